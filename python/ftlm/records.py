@@ -1,0 +1,216 @@
+"""A run and a structure become the record that the core computes on: pulse means of every signal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.errors import DataError, ModelError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from ftlm.models import Equation, Initial, Structure
+    from ftlm.runs import Run
+
+    Floats = NDArray[np.float64]
+
+__all__ = ["Record", "default_m", "equation_tuple", "initial_tuple", "record", "structure_tuple"]
+
+#: The paper's number of block pulses, used where the record carries as many.
+PAPER_M = 2048
+#: Most pulses in one record: 2^24 of one signal are 128 MB.
+MAX_M = 1 << 24
+COULOMB = "coulomb_"
+#: A first value beyond this many noise standard deviations is not rest.
+REST_SIGMAS = 5.0
+#: Samples over which rest is judged.
+REST_SAMPLES = 8
+
+
+@dataclass(frozen=True)
+class Record:
+    """Pulse means of the signals of a structure on one run.
+
+    Parameters
+    ----------
+    signals
+        Names, in the order of the rows.
+    step
+        Pulse width [s].
+    means
+        Rows of pulse means.
+    inputs
+        Which signals are inputs of the run.
+    sensor
+        Series of the sensor filter, applied to every signal not measured through it, or None.
+    initial
+        Initial terms, decided.
+    """
+
+    signals: tuple[str, ...]
+    step: float
+    means: Floats
+    inputs: tuple[bool, ...]
+    sensor: Floats | None
+    initial: Initial
+
+    @property
+    def m(self) -> int:
+        """Number of pulses."""
+        return int(self.means.shape[1])
+
+    def core(self) -> tuple[float, Floats, Floats | None]:
+        """The record as the core takes it."""
+        return self.step, self.means, self.sensor
+
+    def of(self, name: str) -> Floats:
+        """Pulse means of a signal."""
+        return self.means[self.signals.index(name)]
+
+
+def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
+    """The paper's 2 048 pulses, or as many as the shortest run carries (a power of two for Haar coordinates)."""
+    carried = min(run.length for run in runs) - 1
+    m = min(PAPER_M, carried)
+    return 1 << (m.bit_length() - 1) if power_of_two and m > 0 else m
+
+
+def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
+    """Refuse an m that is no number of pulses, that a run does not carry, or that Haar coordinates cannot take.
+
+    Raises
+    ------
+    ModelError
+        Naming the run, what it carries and what to choose.
+    """
+    if isinstance(m, bool) or int(m) != m or m < 1:
+        raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
+    m = int(m)
+    for run in runs:
+        carried = run.length - 1
+        if m > carried:
+            raise ModelError(
+                f"m = {m} is more than run {run.name!r} carries: {run.length} rows are {carried} pulses; "
+                f"take m = {carried} or less"
+            )
+    if power_of_two and m & (m - 1):
+        below = 1 << (m.bit_length() - 1)
+        raise ModelError(
+            f"m = {m} is no power of two, which Haar rows need; take m = {below} or {2 * below}, or rows='time'"
+        )
+    return m
+
+
+def starts_at_rest(run: Run, structure: Structure) -> bool:
+    """Whether all outputs start at zero within their noise, judged over the first samples."""
+    for name in (s for s in structure.signals if s in run.outputs):
+        y = run[name]
+        noise = float(np.median(np.abs(np.diff(y, 2)))) / 0.6745 / np.sqrt(6.0) if len(y) > 2 else 0.0
+        head = y[:REST_SAMPLES]
+        if np.max(np.abs(head)) > REST_SIGMAS * noise + 1e-3 * float(np.std(y)):
+            return False
+    return True
+
+
+def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> Record:
+    """Pulse means of every signal of a structure, delays and sensor filter honoured.
+
+    Outputs are point samples taken as linear in between; inputs hold or are linear as the run says; m may exceed the
+    run's own grid only where nothing is measured against it.
+
+    Parameters
+    ----------
+    run
+        The run.
+    structure
+        Whose signals are wanted.
+    m
+        Number of pulses.
+    filtered
+        Whether to put signals that were not measured through the sensor filter through it (equation error), or to
+        leave them (coupled free run).
+
+    Raises
+    ------
+    DataError
+        A signal that the run does not have.
+    ModelError
+        A delay of a signal that is no input.
+    """
+    initial = structure.initial
+    if initial == "auto":
+        initial = "rest" if starts_at_rest(run, structure) else "caputo"
+    sensor = None
+    if filtered and structure.sensor_filter is not None:
+        sensor = sensor_series(structure, m, run.duration / m)
+    rows = []
+    for name in structure.signals:
+        means = _means(run, structure, name, m, at_rest=initial == "rest")
+        if sensor is not None and structure.sensor_filter is not None and name not in structure.sensor_filter.outputs:
+            means = _core.series_multiply(sensor, means, m)
+        rows.append(means)
+    return Record(
+        structure.signals,
+        run.duration / m,
+        np.ascontiguousarray(np.stack(rows)),
+        tuple(s in run.inputs for s in structure.signals),
+        sensor,
+        initial,
+    )
+
+
+def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
+    """The structure's sensor filter as a series, or None."""
+    sensor = structure.sensor_filter
+    return None if sensor is None else _core.filter_series(list(sensor.numerator), list(sensor.denominator), m, step)
+
+
+def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) -> Floats:
+    if name not in run and name.startswith(COULOMB) and name.removeprefix(COULOMB) in run:
+        # The sign of the measured rate over each interval; the last row repeats so that rows match.
+        rate = np.sign(np.diff(run[name.removeprefix(COULOMB)]))
+        return _core.pulse_means(np.append(rate, rate[-1]), m, True)
+    if name not in run:
+        raise DataError(
+            f"run {run.name!r} has no signal {name!r}, which the model needs; "
+            f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs="
+        )
+    samples = run[name]
+    delay = structure.delay.get(name, 0.0)
+    if name not in run.inputs:
+        if delay:
+            raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
+        return _core.pulse_means(samples, m, False)
+    if delay:
+        samples = _core.delayed(samples, delay / run.step, 0.0 if at_rest else float(samples[0]))
+    return _core.pulse_means(samples, m, run.intersample[name] == "zoh")
+
+
+# ------------------------------------------------------------------------------------------------ as the core takes it
+
+
+def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
+    """Output, alpha and (signal, order) pairs of an equation whose orders are numbers."""
+    index = {name: i for i, name in enumerate(signals)}
+    terms = [(index[t.signal], t.order.constant) for t in item.terms]
+    return index[item.output], item.order.constant, terms
+
+
+def equation_tuple(
+    item: Equation, signals: Sequence[str]
+) -> tuple[tuple[int, float, list[tuple[int, float]]], list[float]]:
+    """An identified equation."""
+    return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
+
+
+def initial_tuple(initial: Initial) -> tuple[bool, list[float]]:
+    """Initial terms, decided."""
+    if initial == "caputo":
+        return True, []
+    return False, [] if isinstance(initial, str) else list(initial)

@@ -1,0 +1,264 @@
+"""How good a model is on measured runs: equation error and output error, always side by side."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.errors import DataError
+from ftlm.records import check_m, default_m, equation_tuple, initial_tuple, record
+from ftlm.runs import Run, check_compatible
+from ftlm.simulation import respond
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from ftlm.models import Model, Structure
+
+    Floats = NDArray[np.float64]
+
+__all__ = ["Comparison", "Metrics", "compare", "metrics", "near_identity"]
+
+#: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
+NEAR_IDENTITY = 0.25
+#: A free run this many times worse than the equation error says that the equation error flatters.
+FLATTERED = 5.0
+#: A free run with a normalised residual above this explains nothing.
+USELESS = 0.5
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """The four figures of one output.
+
+    Parameters
+    ----------
+    error
+        Sum of absolute errors over the block pulses (paper (45)), in the unit of the output.
+    rmse
+        Root mean square error (paper (46)).
+    nr
+        Normalised residual RMSE / sigma(y) (paper (47)).
+    fit
+        100 (1 - |y - yhat| / |y - mean y|) in percent.
+    """
+
+    error: float
+    rmse: float
+    nr: float
+    fit: float
+
+    def to_dict(self) -> dict[str, float | None]:
+        """For JSON, which has no infinity: None stands for a figure that is not finite."""
+        items = {"error": self.error, "rmse": self.rmse, "nr": self.nr, "fit": self.fit}
+        return {name: value if np.isfinite(value) else None for name, value in items.items()}
+
+
+def metrics(measured: Floats, predicted: Floats) -> Metrics:
+    """Error (45), RMSE (46), NR (47) and fit of a prediction.
+
+    Parameters
+    ----------
+    measured, predicted
+        Arrays of shape (M,) in the same unit.
+
+    Raises
+    ------
+    DataError
+        Different lengths, or measured values that are not finite.
+    """
+    y = np.ascontiguousarray(measured, dtype=np.float64)
+    e = np.ascontiguousarray(y - np.asarray(predicted, dtype=np.float64)) if np.shape(predicted) == y.shape else None
+    if e is None:
+        raise DataError(f"predicted has shape {np.shape(predicted)}, measured {y.shape}; give equal lengths")
+    return Metrics(*_core.metrics(y, e))
+
+
+def _pooled(measured: list[Floats], residuals: list[Floats]) -> Metrics:
+    """Figures over several runs; each run's mean is its own."""
+    if len(measured) == 1:
+        return Metrics(*_core.metrics(measured[0], residuals[0]))
+    return Metrics(*_core.metrics(np.concatenate([y - np.mean(y) for y in measured]), np.concatenate(residuals)))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A model beside measured runs.
+
+    Parameters
+    ----------
+    output_error, equation_error
+        Figures by output, over all runs: of the free run, and of the equation with measured signals on its right-hand
+        side.
+    per_run
+        The same for each run by name: (equation error, output error).
+    simulated, measured
+        Pulse means by output, one array a run.
+    step
+        Pulse width of each run [s].
+    m
+        Number of block pulses.
+    initial
+        Coefficients of the initial terms of the free run, one mapping a run: output -> exponent -> value. They belong
+        to that run alone.
+    warnings
+        What makes these figures doubtful, in words.
+    """
+
+    output_error: dict[str, Metrics]
+    equation_error: dict[str, Metrics]
+    per_run: list[tuple[str, dict[str, Metrics], dict[str, Metrics]]]
+    simulated: dict[str, list[Floats]]
+    measured: dict[str, list[Floats]]
+    step: list[float]
+    m: int
+    initial: list[dict[str, dict[float, float]]]
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """Fit of the free run in percent, by output."""
+        return {name: figures.fit for name, figures in self.output_error.items()}
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "m": self.m,
+            "output_error": {n: f.to_dict() for n, f in self.output_error.items()},
+            "equation_error": {n: f.to_dict() for n, f in self.equation_error.items()},
+            "runs": [
+                {
+                    "run": name,
+                    "equation_error": {n: f.to_dict() for n, f in equation.items()},
+                    "output_error": {n: f.to_dict() for n, f in output.items()},
+                }
+                for name, equation, output in self.per_run
+            ],
+            "warnings": list(self.warnings),
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{'output':<10}{'':<16}{'error':>12}{'RMSE':>12}{'NR':>10}{'fit %':>10}"]
+        for name in self.output_error:
+            both = (("equation error", self.equation_error[name]), ("output error", self.output_error[name]))
+            for label, f in both:
+                lines.append(f"{name:<10}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>10.4g}")
+        lines.append(f"over {self.m} block pulses a run")
+        lines += [f"warning: {w}" for w in self.warnings]
+        return "\n".join(lines)
+
+
+def as_runs(runs: Run | Sequence[Run]) -> list[Run]:
+    """One run or several as a list.
+
+    Raises
+    ------
+    DataError
+        No run, something that is no run, or runs whose names or units differ.
+    """
+    found = [runs] if isinstance(runs, Run) else list(runs)
+    if not found:
+        raise DataError("no run is given; give at least one")
+    for i, run in enumerate(found):
+        if not isinstance(run, Run):
+            raise DataError(f"runs[{i}] is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
+    check_compatible(found)
+    return found
+
+
+def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
+    """Equation error and output error of a model on measured runs.
+
+    Parameters
+    ----------
+    model
+        The model.
+    runs
+        One run or several with the same names and units.
+    m
+        Number of block pulses a run; default that of the identification, or what the runs carry.
+
+    Returns
+    -------
+    Comparison
+        On the data that a model was identified from, its figures are those printed with it.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit, a signal that is not there, a constant output.
+    ModelError
+        An m that the runs do not carry.
+    """
+    found = as_runs(runs)
+    carried = min(run.length for run in found) - 1
+    chosen = min(model.m or default_m(found, power_of_two=False), carried) if m is None else m
+    m = check_m(chosen, found, power_of_two=False)
+    simulated: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    measured: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    own: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    per_run, initial, steps = [], [], []
+    for run in found:
+        run.require_outputs([o for o in model.outputs if o in run])
+        rec, responses, terms = respond(model, run, m)
+        full = rec if model.structure.coupling == "measured" else record(run, model.structure, m)
+        equation_figures, output_figures = {}, {}
+        for item in model.equations:
+            name = item.output
+            core_equation = equation_tuple(item, full.signals)
+            args = (core_equation, list(full.inputs), initial_tuple(full.initial))
+            residual = _core.equation_error(full.core(), *args)
+            y = rec.of(name)
+            simulated[name].append(responses[name])
+            measured[name].append(y)
+            own[name].append(full.of(name))
+            residuals[name].append(residual)
+            equation_figures[name] = Metrics(*_core.metrics(full.of(name), residual))
+            output_figures[name] = Metrics(*_core.metrics(y, y - responses[name]))
+        per_run.append((run.name, equation_figures, output_figures))
+        initial.append(terms)
+        steps.append(rec.step)
+    outputs = {
+        o: _pooled(measured[o], [y - s for y, s in zip(measured[o], simulated[o], strict=True)]) for o in model.outputs
+    }
+    equations = {o: _pooled(own[o], residuals[o]) for o in model.outputs}
+    warnings = near_identity(model.structure, equations, outputs)
+    return Comparison(outputs, equations, per_run, simulated, measured, steps, m, initial, tuple(warnings))
+
+
+def near_identity(
+    structure: Structure, equation_error: Mapping[str, Metrics], output_error: Mapping[str, Metrics]
+) -> list[str]:
+    """Warnings in words where the equation error flatters a model.
+
+    Own-output orders close to alpha reproduce any smooth output from itself; only the free run shows it.
+    """
+    warnings = []
+    for item in structure.equations:
+        name, alpha = item.output, item.order.constant
+        equation, output = equation_error[name], output_error[name]
+        close = [t.order.constant for t in item.terms if t.signal == name and alpha - t.order.constant < NEAR_IDENTITY]
+        # Negated so that a figure that is not a number counts as bad.
+        worse = not output.nr <= FLATTERED * equation.nr
+        useless = not output.nr <= USELESS
+        if close and worse:
+            listed = ", ".join(f"{order:g}" for order in close)
+            warnings.append(
+                f"{name}: orders {listed} are close to alpha = {alpha:g}, so the equation nearly says that {name} "
+                f"equals itself; its free run has NR {output.nr:.3g} against {equation.nr:.3g} for the equation error. "
+                "Do not use these orders"
+            )
+        elif worse and useless:
+            warnings.append(
+                f"{name}: the free run (NR {output.nr:.3g}) is far worse than the equation error ({equation.nr:.3g}); "
+                "the equation error flatters this model"
+            )
+        elif useless:
+            warnings.append(f"{name}: the free run explains little of the output (NR {output.nr:.3g})")
+    return warnings

@@ -1,0 +1,199 @@
+//! Equations of fractional order: terms, orders, order laws, initial terms, sensor filters.
+//!
+//! An equation is D^α y = Σ_k c_k D^{ν_k} s_k over the signals of a record. Divided by D^α it is a series equation,
+//! y = Σ_k c_k I^{α−ν_k} s_k + initial terms, which is how everything else reads it.
+
+use crate::error::{Error, Result};
+use crate::fractional::{block_pulse_kernel, MAX_ORDER};
+use crate::series;
+
+/// Orders closer than this are one order: lattices are written in steps, not in rounding errors.
+pub const ORDER_GRAIN: f64 = 1e-9;
+
+/// One term D^ν s; its coefficient lives beside the structure.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Term {
+    /// Index of the signal in the record.
+    pub signal: usize,
+    /// Order ν; negative only for an input (an integration).
+    pub order: f64,
+}
+
+/// D^α y = Σ c_k D^{ν_k} s_k without its coefficients.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Structure {
+    /// Index of the output y in the record.
+    pub output: usize,
+    /// Highest order α.
+    pub order: f64,
+    /// Terms of the right-hand side.
+    pub terms: Vec<Term>,
+}
+
+/// A structure with its coefficients.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Equation {
+    /// Orders and signals.
+    pub structure: Structure,
+    /// One coefficient a term.
+    pub coefficients: Vec<f64>,
+}
+
+/// How a record that does not start at rest is treated.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Initial {
+    /// At rest: no initial terms.
+    Rest,
+    /// All powers of t that Caputo derivatives leave behind: t^i, i < ⌈α⌉, and t^{α−ν+i}, i < ⌈ν⌉.
+    Caputo,
+    /// These exponents.
+    Powers(Vec<f64>),
+}
+
+impl Structure {
+    /// Refuses orders that make no equation: α outside (0, 3], an own-output order outside [0, α), another
+    /// outside [0, α] (an input's may be negative down to −3).
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] naming the term, [`Error::Structure`] for a signal that is not there.
+    pub fn check(&self, signals: usize, is_input: impl Fn(usize) -> bool) -> Result<()> {
+        let range = |name: String, value: f64, range: String, remedy: &str| Error::OutOfRange {
+            name,
+            value,
+            range,
+            remedy: remedy.to_owned(),
+        };
+        if !(self.order > 0.0 && self.order <= MAX_ORDER) {
+            return Err(range("order alpha".into(), self.order, format!("(0, {MAX_ORDER}]"), "choose another order"));
+        }
+        if self.output >= signals {
+            return Err(missing(self.output, signals));
+        }
+        for (k, term) in self.terms.iter().enumerate() {
+            if term.signal >= signals {
+                return Err(missing(term.signal, signals));
+            }
+            let name = format!("order of term {k}");
+            if term.signal == self.output {
+                if !(term.order >= 0.0 && term.order < self.order - ORDER_GRAIN) {
+                    let allowed = format!("[0, {})", self.order);
+                    return Err(range(name, term.order, allowed, "an own-output order must stay below alpha"));
+                }
+            } else {
+                let lowest = if is_input(term.signal) { -MAX_ORDER } else { 0.0 };
+                if !(term.order >= lowest && term.order <= self.order + ORDER_GRAIN) {
+                    let allowed = format!("[{lowest}, {}]", self.order);
+                    return Err(range(name, term.order, allowed, "an order must not exceed alpha"));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// Order α − ν by which term k is integrated.
+    #[must_use]
+    pub fn integration(&self, k: usize) -> f64 {
+        tidy(self.order - self.terms[k].order)
+    }
+
+    /// Exponents of the initial terms, distinct and ascending.
+    #[must_use]
+    pub fn initial_exponents(&self, initial: &Initial) -> Vec<f64> {
+        let mut exponents = match initial {
+            Initial::Rest => Vec::new(),
+            Initial::Powers(powers) => powers.clone(),
+            Initial::Caputo => {
+                let mut all: Vec<f64> = whole_below(self.order).collect();
+                for (k, term) in self.terms.iter().enumerate() {
+                    all.extend(whole_below(term.order).map(|i| tidy(self.integration(k) + i)));
+                }
+                all
+            }
+        };
+        exponents.sort_by(f64::total_cmp);
+        exponents.dedup_by(|a, b| (*a - *b).abs() < ORDER_GRAIN);
+        exponents
+    }
+}
+
+fn missing(signal: usize, signals: usize) -> Error {
+    Error::Structure {
+        what: format!("the equation names signal {signal}, but the record holds {signals}"),
+        remedy: "give the record all signals of the equation".into(),
+    }
+}
+
+/// 0, 1, … below `order`: the powers of t that D^order annihilates.
+fn whole_below(order: f64) -> impl Iterator<Item = f64> {
+    (0..4).map(f64::from).take_while(move |&i| i < order - ORDER_GRAIN)
+}
+
+/// An order rounded to the grain, so that equal orders are equal bits.
+#[must_use]
+pub fn tidy(order: f64) -> f64 {
+    let units = grains(order);
+    #[allow(clippy::cast_precision_loss)]
+    let tidied = units as f64 / 1e9;
+    tidied
+}
+
+/// An order in units of the grain: the key under which its regressor is kept.
+#[must_use]
+#[allow(clippy::cast_possible_truncation)]
+pub fn grains(order: f64) -> i64 {
+    (order * 1e9).round() as i64
+}
+
+/// An affine order law: constant + Σ weight·free order.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AffineOrder {
+    /// Constant part.
+    pub constant: f64,
+    /// Weight of each free order.
+    pub weights: Vec<f64>,
+}
+
+impl AffineOrder {
+    /// Value at these free orders.
+    #[must_use]
+    pub fn at(&self, free: &[f64]) -> f64 {
+        tidy(self.constant + self.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>())
+    }
+}
+
+/// A rational filter Σ b D^ν / Σ a D^ν, such as the low-pass that a logged deflection went through.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Filter {
+    /// (coefficient, order) of the numerator.
+    pub numerator: Vec<(f64, f64)>,
+    /// (coefficient, order) of the denominator.
+    pub denominator: Vec<(f64, f64)>,
+}
+
+impl Filter {
+    /// The filter as a series of m pulses, at rest before the record.
+    ///
+    /// # Errors
+    /// An improper filter, an order outside [0, 3], or a denominator that starts with zero.
+    pub fn series(&self, m: usize, step: f64) -> Result<Vec<f64>> {
+        let highest = self.denominator.iter().map(|t| t.1).fold(0.0, f64::max);
+        let mut parts = [vec![0.0; m], vec![0.0; m]];
+        for (part, terms) in parts.iter_mut().zip([&self.numerator, &self.denominator]) {
+            for &(coefficient, order) in terms {
+                if !(order >= 0.0 && order <= highest && highest <= MAX_ORDER) {
+                    return Err(Error::OutOfRange {
+                        name: "order of the sensor filter".into(),
+                        value: order,
+                        range: format!("[0, {}]", highest.min(MAX_ORDER)),
+                        remedy: "a filter's numerator must not exceed its denominator in order".into(),
+                    });
+                }
+                for (p, k) in part.iter_mut().zip(block_pulse_kernel(tidy(highest - order), m, step)) {
+                    *p += coefficient * k;
+                }
+            }
+        }
+        let [numerator, denominator] = parts;
+        series::divide(&numerator, &denominator)
+    }
+}

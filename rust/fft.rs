@@ -1,0 +1,125 @@
+//! Plans, lengths and scratch for real Fourier transforms; the only user of `realfft`.
+//!
+//! Transforms are unnormalised forward and divided by their length on the way back, so a product of
+//! spectra is a cyclic convolution. Scratch belongs to the caller ([`Workspace`]): plans are shared,
+//! workspaces are one per thread.
+
+use std::collections::HashMap;
+use std::sync::{Arc, Mutex, OnceLock};
+
+use realfft::{num_complex::Complex, ComplexToReal, RealFftPlanner, RealToComplex};
+
+/// One complex number of a spectrum.
+pub type Bin = Complex<f64>;
+
+/// A forward and an inverse real transform of one even length.
+#[derive(Clone)]
+pub struct Plan {
+    len: usize,
+    forward: Arc<dyn RealToComplex<f64>>,
+    inverse: Arc<dyn ComplexToReal<f64>>,
+}
+
+/// Scratch of the transforms of one thread; grows to the largest plan it has met.
+#[derive(Default)]
+pub struct Workspace {
+    scratch: Vec<Bin>,
+}
+
+/// Smallest even 5-smooth length that is at least `n`: the lengths at which the transform is fast.
+#[must_use]
+pub fn fast_length(n: usize) -> usize {
+    let mut len = n.max(2);
+    loop {
+        let mut rest = len;
+        for prime in [2, 3, 5] {
+            while rest % prime == 0 {
+                rest /= prime;
+            }
+        }
+        if rest == 1 && len % 2 == 0 {
+            return len;
+        }
+        len += 1;
+    }
+}
+
+/// The plan of a length, made once per process.
+#[must_use]
+pub fn plan(len: usize) -> Plan {
+    static PLANS: OnceLock<Mutex<HashMap<usize, Plan>>> = OnceLock::new();
+    let table = PLANS.get_or_init(|| Mutex::new(HashMap::new()));
+    // A poisoned table only means that another thread died between two inserts; its content is whole.
+    let mut table = table.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    table
+        .entry(len)
+        .or_insert_with(|| {
+            let mut planner = RealFftPlanner::<f64>::new();
+            Plan { len, forward: planner.plan_fft_forward(len), inverse: planner.plan_fft_inverse(len) }
+        })
+        .clone()
+}
+
+impl Plan {
+    /// Number of real points.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.len
+    }
+
+    /// Never true: a plan has at least two points.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len == 0
+    }
+
+    /// Number of bins of a spectrum: `len / 2 + 1`.
+    #[must_use]
+    pub fn bins(&self) -> usize {
+        self.len / 2 + 1
+    }
+
+    /// Spectrum of `time`, whose content is destroyed. `time` has `len`, `spectrum` has `bins` elements.
+    pub fn forward(&self, time: &mut [f64], spectrum: &mut [Bin], workspace: &mut Workspace) {
+        let scratch = workspace.at_least(self.forward.get_scratch_len());
+        // Lengths are those of the plan by construction; a mismatch would leave zeros and fail every oracle.
+        let done = self.forward.process_with_scratch(time, spectrum, scratch);
+        debug_assert!(done.is_ok());
+    }
+
+    /// Signal of `spectrum`, divided by the length; the spectrum's content is destroyed.
+    pub fn inverse(&self, spectrum: &mut [Bin], time: &mut [f64], workspace: &mut Workspace) {
+        // The transform refuses an imaginary part in the two bins that a real signal keeps real.
+        if let Some(first) = spectrum.first_mut() {
+            first.im = 0.0;
+        }
+        if self.len % 2 == 0 {
+            if let Some(last) = spectrum.last_mut() {
+                last.im = 0.0;
+            }
+        }
+        let scratch = workspace.at_least(self.inverse.get_scratch_len());
+        let done = self.inverse.process_with_scratch(spectrum, time, scratch);
+        debug_assert!(done.is_ok());
+        #[allow(clippy::cast_precision_loss)]
+        let scale = 1.0 / self.len as f64;
+        for value in time {
+            *value *= scale;
+        }
+    }
+}
+
+impl Workspace {
+    /// An empty workspace.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    fn at_least(&mut self, len: usize) -> &mut [Bin] {
+        if self.scratch.len() < len {
+            self.scratch.resize(len, Bin::new(0.0, 0.0));
+        }
+        &mut self.scratch[..len]
+    }
+}

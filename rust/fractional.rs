@@ -1,0 +1,308 @@
+//! Kernels of the fractional integral I^η and of its derivative with respect to η, Grünwald–Letnikov
+//! weights, and the fractional integrals and derivatives of sampled signals.
+
+use crate::error::{check_finite, check_step, Error, Result};
+use crate::series;
+
+/// Highest order of an integral or a derivative; flexible machines need less than 3.
+pub const MAX_ORDER: f64 = 3.0;
+
+/// Below this pulse distance the even binomial sum converges slowly and gets [`TERMS_NEAR`] terms.
+const NEAR: usize = 8;
+/// Terms for distances 2 … 7: 4^−25 is below the rounding error at distance 2.
+const TERMS_NEAR: usize = 25;
+/// Terms from distance 8 on: 64^−8 is below the rounding error.
+const TERMS_FAR: usize = 8;
+
+/// Block-pulse kernel of I^η: first row of F^η, `h^η/Γ(η+2)·v_n`, n = 1 … m (paper (32)).
+///
+/// The printed `v_n` is a second difference of n^{η+1} and cancels catastrophically (relative error 2e−3 at
+/// n = 2^20 for η = 0.15); here it is the even binomial sum, exact to a few ε for every n. η = 0 gives the
+/// identity.
+///
+/// Cost O(m).
+#[must_use]
+pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
+    let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
+    (1..=m).map(|n| scale * second_difference(eta, n).0).collect()
+}
+
+/// Derivative of [`block_pulse_kernel`] with respect to η.
+///
+/// Uses d/dη of `h^η/Γ(η+2)`, that is ln h − ψ(η+2), and the term-by-term derivative of the binomial sum.
+#[must_use]
+pub fn block_pulse_kernel_derivative(eta: f64, m: usize, step: f64) -> Vec<f64> {
+    let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
+    let slope = libm::log(step) - digamma(eta + 2.0);
+    (1..=m)
+        .map(|n| {
+            let (v, dv) = second_difference(eta, n);
+            scale * (v * slope + dv)
+        })
+        .collect()
+}
+
+/// `v_n = n^{η+1} − 2(n−1)^{η+1} + (n−2)^{η+1}` (v₁ = 1) and its derivative with respect to η, both to a few ε.
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn second_difference(eta: f64, n: usize) -> (f64, f64) {
+    match n {
+        0 => (0.0, 0.0),
+        1 => (1.0, 0.0),
+        2 => {
+            let ln2 = std::f64::consts::LN_2;
+            (2.0 * libm::expm1(eta * ln2), 2.0 * libm::exp2(eta) * ln2)
+        }
+        _ => {
+            let centre = (n - 1) as f64;
+            let terms = if n - 1 < NEAR { TERMS_NEAR } else { TERMS_FAR };
+            let shrink = 1.0 / (centre * centre);
+            let (mut c, mut dc) = (1.0, 0.0);
+            let (mut power, mut sum, mut dsum) = (1.0, 0.0, 0.0);
+            for k in 0..terms {
+                for j in [2 * k, 2 * k + 1] {
+                    // η + 1 − j, but exactly η at j = 1: for small η the rounding of η + 1 would be the whole error.
+                    let factor = if j == 0 { eta + 1.0 } else { eta - (j as f64 - 1.0) };
+                    let divisor = (j + 1) as f64;
+                    dc = (dc * factor + c) / divisor;
+                    c = c * factor / divisor;
+                }
+                power *= shrink;
+                sum += c * power;
+                dsum += dc * power;
+            }
+            let outer = 2.0 * libm::pow(centre, eta + 1.0);
+            (outer * sum, outer * (sum * libm::log(centre) + dsum))
+        }
+    }
+}
+
+/// ψ(x) for x > 0: recurrence up to x ≥ 10, then the asymptotic series (DLMF 5.11.2).
+#[must_use]
+pub fn digamma(x: f64) -> f64 {
+    // B_{2k}/(2k) for k = 1 … 7; the eighth term is below 1e−17 at x = 10.
+    const SERIES: [f64; 7] =
+        [1.0 / 12.0, -1.0 / 120.0, 1.0 / 252.0, -1.0 / 240.0, 1.0 / 132.0, -691.0 / 32760.0, 1.0 / 12.0];
+    let (mut x, mut shift) = (x, 0.0);
+    while x < 10.0 {
+        shift += 1.0 / x;
+        x += 1.0;
+    }
+    let square = 1.0 / (x * x);
+    let tail = SERIES.iter().rev().fold(0.0, |sum, &b| (sum + b) * square);
+    libm::log(x) - 0.5 / x - tail - shift
+}
+
+/// Grünwald–Letnikov weights `(−1)^j C(α, j)`, j = 0 … m−1 (paper (2)); a negative α integrates.
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
+    let mut weights = Vec::with_capacity(m);
+    let mut weight = 1.0;
+    for j in 0..m {
+        if j > 0 {
+            weight *= 1.0 - (alpha + 1.0) / j as f64;
+        }
+        weights.push(weight);
+    }
+    weights
+}
+
+/// Pulse means of `t^exponent`, k = 1 … m, exact to a few ε (exponent > −1).
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+    let a = exponent + 1.0;
+    let scale = libm::pow(step, exponent) / a;
+    (1..=m)
+        .map(|k| {
+            let k = k as f64;
+            // k^a − (k−1)^a without the cancellation.
+            scale * if k == 1.0 { 1.0 } else { -libm::pow(k, a) * libm::expm1(a * libm::log1p(-1.0 / k)) }
+        })
+        .collect()
+}
+
+/// How a fractional integral of samples is computed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum IntegralRule {
+    /// The samples are means over pulses and so is the result: F^η (paper (31), (32)); second order in h.
+    BlockPulse,
+    /// Point samples, exact for the linear interpolant (product trapezoidal rule); second order in h.
+    Trapezoidal,
+    /// Point samples, Grünwald–Letnikov sum with −η (paper (2)); first order in h.
+    GrunwaldLetnikov,
+}
+
+/// Which fractional derivative.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Derivative {
+    /// Grünwald–Letnikov sum (paper (2)); first order in h for signals that start at zero.
+    GrunwaldLetnikov,
+    /// Riemann–Liouville (paper (3)): Caputo's plus the power functions of the initial values; infinite at t = 0
+    /// where an initial value is not zero.
+    RiemannLiouville,
+    /// Caputo (paper (5)) by the L1 formula on the highest whole derivative; order min(2, 2 − frac α) in h.
+    Caputo,
+}
+
+/// I^η of uniformly sampled `x`, lower limit at the first sample.
+///
+/// # Errors
+/// An order outside [0, 3], a step that is not positive, or a value that is not finite.
+pub fn fractional_integral(x: &[f64], eta: f64, step: f64, rule: IntegralRule) -> Result<Vec<f64>> {
+    check_step(step)?;
+    check_order("order", eta)?;
+    check_finite("x", x)?;
+    let m = x.len();
+    if eta == 0.0 || m == 0 {
+        return Ok(x.to_vec());
+    }
+    match rule {
+        IntegralRule::BlockPulse => Ok(series::multiply(&block_pulse_kernel(eta, m, step), x, m)),
+        IntegralRule::GrunwaldLetnikov => {
+            let scale = libm::pow(step, eta);
+            let mut out = series::multiply(&grunwald_letnikov_weights(-eta, m), x, m);
+            out.iter_mut().for_each(|v| *v *= scale);
+            Ok(out)
+        }
+        IntegralRule::Trapezoidal => {
+            // The block-pulse kernel is also the trapezoidal weight of every sample but the first.
+            let mut out = series::multiply(&block_pulse_kernel(eta, m, step), x, m);
+            let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
+            for (n, value) in out.iter_mut().enumerate() {
+                *value += x[0] * scale * (first_sample_weight(eta, n) - second_difference(eta, n + 1).0);
+            }
+            if let Some(first) = out.first_mut() {
+                *first = 0.0;
+            }
+            Ok(out)
+        }
+    }
+}
+
+/// Trapezoidal weight of the first sample at point n: `(n−1)^{η+1} − (n−1−η) n^η`.
+#[allow(clippy::cast_precision_loss)]
+fn first_sample_weight(eta: f64, n: usize) -> f64 {
+    if n == 0 {
+        return 0.0;
+    }
+    if n == 1 {
+        return eta;
+    }
+    let n = n as f64;
+    // n^η·[(n−1)((1−1/n)^η − 1) + η] with the inner difference by expm1.
+    libm::pow(n, eta) * ((n - 1.0) * libm::expm1(eta * libm::log1p(-1.0 / n)) + eta)
+}
+
+/// D^α of uniformly sampled `x`, lower limit at the first sample.
+///
+/// `initial` gives x(0), x′(0), … where they are known; missing ones are taken from second-order one-sided
+/// differences of the samples.
+///
+/// # Errors
+/// An order outside [0, 3], a step that is not positive, a value that is not finite, or fewer samples than the
+/// differences need (⌈α⌉ + 2).
+pub fn fractional_derivative(
+    x: &[f64],
+    alpha: f64,
+    step: f64,
+    definition: Derivative,
+    initial: &[f64],
+) -> Result<Vec<f64>> {
+    check_step(step)?;
+    check_order("order", alpha)?;
+    check_finite("x", x)?;
+    check_finite("initial", initial)?;
+    let m = x.len();
+    if alpha == 0.0 {
+        return Ok(x.to_vec());
+    }
+    if definition == Derivative::GrunwaldLetnikov {
+        let scale = libm::pow(step, -alpha);
+        let mut out = series::multiply(&grunwald_letnikov_weights(alpha, m), x, m);
+        out.iter_mut().for_each(|v| *v *= scale);
+        return Ok(out);
+    }
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    let whole = alpha.ceil() as usize;
+    if m < whole + 2 {
+        return Err(Error::Length { name: "x".into(), expected: whole + 2, found: m });
+    }
+    // Initial values and the highest whole derivative that the L1 formula still integrates.
+    let mut starts = Vec::with_capacity(whole);
+    let mut highest = x.to_vec();
+    for k in 0..whole {
+        if k > 0 {
+            highest = difference(&highest, step);
+        }
+        starts.push(initial.get(k).copied().unwrap_or(highest[0]));
+        highest[0] = starts[k];
+    }
+    #[allow(clippy::cast_precision_loss)]
+    let fraction = alpha - (whole - 1) as f64;
+    let mut out = if fraction == 1.0 { difference(&highest, step) } else { l1(&highest, fraction, step) };
+    if definition == Derivative::RiemannLiouville && fraction < 1.0 {
+        #[allow(clippy::cast_precision_loss)]
+        for (k, &start) in starts.iter().enumerate() {
+            if start == 0.0 {
+                continue;
+            }
+            let power = k as f64 - alpha;
+            let scale = start / libm::tgamma(power + 1.0);
+            for (n, value) in out.iter_mut().enumerate() {
+                *value += scale * libm::pow(n as f64 * step, power);
+            }
+        }
+    }
+    Ok(out)
+}
+
+/// L1 formula: exact Caputo derivative, order in (0, 1), of the linear interpolant.
+#[allow(clippy::cast_precision_loss)]
+fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
+    let (m, a) = (x.len(), 1.0 - order);
+    let scale = libm::pow(step, -order) / libm::tgamma(2.0 - order);
+    let weights: Vec<f64> = (0..m)
+        .map(|k| {
+            let k = k as f64;
+            // (k+1)^a − k^a without the cancellation.
+            scale * if k == 0.0 { 1.0 } else { libm::pow(k, a) * libm::expm1(a * libm::log1p(1.0 / k)) }
+        })
+        .collect();
+    let mut rises = vec![0.0; m];
+    for n in 1..m {
+        rises[n] = x[n] - x[n - 1];
+    }
+    // rises[0] = 0, so the product at n is Σ_{k<n} w_k·(x_{n−k} − x_{n−k−1}).
+    series::multiply(&weights, &rises, m)
+}
+
+/// First derivative by central differences, one-sided at the ends; second order in h. Needs three samples.
+fn difference(x: &[f64], step: f64) -> Vec<f64> {
+    let m = x.len();
+    let mut out = vec![0.0; m];
+    for n in 1..m - 1 {
+        out[n] = (x[n + 1] - x[n - 1]) / (2.0 * step);
+    }
+    out[0] = (-3.0 * x[0] + 4.0 * x[1] - x[2]) / (2.0 * step);
+    out[m - 1] = (3.0 * x[m - 1] - 4.0 * x[m - 2] + x[m - 3]) / (2.0 * step);
+    out
+}
+
+/// Refuses an order outside [0, 3].
+///
+/// # Errors
+/// [`Error::OutOfRange`].
+pub fn check_order(name: &str, order: f64) -> Result<()> {
+    if (0.0..=MAX_ORDER).contains(&order) {
+        Ok(())
+    } else {
+        Err(Error::OutOfRange {
+            name: name.to_owned(),
+            value: order,
+            range: format!("[0, {MAX_ORDER}]"),
+            remedy: "split a higher order into a whole and a fractional part".into(),
+        })
+    }
+}

@@ -1,0 +1,55 @@
+//! Bindings: the only users of pyo3 and numpy. Arrays are checked here once, then trusted; Python is detached in every
+//! call that computes.
+
+mod arrays;
+mod errors;
+mod estimate;
+mod operators;
+mod search;
+mod simulate;
+
+use pyo3::prelude::*;
+
+/// The compiled core of ftlm.
+#[pymodule]
+mod _core {
+    use super::*;
+
+    #[pymodule_export]
+    use super::operators::{
+        block_pulse_kernel, block_pulse_matrix, delayed, filter_series, fractional_derivative, fractional_integral,
+        grunwald_letnikov_weights, haar_inverse, haar_matrix, haar_transform, operational_matrix, point_samples,
+        pulse_means, series_divide, series_multiply,
+    };
+
+    #[pymodule_export]
+    use super::estimate::{least_squares, multi_innovation};
+
+    #[pymodule_export]
+    use super::simulate::{equation_error, explicit_euler, metrics, respond, respond_with_initial};
+
+    #[pymodule_export]
+    use super::search::{lattice_size, search, search_stage};
+
+    #[pymodule_init]
+    fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        module.add("__version__", env!("CARGO_PKG_VERSION"))?;
+        module.add("SIMD", simd())
+    }
+
+    /// The widest vector unit that this processor offers.
+    fn simd() -> &'static str {
+        #[cfg(target_arch = "x86_64")]
+        {
+            if std::arch::is_x86_feature_detected!("avx512f") {
+                return "avx512f";
+            }
+            if std::arch::is_x86_feature_detected!("avx2") {
+                return "avx2";
+            }
+            "sse2"
+        }
+        #[cfg(not(target_arch = "x86_64"))]
+        "portable"
+    }
+}

@@ -1,0 +1,239 @@
+//! Kernels, transforms, matrices, fractional integrals and derivatives, pulse means.
+
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::prelude::*;
+
+use super::arrays::{columns, matrix, rows, stacked, vector};
+use super::errors::detached;
+use crate::equation::Filter;
+use crate::error::{check_finite, check_length, check_step, Error};
+use crate::fractional::{self, Derivative, IntegralRule};
+use crate::means::{self, Intersample};
+use crate::{haar, operational, series};
+
+type Array<'py> = Bound<'py, PyArray1<f64>>;
+type Matrix<'py> = Bound<'py, PyArray2<f64>>;
+
+fn choice(name: &str, given: &str, known: &str) -> Error {
+    Error::Structure { what: format!("{name} '{given}' is not known"), remedy: format!("use one of {known}") }
+}
+
+#[pyfunction]
+#[pyo3(signature = (order, m, step, *, derivative = false))]
+pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, derivative: bool) -> PyResult<Array<'_>> {
+    let kernel = detached(py, || {
+        fractional::check_order("order", order)?;
+        check_step(step)?;
+        Ok(if derivative {
+            fractional::block_pulse_kernel_derivative(order, m, step)
+        } else {
+            fractional::block_pulse_kernel(order, m, step)
+        })
+    })?;
+    Ok(PyArray1::from_vec(py, kernel))
+}
+
+#[pyfunction]
+pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> Array<'_> {
+    PyArray1::from_vec(py, fractional::grunwald_letnikov_weights(order, m))
+}
+
+#[pyfunction]
+pub fn haar_transform<'py>(py: Python<'py>, x: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
+    transformed(py, &x, haar::transform)
+}
+
+#[pyfunction]
+pub fn haar_inverse<'py>(py: Python<'py>, x: PyReadonlyArray2<'py, f64>) -> PyResult<Matrix<'py>> {
+    transformed(py, &x, haar::inverse)
+}
+
+fn transformed<'py>(
+    py: Python<'py>,
+    x: &PyReadonlyArray2<'py, f64>,
+    work: fn(&mut [f64]) -> crate::error::Result<()>,
+) -> PyResult<Matrix<'py>> {
+    let mut all = rows(x);
+    let all = detached(py, || {
+        for row in &mut all {
+            check_finite("x", row)?;
+            work(row)?;
+        }
+        Ok(all)
+    })?;
+    stacked(py, &all)
+}
+
+/// A dense matrix beyond this would exhaust memory by a slip of the hand.
+const LARGEST_DENSE: usize = 1 << 14;
+
+fn check_dense(m: usize) -> crate::error::Result<()> {
+    if m == 0 || m > LARGEST_DENSE {
+        #[allow(clippy::cast_precision_loss)]
+        return Err(Error::OutOfRange {
+            name: "m".into(),
+            value: m as f64,
+            range: format!("[1, {LARGEST_DENSE}]"),
+            remedy: "dense matrices are for study; apply the operator as a series instead".into(),
+        });
+    }
+    Ok(())
+}
+
+#[pyfunction]
+pub fn haar_matrix(py: Python<'_>, m: usize) -> PyResult<Matrix<'_>> {
+    let values = detached(py, || {
+        check_dense(m)?;
+        haar::matrix(m)
+    })?;
+    matrix(py, values, m)
+}
+
+#[pyfunction]
+pub fn block_pulse_matrix(py: Python<'_>, order: f64, m: usize, step: f64) -> PyResult<Matrix<'_>> {
+    let values = detached(py, || {
+        check_dense(m)?;
+        operational::block_pulse_matrix(order, m, step)
+    })?;
+    matrix(py, values, m)
+}
+
+#[pyfunction]
+#[pyo3(signature = (order, m, step, *, dense = false))]
+pub fn operational_matrix(py: Python<'_>, order: f64, m: usize, step: f64, dense: bool) -> PyResult<Matrix<'_>> {
+    let values = detached(py, || {
+        check_dense(m)?;
+        if dense {
+            operational::operational_matrix_dense(order, m, step)
+        } else {
+            operational::operational_matrix(order, m, step)
+        }
+    })?;
+    matrix(py, values, m)
+}
+
+#[pyfunction]
+#[pyo3(signature = (a, b, m, *, naive = false))]
+pub fn series_multiply<'py>(
+    py: Python<'py>,
+    a: PyReadonlyArray1<'py, f64>,
+    b: PyReadonlyArray1<'py, f64>,
+    m: usize,
+    naive: bool,
+) -> PyResult<Array<'py>> {
+    let (a, b) = (vector("a", &a)?, vector("b", &b)?);
+    let product =
+        detached(py, || Ok(if naive { series::multiply_naive(&a, &b, m) } else { series::multiply(&a, &b, m) }))?;
+    Ok(PyArray1::from_vec(py, product))
+}
+
+#[pyfunction]
+#[pyo3(signature = (numerator, divisor, *, naive = false))]
+pub fn series_divide<'py>(
+    py: Python<'py>,
+    numerator: PyReadonlyArray1<'py, f64>,
+    divisor: PyReadonlyArray1<'py, f64>,
+    naive: bool,
+) -> PyResult<Array<'py>> {
+    let (n, d) = (vector("numerator", &numerator)?, vector("divisor", &divisor)?);
+    let quotient = detached(py, || {
+        check_length("divisor", n.len(), d.len())?;
+        if naive {
+            series::divide_naive(&n, &d)
+        } else {
+            series::divide(&n, &d)
+        }
+    })?;
+    Ok(PyArray1::from_vec(py, quotient))
+}
+
+#[pyfunction]
+pub fn fractional_integral<'py>(
+    py: Python<'py>,
+    x: PyReadonlyArray2<'py, f64>,
+    order: f64,
+    step: f64,
+    rule: &str,
+) -> PyResult<Matrix<'py>> {
+    let rule = match rule {
+        "block-pulse" => IntegralRule::BlockPulse,
+        "trapezoidal" => IntegralRule::Trapezoidal,
+        "grunwald-letnikov" => IntegralRule::GrunwaldLetnikov,
+        other => return Err(choice("rule", other, "block-pulse, trapezoidal, grunwald-letnikov").into()),
+    };
+    let all = rows(&x);
+    let out = detached(py, || all.iter().map(|row| fractional::fractional_integral(row, order, step, rule)).collect())?;
+    reshaped(py, out, columns(&x))
+}
+
+#[pyfunction]
+pub fn fractional_derivative<'py>(
+    py: Python<'py>,
+    x: PyReadonlyArray2<'py, f64>,
+    order: f64,
+    step: f64,
+    definition: &str,
+    initial: PyReadonlyArray2<'py, f64>,
+) -> PyResult<Matrix<'py>> {
+    let definition = match definition {
+        "grunwald-letnikov" => Derivative::GrunwaldLetnikov,
+        "riemann-liouville" => Derivative::RiemannLiouville,
+        "caputo" => Derivative::Caputo,
+        other => return Err(choice("definition", other, "grunwald-letnikov, riemann-liouville, caputo").into()),
+    };
+    let (all, starts) = (rows(&x), rows(&initial));
+    let out = detached(py, || {
+        check_length("initial", all.len(), starts.len())?;
+        all.iter()
+            .zip(&starts)
+            .map(|(row, start)| fractional::fractional_derivative(row, order, step, definition, start))
+            .collect()
+    })?;
+    reshaped(py, out, columns(&x))
+}
+
+fn reshaped(py: Python<'_>, all: Vec<Vec<f64>>, width: usize) -> PyResult<Matrix<'_>> {
+    use numpy::PyArrayMethods;
+    PyArray1::from_vec(py, all.concat()).reshape([all.len(), width])
+}
+
+#[pyfunction]
+pub fn pulse_means<'py>(
+    py: Python<'py>,
+    samples: PyReadonlyArray1<'py, f64>,
+    m: usize,
+    hold: bool,
+) -> PyResult<Array<'py>> {
+    let samples = vector("samples", &samples)?;
+    let between = if hold { Intersample::Hold } else { Intersample::Linear };
+    Ok(PyArray1::from_vec(py, detached(py, || means::pulse_means(&samples, m, between))?))
+}
+
+#[pyfunction]
+pub fn point_samples<'py>(py: Python<'py>, means: PyReadonlyArray1<'py, f64>) -> Array<'py> {
+    let values: Vec<f64> = means.as_array().iter().copied().collect();
+    PyArray1::from_vec(py, means::point_samples(&values))
+}
+
+#[pyfunction]
+pub fn delayed<'py>(
+    py: Python<'py>,
+    samples: PyReadonlyArray1<'py, f64>,
+    delay: f64,
+    before: f64,
+) -> PyResult<Array<'py>> {
+    let samples = vector("samples", &samples)?;
+    Ok(PyArray1::from_vec(py, detached(py, || means::delayed(&samples, delay, before))?))
+}
+
+#[pyfunction]
+pub fn filter_series(
+    py: Python<'_>,
+    numerator: Vec<(f64, f64)>,
+    denominator: Vec<(f64, f64)>,
+    m: usize,
+    step: f64,
+) -> PyResult<Array<'_>> {
+    let filter = Filter { numerator, denominator };
+    Ok(PyArray1::from_vec(py, detached(py, || filter.series(m, step))?))
+}

@@ -1,0 +1,239 @@
+//! Order searches, watched for Ctrl-C while they run.
+
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{channel, RecvTimeoutError};
+use std::time::Duration;
+
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use super::arrays::{initial, records, InitialArg, RecordArg};
+use super::errors::caught;
+use crate::equation::AffineOrder;
+use crate::error::Error;
+use crate::estimate::multi_innovation::{Innovation, Rows};
+use crate::search::lattice::{Lattice, LawEquation, LawLattice, TermAxis};
+use crate::search::run::{self, Control, Counts, Criterion, Estimator, Failure, Norm, Options};
+use crate::search::stage;
+
+/// How often Python is asked for signals: well under the half second after which Ctrl-C must have ended a search.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Runs `work` on a thread of its own, so that this one can watch for signals and report progress.
+fn watched<T: Send>(
+    py: Python<'_>,
+    progress: Option<&Py<PyAny>>,
+    work: impl FnOnce(&Control) -> Result<T, Error> + Send,
+) -> PyResult<T> {
+    let control = Control::default();
+    let result = py.detach(|| {
+        std::thread::scope(|scope| {
+            let (finished, wait) = channel::<()>();
+            let worker = scope.spawn(|| {
+                let result = caught(|| work(&control));
+                drop(finished);
+                result
+            });
+            let mut raised: Option<PyErr> = None;
+            while let Err(RecvTimeoutError::Timeout) = wait.recv_timeout(LOOK) {
+                let look = Python::attach(|py| {
+                    py.check_signals()?;
+                    if let Some(progress) = progress {
+                        let (done, total) =
+                            (control.done.load(Ordering::Relaxed), control.total.load(Ordering::Relaxed));
+                        progress.call1(py, (done, total))?;
+                    }
+                    Ok::<_, PyErr>(())
+                });
+                if let Err(error) = look {
+                    control.stop.store(true, Ordering::Relaxed);
+                    raised.get_or_insert(error);
+                }
+            }
+            let result = worker
+                .join()
+                .unwrap_or_else(|_| Err(Error::Internal { what: "the search thread ended without a result".into() }));
+            match raised {
+                Some(error) => Err(error),
+                None => result.map_err(PyErr::from),
+            }
+        })
+    })?;
+    if let Some(progress) = progress {
+        progress.call1(py, (control.done.load(Ordering::Relaxed), control.total.load(Ordering::Relaxed)))?;
+    }
+    Ok(result)
+}
+
+/// (criterion, norm, p or 0 for least squares, K₀, Haar rows, keep, threads, early stopping).
+type OptionsArg = (String, String, usize, f64, bool, usize, usize, bool);
+
+fn options(argument: OptionsArg, terms: InitialArg) -> PyResult<Options> {
+    let (criterion, norm, length, prior_covariance, haar, keep, threads, early_stopping) = argument;
+    let unknown = |what: String, remedy: &str| Error::Structure { what, remedy: remedy.into() };
+    Ok(Options {
+        criterion: match criterion.as_str() {
+            "output-error" => Criterion::OutputError,
+            "equation-error" => Criterion::EquationError,
+            other => {
+                let what = format!("criterion '{other}' is not known");
+                return Err(unknown(what, "use output-error or equation-error").into());
+            }
+        },
+        norm: match norm.as_str() {
+            "l1" => Norm::L1,
+            "l2" => Norm::L2,
+            other => return Err(unknown(format!("norm '{other}' is not known"), "use l1 or l2").into()),
+        },
+        estimator: if length == 0 {
+            Estimator::LeastSquares
+        } else {
+            let rows = if haar { Rows::Haar } else { Rows::Time };
+            Estimator::MultiInnovation(Innovation { length, prior_covariance, rows })
+        },
+        initial: initial(terms)?,
+        keep,
+        threads,
+        early_stopping,
+    })
+}
+
+fn counted<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
+    let dict = PyDict::new(py);
+    dict.set_item("candidates", counts.candidates)?;
+    dict.set_item("kept", counts.kept)?;
+    dict.set_item("beaten", counts.beaten)?;
+    dict.set_item("stopped early", counts.stopped)?;
+    dict.set_item("singular", counts.singular)?;
+    dict.set_item("diverged", counts.diverged)?;
+    Ok(dict)
+}
+
+fn named(failure: Failure) -> &'static str {
+    match failure {
+        Failure::Singular => "singular",
+        Failure::Diverged => "diverged",
+    }
+}
+
+/// (output, values of alpha, [(signal, values, interchangeable), …]).
+type LatticeArg = (usize, Vec<f64>, Vec<(usize, Vec<f64>, bool)>);
+
+fn lattice(argument: LatticeArg, inputs: &[bool]) -> Result<Lattice, Error> {
+    let (output, alphas, axes) = argument;
+    let axes: Vec<TermAxis> = axes
+        .into_iter()
+        .map(|(signal, values, interchangeable)| TermAxis { signal, values, interchangeable })
+        .collect();
+    Lattice::new(output, &alphas, &axes, |s| inputs.get(s).copied().unwrap_or(false))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn lattice_size(py: Python<'_>, orders: LatticeArg, inputs: Vec<bool>) -> PyResult<u64> {
+    super::errors::detached(py, || Ok(lattice(orders, &inputs)?.count()))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+pub fn search<'py>(
+    py: Python<'py>,
+    runs: Vec<RecordArg<'py>>,
+    orders: LatticeArg,
+    inputs: Vec<bool>,
+    fixed: Vec<Option<f64>>,
+    terms: InitialArg,
+    settings: OptionsArg,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let records = records(&runs)?;
+    let options = options(settings, terms)?;
+    let (lattice, outcome) = watched(py, progress.as_ref(), |control| {
+        let lattice = lattice(orders, &inputs)?;
+        let outcome = run::search(&records, &lattice, &fixed, &options, control)?;
+        Ok((lattice, outcome))
+    })?;
+    let rows: Vec<_> = outcome
+        .rows
+        .into_iter()
+        .map(|row| {
+            let structure = lattice.structure(row.index);
+            let orders: Vec<f64> = structure.terms.iter().map(|t| t.order).collect();
+            (row.index, row.score, structure.order, orders, row.coefficients, row.initial)
+        })
+        .collect();
+    let failures: Vec<(u64, f64, Vec<f64>, &str)> = outcome
+        .failures
+        .iter()
+        .map(|&(index, failure)| {
+            let structure = lattice.structure(index);
+            let orders = structure.terms.iter().map(|t| t.order).collect();
+            (index, structure.order, orders, named(failure))
+        })
+        .collect();
+    let dict = PyDict::new(py);
+    dict.set_item("rows", rows)?;
+    dict.set_item("counts", counted(py, &outcome.counts)?)?;
+    dict.set_item("failures", failures)?;
+    Ok(dict)
+}
+
+/// (constant, weight of each free order).
+type AffineArg = (f64, Vec<f64>);
+/// (output, alpha, [(signal, order), …]).
+type LawEquationArg = (usize, AffineArg, Vec<(usize, AffineArg)>);
+
+fn affine((constant, weights): AffineArg) -> AffineOrder {
+    AffineOrder { constant, weights }
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+pub fn search_stage<'py>(
+    py: Python<'py>,
+    runs: Vec<RecordArg<'py>>,
+    axes: Vec<Vec<f64>>,
+    laws: Vec<LawEquationArg>,
+    inputs: Vec<bool>,
+    fixed: Vec<Vec<Option<f64>>>,
+    scales: Vec<f64>,
+    terms: InitialArg,
+    settings: OptionsArg,
+    progress: Option<Py<PyAny>>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let records = records(&runs)?;
+    let options = options(settings, terms)?;
+    let equations: Vec<LawEquation> = laws
+        .into_iter()
+        .map(|(output, order, terms)| LawEquation {
+            output,
+            order: affine(order),
+            terms: terms.into_iter().map(|(signal, order)| (signal, affine(order))).collect(),
+        })
+        .collect();
+    let outcome = watched(py, progress.as_ref(), |control| {
+        let lattice = LawLattice::new(&axes, &equations, &inputs)?;
+        stage::search(&records, &lattice, &fixed, &scales, &options, control)
+    })?;
+    let rows: Vec<_> = outcome
+        .rows
+        .into_iter()
+        .map(|row| {
+            let parts: Vec<_> = row
+                .structures
+                .iter()
+                .zip(row.rows)
+                .map(|(structure, part)| {
+                    let orders: Vec<f64> = structure.terms.iter().map(|t| t.order).collect();
+                    (part.score, structure.order, orders, part.coefficients, part.initial)
+                })
+                .collect();
+            (row.index, row.score, row.free, parts)
+        })
+        .collect();
+    let dict = PyDict::new(py);
+    dict.set_item("rows", rows)?;
+    dict.set_item("counts", counted(py, &outcome.counts)?)?;
+    dict.set_item("distinct", outcome.distinct)?;
+    Ok(dict)
+}

@@ -1,0 +1,101 @@
+//! Free runs, the two errors, explicit Euler and the four figures.
+
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
+use pyo3::prelude::*;
+
+use super::arrays::{equations, initial, record, rows, stacked, vector, EquationArg, InitialArg, RecordArg};
+use super::errors::detached;
+use crate::error::{check_finite, check_length, check_step};
+use crate::simulate::{self, OutputFilter};
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn respond<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    model: Vec<EquationArg>,
+    inputs: Vec<bool>,
+    terms: Vec<Vec<(f64, f64)>>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let record = record(&run)?;
+    let equations = equations(model, record.len(), &inputs)?;
+    let outputs = detached(py, || simulate::respond(&equations, &record, &terms))?;
+    stacked(py, &outputs)
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
+pub fn respond_with_initial<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    model: Vec<EquationArg>,
+    inputs: Vec<bool>,
+    terms: InitialArg,
+    filter: Option<(PyReadonlyArray1<'py, f64>, Vec<bool>)>,
+) -> PyResult<(Bound<'py, PyArray2<f64>>, Vec<Vec<f64>>, Vec<Vec<f64>>)> {
+    let record = record(&run)?;
+    let equations = equations(model, record.len(), &inputs)?;
+    let initial = initial(terms)?;
+    let filter = filter.map(|(series, applies)| Ok::<_, PyErr>((vector("filter", &series)?, applies))).transpose()?;
+    let response = detached(py, || {
+        let filter = match &filter {
+            None => None,
+            Some((series, applies)) => {
+                check_length("filter", record.m(), series.len())?;
+                check_length("filtered outputs", equations.len(), applies.len())?;
+                Some(OutputFilter { series, applies })
+            }
+        };
+        simulate::respond_with_initial(&equations, &record, &initial, filter)
+    })?;
+    Ok((stacked(py, &response.outputs)?, response.exponents, response.initial))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn equation_error<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    equation: EquationArg,
+    inputs: Vec<bool>,
+    terms: InitialArg,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let record = record(&run)?;
+    let equations = equations(vec![equation], record.len(), &inputs)?;
+    let initial = initial(terms)?;
+    Ok(PyArray1::from_vec(py, detached(py, || simulate::equation_error(&equations[0], &record, &initial))?))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn explicit_euler<'py>(
+    py: Python<'py>,
+    signals: PyReadonlyArray2<'py, f64>,
+    step: f64,
+    model: Vec<EquationArg>,
+    inputs: Vec<bool>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let signals = rows(&signals);
+    let equations = equations(model, signals.len(), &inputs)?;
+    let outputs = detached(py, || {
+        check_step(step)?;
+        for (i, signal) in signals.iter().enumerate() {
+            check_finite(&format!("signal {i}"), signal)?;
+        }
+        simulate::explicit_euler(&equations, &signals, step)
+    })?;
+    stacked(py, &outputs)
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn metrics(
+    measured: PyReadonlyArray1<'_, f64>,
+    residuals: PyReadonlyArray1<'_, f64>,
+) -> PyResult<(f64, f64, f64, f64)> {
+    let measured = vector("measured", &measured)?;
+    let residuals: Vec<f64> = residuals.as_array().iter().copied().collect();
+    check_length("residuals", measured.len(), residuals.len())?;
+    let found = crate::metrics::metrics(&measured, &residuals);
+    Ok((found.error, found.rmse, found.nr, found.fit_percent))
+}

@@ -1,0 +1,226 @@
+//! Records and equations become one bank of distinct regressors I^η s, shared by all candidates of a search.
+
+use std::collections::HashMap;
+
+use crate::equation::{grains, tidy};
+use crate::error::{check_finite, check_length, check_step, Error, Result};
+use crate::fractional::{block_pulse_kernel, power_means};
+use crate::series::{self, Buffers, Kernel};
+
+/// Largest bank kept in memory; beyond it a search refuses to start.
+pub const BANK_LIMIT: u128 = 2 << 30;
+
+/// One run as pulse means: all signals over the same m pulses of length `step`.
+#[derive(Debug, Clone)]
+pub struct Record {
+    step: f64,
+    signals: Vec<Vec<f64>>,
+    filter: Option<Vec<f64>>,
+}
+
+impl Record {
+    /// Checks and takes over pulse means; all signals of equal, non-zero length and finite.
+    ///
+    /// `filter` is the series that the signals went through (a known sensor filter), to be applied to initial terms.
+    ///
+    /// # Errors
+    /// [`Error::Length`], [`Error::NotFinite`] naming the signal by number, [`Error::OutOfRange`] for the step.
+    pub fn new(step: f64, signals: Vec<Vec<f64>>, filter: Option<Vec<f64>>) -> Result<Self> {
+        check_step(step)?;
+        let m = signals.first().map_or(0, Vec::len);
+        if m == 0 {
+            return Err(Error::Length { name: "signal 0".into(), expected: 1, found: 0 });
+        }
+        for (i, signal) in signals.iter().enumerate() {
+            let name = format!("signal {i}");
+            check_length(&name, m, signal.len())?;
+            check_finite(&name, signal)?;
+        }
+        if let Some(series) = &filter {
+            check_length("filter", m, series.len())?;
+        }
+        Ok(Self { step, signals, filter })
+    }
+
+    /// Number of pulses.
+    #[must_use]
+    pub fn m(&self) -> usize {
+        self.signals[0].len()
+    }
+
+    /// Pulse width [s].
+    #[must_use]
+    pub fn step(&self) -> f64 {
+        self.step
+    }
+
+    /// Number of signals.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.signals.len()
+    }
+
+    /// Never true: a record holds at least one signal.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.signals.is_empty()
+    }
+
+    /// Pulse means of a signal.
+    #[must_use]
+    pub fn signal(&self, index: usize) -> &[f64] {
+        &self.signals[index]
+    }
+
+    /// I^η of a signal.
+    #[must_use]
+    pub fn integral(&self, signal: usize, eta: f64) -> Vec<f64> {
+        series::multiply(&block_pulse_kernel(eta, self.m(), self.step), &self.signals[signal], self.m())
+    }
+
+    /// Pulse means of the initial term t^exponent, through the sensor filter where there is one.
+    #[must_use]
+    pub fn initial_term(&self, exponent: f64) -> Vec<f64> {
+        let powers = power_means(exponent, self.m(), self.step);
+        match &self.filter {
+            None => powers,
+            Some(filter) => series::multiply(filter, &powers, self.m()),
+        }
+    }
+}
+
+/// What a column of a bank is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Key {
+    /// I^η of a signal; η in grains.
+    Integral {
+        /// Signal of the record.
+        signal: usize,
+        /// Integration order, see [`grains`].
+        order: i64,
+    },
+    /// t^e; e in grains.
+    Initial {
+        /// Exponent, see [`grains`].
+        exponent: i64,
+    },
+}
+
+impl Key {
+    /// The key of I^eta of a signal.
+    #[must_use]
+    pub fn integral(signal: usize, eta: f64) -> Self {
+        Self::Integral { signal, order: grains(eta) }
+    }
+
+    /// The key of an initial term.
+    #[must_use]
+    pub fn initial(exponent: f64) -> Self {
+        Self::Initial { exponent: grains(exponent) }
+    }
+}
+
+/// Distinct regressors in order of first mention, the same order for every record of a search.
+#[derive(Debug, Default, Clone)]
+pub struct Index {
+    keys: Vec<Key>,
+    positions: HashMap<Key, usize>,
+}
+
+impl Index {
+    /// Position of a key, added at the end if new.
+    pub fn insert(&mut self, key: Key) -> usize {
+        let keys = &mut self.keys;
+        *self.positions.entry(key).or_insert_with(|| {
+            keys.push(key);
+            keys.len() - 1
+        })
+    }
+
+    /// Position of a key.
+    #[must_use]
+    pub fn get(&self, key: Key) -> Option<usize> {
+        self.positions.get(&key).copied()
+    }
+
+    /// All keys in order.
+    #[must_use]
+    pub fn keys(&self) -> &[Key] {
+        &self.keys
+    }
+}
+
+/// The columns of an [`Index`] on one record.
+pub struct Bank {
+    columns: Vec<Vec<f64>>,
+    /// Kernels of the output's own regressors, by position; empty for all others.
+    kernels: Vec<Vec<f64>>,
+}
+
+impl Bank {
+    /// Computes every column; `output` is the signal whose kernels simulation needs.
+    ///
+    /// One pair of transforms a column. O(columns · m log m), memory 8·m bytes a column (twice for the output's own).
+    ///
+    /// # Errors
+    /// [`Error::BankTooLarge`] beyond [`BANK_LIMIT`].
+    #[allow(clippy::cast_precision_loss)]
+    pub fn new(index: &Index, record: &Record, output: usize) -> Result<Self> {
+        let m = record.m();
+        let own = index.keys.iter().filter(|k| matches!(k, Key::Integral { signal, .. } if *signal == output)).count();
+        let bytes = 8 * m as u128 * (index.keys.len() + own) as u128;
+        if bytes > BANK_LIMIT {
+            return Err(Error::BankTooLarge { columns: index.keys.len(), m, bytes, limit: BANK_LIMIT });
+        }
+        let mut buffers = Buffers::default();
+        let mut spectra: HashMap<usize, Kernel> = HashMap::new();
+        let mut columns = Vec::with_capacity(index.keys.len());
+        let mut kernels = Vec::with_capacity(index.keys.len());
+        for key in &index.keys {
+            match *key {
+                Key::Integral { signal, order } => {
+                    let kernel = block_pulse_kernel(tidy(order as f64 / 1e9), m, record.step());
+                    let column = if order == 0 {
+                        record.signal(signal).to_vec()
+                    } else {
+                        let mut column = vec![0.0; m];
+                        let spectrum = spectra.entry(signal).or_insert_with(|| Kernel::new(record.signal(signal)));
+                        spectrum.apply(&kernel, &mut column, &mut buffers);
+                        column
+                    };
+                    columns.push(column);
+                    kernels.push(if signal == output { kernel } else { Vec::new() });
+                }
+                Key::Initial { exponent } => {
+                    columns.push(record.initial_term(exponent as f64 / 1e9));
+                    kernels.push(Vec::new());
+                }
+            }
+        }
+        Ok(Self { columns, kernels })
+    }
+
+    /// Column at a position.
+    #[must_use]
+    pub fn column(&self, position: usize) -> &[f64] {
+        &self.columns[position]
+    }
+
+    /// Kernel of an own-output column.
+    #[must_use]
+    pub fn kernel(&self, position: usize) -> &[f64] {
+        &self.kernels[position]
+    }
+
+    /// Number of columns.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.columns.len()
+    }
+
+    /// Whether there is no column.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.columns.is_empty()
+    }
+}

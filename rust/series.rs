@@ -1,0 +1,375 @@
+//! Truncated power series in the one-step delay: multiply, divide, apply, and the naive oracles beside them.
+//!
+//! A causal operator on pulse means is a polynomial in the delay z cut off at z^m; F^η is one of them
+//! ([`crate::fractional::block_pulse_kernel`]). All such operators commute. Products are convolutions by FFT,
+//! O(m log m). Division is forward substitution in blocks joined by FFT products, O(m log² m): exact for every
+//! divisor with a leading coefficient, stable or not. [`Division`] hands out the quotient block by block, so that a
+//! search can stop reading a candidate that has lost.
+
+use crate::error::{check_length, Error, Result};
+use crate::fft::{self, Bin, Plan, Workspace};
+
+/// Below this length a product is formed directly: it is faster there and free of transform rounding.
+const DIRECT: usize = 64;
+
+/// Length of a block of forward substitution; measured best of 16, 32, 64, 128 at m = 2048.
+pub const BLOCK: usize = 64;
+
+/// Product mod z^m by definition: the oracle of [`multiply`]. O(m²).
+#[must_use]
+pub fn multiply_naive(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
+    let mut out = vec![0.0; m];
+    for (i, &x) in a.iter().enumerate().take(m) {
+        for (value, &y) in out[i..].iter_mut().zip(b) {
+            *value += x * y;
+        }
+    }
+    out
+}
+
+/// Product mod z^m, equivalently the causal convolution of a kernel with a signal. O(m log m).
+#[must_use]
+pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
+    let (a, b) = (&a[..a.len().min(m)], &b[..b.len().min(m)]);
+    if a.len().min(b.len()) <= DIRECT {
+        return multiply_naive(a, b, m);
+    }
+    let kernel = Kernel::with_length(a, a.len() + b.len());
+    let mut out = vec![0.0; m];
+    kernel.apply(b, &mut out, &mut Buffers::default());
+    out
+}
+
+/// Reusable memory of the transforms of one thread.
+#[derive(Default)]
+pub struct Buffers {
+    time: Vec<f64>,
+    spectrum: Vec<Bin>,
+    workspace: Workspace,
+}
+
+/// A series with its spectrum, to be applied to many signals: two transforms each.
+pub struct Kernel {
+    plan: Plan,
+    spectrum: Vec<Bin>,
+}
+
+impl Kernel {
+    /// Caches a series of length m for signals of up to m points.
+    #[must_use]
+    pub fn new(series: &[f64]) -> Self {
+        Self::with_length(series, 2 * series.len())
+    }
+
+    fn with_length(series: &[f64], total: usize) -> Self {
+        let plan = fft::plan(fft::fast_length(total));
+        let mut time = vec![0.0; plan.len()];
+        time[..series.len()].copy_from_slice(series);
+        let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
+        plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+        Self { plan, spectrum }
+    }
+
+    /// The first `out.len()` terms of the product with `signal`; neither longer than the length cached for.
+    pub fn apply(&self, signal: &[f64], out: &mut [f64], buffers: &mut Buffers) {
+        buffers.time.clear();
+        buffers.time.extend_from_slice(signal);
+        buffers.time.resize(self.plan.len(), 0.0);
+        buffers.spectrum.resize(self.plan.bins(), Bin::new(0.0, 0.0));
+        let spectrum = &mut buffers.spectrum[..self.plan.bins()];
+        self.plan.forward(&mut buffers.time, spectrum, &mut buffers.workspace);
+        for (x, k) in spectrum.iter_mut().zip(&self.spectrum) {
+            *x *= k;
+        }
+        self.plan.inverse(spectrum, &mut buffers.time, &mut buffers.workspace);
+        let read = out.len().min(buffers.time.len());
+        out[..read].copy_from_slice(&buffers.time[..read]);
+    }
+}
+
+/// Quotient `numerator / divisor` mod z^m by plain forward substitution: the oracle of [`divide`]. O(m²).
+///
+/// # Errors
+/// [`Error::LeadingZero`] where the divisor starts with zero.
+pub fn divide_naive(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
+    let leading = check_leading(divisor)?;
+    let mut quotient = numerator.to_vec();
+    for k in 0..quotient.len() {
+        quotient[k] /= leading;
+        let value = quotient[k];
+        for (rest, &d) in quotient[k + 1..].iter_mut().zip(&divisor[1..]) {
+            *rest -= d * value;
+        }
+    }
+    Ok(quotient)
+}
+
+/// Quotient mod z^m, m the numerator's length; exact whether or not the divisor is stable. O(m log² m).
+///
+/// # Errors
+/// [`Error::LeadingZero`] where the divisor starts with zero, [`Error::Length`] where it is shorter than m.
+pub fn divide(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
+    let quotient = solve(&[vec![divisor]], &[numerator])?;
+    quotient.into_iter().next().ok_or_else(|| Error::Internal { what: "a division without a quotient".into() })
+}
+
+fn check_leading(divisor: &[f64]) -> Result<f64> {
+    match divisor.first() {
+        Some(&d) if d != 0.0 && d.is_finite() => Ok(d),
+        first => Err(Error::LeadingZero { leading: first.copied().unwrap_or(0.0) }),
+    }
+}
+
+/// Solves the n × n system Σ_j A_ij y_j = b_i of series mod z^m, A_ij of length m at least. O(n² m log² m).
+///
+/// # Errors
+/// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
+pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<Vec<f64>>> {
+    let n = rhs.len();
+    let m = rhs.first().map_or(0, |b| b.len());
+    check_length("matrix of series", n, matrix.len())?;
+    for row in matrix {
+        check_length("row of the matrix of series", n, row.len())?;
+        for series in row {
+            if series.as_ref().len() < m {
+                return Err(Error::Length { name: "series".into(), expected: m, found: series.as_ref().len() });
+            }
+        }
+    }
+    for b in rhs {
+        check_length("right-hand side", m, b.len())?;
+    }
+    let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(|s| s.as_ref()[0])).collect();
+    let inverse = crate::small::inverse(&leading, n)?;
+    let mut division = Division::new(n, m);
+    let mut start = 0;
+    while start < m {
+        let end = (start + BLOCK).min(m);
+        for (i, b) in rhs.iter().enumerate() {
+            division.add(i, start, &b[start..end]);
+        }
+        division.advance(&inverse, |i, j, len| &matrix[i][j].as_ref()[..len]);
+        start = end;
+    }
+    Ok(division.into_quotients())
+}
+
+/// An n × n division under way: blocks of the quotients come out in order.
+///
+/// Right-hand sides are added block by block ([`Division::add`]), then [`Division::advance`] solves the next block and
+/// adds its effect on the rest. After block b the only finished left half of the recursion is the one whose length is
+/// the largest power of two that divides b + 1, so one transform pair a block carries the whole recursion.
+pub struct Division {
+    n: usize,
+    m: usize,
+    solved: usize,
+    /// Right-hand side less what solved blocks contribute, then the quotient, per unknown.
+    rest: Vec<Vec<f64>>,
+    /// Spectra of the n² series, per power of two of blocks; made when first needed.
+    levels: Vec<Option<Vec<Vec<Bin>>>>,
+    spectra: Vec<Vec<Bin>>,
+    product: Vec<Bin>,
+    time: Vec<f64>,
+    workspace: Workspace,
+}
+
+impl Division {
+    /// A division of n unknown series of m terms.
+    #[must_use]
+    pub fn new(n: usize, m: usize) -> Self {
+        Self {
+            n,
+            m,
+            solved: 0,
+            rest: vec![vec![0.0; m]; n],
+            levels: Vec::new(),
+            spectra: vec![Vec::new(); n],
+            product: Vec::new(),
+            time: Vec::new(),
+            workspace: Workspace::new(),
+        }
+    }
+
+    /// Forgets everything but the memory.
+    pub fn reset(&mut self) {
+        self.solved = 0;
+        self.levels.iter_mut().for_each(|level| *level = None);
+        self.rest.iter_mut().for_each(|r| r.fill(0.0));
+    }
+
+    /// Number of terms solved so far.
+    #[must_use]
+    pub fn solved(&self) -> usize {
+        self.solved
+    }
+
+    /// Adds to the right-hand side of equation i from term `start` on; `start` must not be solved yet.
+    pub fn add(&mut self, i: usize, start: usize, values: &[f64]) {
+        for (rest, &v) in self.rest[i][start..].iter_mut().zip(values) {
+            *rest += v;
+        }
+    }
+
+    /// Quotient i as far as solved.
+    #[must_use]
+    pub fn quotient(&self, i: usize) -> &[f64] {
+        &self.rest[i][..self.solved]
+    }
+
+    /// All quotients.
+    #[must_use]
+    pub fn into_quotients(self) -> Vec<Vec<f64>> {
+        self.rest
+    }
+
+    /// How many terms of each series the next [`Division::advance`] reads.
+    #[must_use]
+    pub fn reads(&self) -> usize {
+        let hi = (self.solved + BLOCK).min(self.m);
+        if hi == self.m {
+            return hi - self.solved;
+        }
+        (2 * (BLOCK << (hi / BLOCK).trailing_zeros())).min(self.m)
+    }
+
+    /// Number of terms in all.
+    #[must_use]
+    pub fn terms(&self) -> usize {
+        self.m
+    }
+
+    /// Solves the next block and joins it to the rest. `inverse` is the row-major inverse of the leading matrix;
+    /// `series(i, j, len)` gives the first `len` terms of A_ij (fewer where m is less), never more than
+    /// [`Division::reads`].
+    pub fn advance<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
+        self.solve_block(inverse, &series);
+        self.join(&series);
+    }
+
+    /// The first half of [`Division::advance`]: the next block of the quotients, by forward substitution.
+    pub fn solve_block<'a>(&mut self, inverse: &[f64], series: impl Fn(usize, usize, usize) -> &'a [f64]) {
+        let lo = self.solved;
+        let hi = (lo + BLOCK).min(self.m);
+        self.substitute(inverse, &series, lo, hi);
+        self.solved = hi;
+    }
+
+    /// The second half of [`Division::advance`]: what the solved blocks contribute to those after them.
+    pub fn join<'a>(&mut self, series: impl Fn(usize, usize, usize) -> &'a [f64]) {
+        let (n, hi) = (self.n, self.solved);
+        if hi == self.m {
+            return;
+        }
+        let lo = hi.saturating_sub(BLOCK);
+        let blocks = hi / BLOCK;
+        let level = blocks.trailing_zeros() as usize;
+        let half = BLOCK << level;
+        let end = (hi + half).min(self.m);
+        if half <= DIRECT {
+            for i in 0..n {
+                for j in 0..n {
+                    let a = series(i, j, (2 * half).min(self.m));
+                    // Split borrows: the solved part of j feeds the open part of i.
+                    for s in lo..hi {
+                        let y = self.rest[j][s];
+                        let kernel = &a[hi - s..];
+                        for (rest, &v) in self.rest[i][hi..end].iter_mut().zip(kernel) {
+                            *rest -= v * y;
+                        }
+                    }
+                }
+            }
+            return;
+        }
+        let plan = fft::plan(2 * half);
+        self.prepare(level, &plan, &series);
+        let zero = Bin::new(0.0, 0.0);
+        self.time.resize(self.time.len().max(plan.len()), 0.0);
+        self.product.resize(self.product.len().max(plan.bins()), zero);
+        for j in 0..n {
+            let time = &mut self.time[..plan.len()];
+            time[..half].copy_from_slice(&self.rest[j][hi - half..hi]);
+            time[half..].fill(0.0);
+            let bins = plan.bins().max(self.spectra[j].len());
+            self.spectra[j].resize(bins, zero);
+            plan.forward(time, &mut self.spectra[j][..plan.bins()], &mut self.workspace);
+        }
+        let Some(kernels) = self.levels.get(level).and_then(Option::as_ref) else { return };
+        for i in 0..n {
+            let product = &mut self.product[..plan.bins()];
+            product.fill(zero);
+            for j in 0..n {
+                for ((p, x), k) in product.iter_mut().zip(&self.spectra[j]).zip(&kernels[i * n + j]) {
+                    *p += x * k;
+                }
+            }
+            // The wrapped part of the cyclic product falls on the first half, which is not read.
+            plan.inverse(product, &mut self.time[..plan.len()], &mut self.workspace);
+            for (rest, &v) in self.rest[i][hi..end].iter_mut().zip(&self.time[half..]) {
+                *rest -= v;
+            }
+        }
+    }
+
+    fn substitute<'a>(
+        &mut self,
+        inverse: &[f64],
+        series: &impl Fn(usize, usize, usize) -> &'a [f64],
+        lo: usize,
+        hi: usize,
+    ) {
+        let n = self.n;
+        if n == 1 {
+            let a = series(0, 0, hi - lo);
+            let block = &mut self.rest[0][lo..hi];
+            for k in 0..block.len() {
+                block[k] *= inverse[0];
+                let y = block[k];
+                let (_, later) = block.split_at_mut(k + 1);
+                for (rest, &v) in later.iter_mut().zip(&a[1..]) {
+                    *rest -= v * y;
+                }
+            }
+            return;
+        }
+        let mut values = vec![0.0; n];
+        for k in lo..hi {
+            for (i, value) in values.iter_mut().enumerate() {
+                *value = (0..n).map(|j| inverse[i * n + j] * self.rest[j][k]).sum();
+            }
+            for (j, &y) in values.iter().enumerate() {
+                self.rest[j][k] = y;
+            }
+            for i in 0..n {
+                for (j, &y) in values.iter().enumerate() {
+                    let a = series(i, j, hi - lo);
+                    for (rest, &v) in self.rest[i][k + 1..hi].iter_mut().zip(&a[1..]) {
+                        *rest -= v * y;
+                    }
+                }
+            }
+        }
+    }
+
+    fn prepare<'a>(&mut self, level: usize, plan: &Plan, series: &impl Fn(usize, usize, usize) -> &'a [f64]) {
+        if self.levels.len() <= level {
+            self.levels.resize_with(level + 1, || None);
+        }
+        if self.levels[level].is_some() {
+            return;
+        }
+        let mut spectra = Vec::with_capacity(self.n * self.n);
+        let mut time = vec![0.0; plan.len()];
+        for i in 0..self.n {
+            for j in 0..self.n {
+                let a = series(i, j, plan.len().min(self.m));
+                time[..a.len()].copy_from_slice(a);
+                time[a.len()..].fill(0.0);
+                let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
+                plan.forward(&mut time, &mut spectrum, &mut self.workspace);
+                spectra.push(spectrum);
+            }
+        }
+        self.levels[level] = Some(spectra);
+    }
+}

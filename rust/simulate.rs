@@ -1,0 +1,243 @@
+//! Response of an equation and of a coupled model, the two errors of a model, and the explicit Euler baseline.
+
+use crate::equation::{Equation, Initial, ORDER_GRAIN};
+use crate::error::{Error, Result};
+use crate::estimate::least_squares;
+use crate::fractional::block_pulse_kernel;
+use crate::regressors::Record;
+use crate::series;
+
+/// A response with the initial terms that were fitted to the measured outputs.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Response {
+    /// Pulse means of each equation's output.
+    pub outputs: Vec<Vec<f64>>,
+    /// Exponents of the initial terms, per equation.
+    pub exponents: Vec<Vec<f64>>,
+    /// Their coefficients; 0 where dropped as combinations of others.
+    pub initial: Vec<Vec<f64>>,
+}
+
+/// The filter that measured outputs went through, and which of the equations' outputs did.
+#[derive(Debug, Clone, Copy)]
+pub struct OutputFilter<'a> {
+    /// The filter as a series.
+    pub series: &'a [f64],
+    /// One flag an equation.
+    pub applies: &'a [bool],
+}
+
+/// The series system A y = b of some equations: their outputs are unknown, every other signal is read from the record.
+struct System {
+    matrix: Vec<Vec<Vec<f64>>>,
+    rhs: Vec<Vec<f64>>,
+}
+
+impl System {
+    fn new(equations: &[Equation], record: &Record) -> Result<Self> {
+        let m = record.m();
+        let n = equations.len();
+        let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
+        for (i, output) in outputs.iter().enumerate() {
+            if outputs[..i].contains(output) {
+                return Err(Error::Structure {
+                    what: format!("two equations have signal {output} as their output"),
+                    remedy: "give one equation an output".into(),
+                });
+            }
+        }
+        let mut matrix = vec![vec![vec![0.0; m]; n]; n];
+        let mut rhs = vec![vec![0.0; m]; n];
+        for (i, equation) in equations.iter().enumerate() {
+            let structure = &equation.structure;
+            structure.check(record.len(), |s| !outputs.contains(&s))?;
+            matrix[i][i][0] += 1.0;
+            for (k, (term, &c)) in structure.terms.iter().zip(&equation.coefficients).enumerate() {
+                let eta = structure.integration(k);
+                match outputs.iter().position(|&o| o == term.signal) {
+                    Some(j) => {
+                        let kernel = block_pulse_kernel(eta, m, record.step());
+                        matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v);
+                    }
+                    None => {
+                        let integral = record.integral(term.signal, eta);
+                        rhs[i].iter_mut().zip(integral).for_each(|(b, v)| *b += c * v);
+                    }
+                }
+            }
+        }
+        Ok(Self { matrix, rhs })
+    }
+
+    fn solve(&self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
+        let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
+        series::solve(&self.matrix, &borrowed)
+    }
+}
+
+/// Free run: pulse means of the outputs of `equations`, driven by the record's other signals.
+///
+/// One equation alone is driven by the measured other outputs (measured coupling); all equations of a stage together
+/// by the currents alone. `initial` holds (exponent, coefficient) pairs per equation, empty at rest. An unstable model
+/// may leave the range of floating point: the values are then not finite. O(n² m log² m).
+///
+/// # Errors
+/// Orders or signals that make no equation, [`Error::LeadingZero`] where the outputs cannot be solved for.
+pub fn respond(equations: &[Equation], record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
+    let system = System::new(equations, record)?;
+    let mut rhs = system.rhs.clone();
+    for (b, terms) in rhs.iter_mut().zip(initial) {
+        for &(exponent, coefficient) in terms {
+            b.iter_mut().zip(record.initial_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
+        }
+    }
+    system.solve(&rhs)
+}
+
+/// Free run whose initial terms are those that bring it closest to the measured outputs.
+///
+/// The response is linear in the initial terms, so they follow by least squares on the output error, each output
+/// weighted by 1/σ of its measurement. They belong to this record alone.
+///
+/// # Errors
+/// As [`respond`].
+pub fn respond_with_initial(
+    equations: &[Equation],
+    record: &Record,
+    initial: &Initial,
+    filter: Option<OutputFilter<'_>>,
+) -> Result<Response> {
+    let system = System::new(equations, record)?;
+    let n = equations.len();
+    let exponents: Vec<Vec<f64>> = equations.iter().map(|e| e.structure.initial_exponents(initial)).collect();
+    let through = |mut outputs: Vec<Vec<f64>>| {
+        if let Some(filter) = filter {
+            for (output, _) in outputs.iter_mut().zip(filter.applies).filter(|(_, &applies)| applies) {
+                *output = series::multiply(filter.series, output, record.m());
+            }
+        }
+        outputs
+    };
+    let mut outputs = through(system.solve(&system.rhs)?);
+    let mut coefficients: Vec<Vec<f64>> = exponents.iter().map(|e| vec![0.0; e.len()]).collect();
+    let finite = |outputs: &[Vec<f64>]| outputs.iter().flatten().all(|v| v.is_finite());
+    if exponents.iter().all(Vec::is_empty) || !finite(&outputs) {
+        return Ok(Response { outputs, exponents, initial: coefficients });
+    }
+    let weights: Vec<f64> = equations.iter().map(|e| weight(record.signal(e.structure.output))).collect();
+    let stack = |outputs: &[Vec<f64>]| -> Vec<f64> {
+        outputs.iter().zip(&weights).flat_map(|(o, w)| o.iter().map(move |v| v * w)).collect()
+    };
+    let mut responses = Vec::new();
+    for (i, list) in exponents.iter().enumerate() {
+        for (e, &exponent) in list.iter().enumerate() {
+            let mut rhs = vec![vec![0.0; record.m()]; n];
+            rhs[i] = record.initial_term(exponent);
+            let response = through(system.solve(&rhs)?);
+            if finite(&response) {
+                responses.push((i, e, response));
+            }
+        }
+    }
+    let columns: Vec<Vec<f64>> = responses.iter().map(|(_, _, r)| stack(r)).collect();
+    let misses: Vec<Vec<f64>> = equations
+        .iter()
+        .zip(&outputs)
+        .map(|(e, o)| record.signal(e.structure.output).iter().zip(o).map(|(y, v)| y - v).collect())
+        .collect();
+    let (solution, _) = least_squares::solve(&columns, &stack(&misses), 0)?;
+    for ((i, e, response), x) in responses.iter().zip(solution) {
+        coefficients[*i][*e] = x;
+        for (output, r) in outputs.iter_mut().zip(response) {
+            output.iter_mut().zip(r).for_each(|(o, v)| *o += x * v);
+        }
+    }
+    Ok(Response { outputs, exponents, initial: coefficients })
+}
+
+#[allow(clippy::cast_precision_loss)]
+fn weight(y: &[f64]) -> f64 {
+    let mean = y.iter().sum::<f64>() / y.len() as f64;
+    let variance = y.iter().map(|v| (v - mean) * (v - mean)).sum::<f64>() / y.len() as f64;
+    if variance > 0.0 {
+        1.0 / variance.sqrt()
+    } else {
+        1.0
+    }
+}
+
+/// Equation error ε = y − Σ c_k I^{α−ν_k} s_k − initial terms, measured y on the right-hand side; the initial terms by
+/// least squares at the given coefficients.
+///
+/// # Errors
+/// Orders or signals that make no equation.
+pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -> Result<Vec<f64>> {
+    equation.structure.check(record.len(), |_| true)?;
+    let fixed: Vec<Option<f64>> = equation.coefficients.iter().copied().map(Some).collect();
+    let records = std::slice::from_ref(record);
+    let regression = least_squares::Regression::new(records, &equation.structure, &fixed, initial)?;
+    let (solution, _) = least_squares::solve(&regression.columns, &regression.target, 0)?;
+    let mut residuals = regression.target;
+    for (column, x) in regression.columns.iter().zip(solution) {
+        residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
+    }
+    Ok(residuals)
+}
+
+/// Integer-order equations stepped by explicit Euler from rest, as the paper's baseline was run.
+///
+/// `signals` are point samples of the record's signals (those of the equations' outputs are ignored), `step` their
+/// step. Every α must be whole, every order of an output whole and below that output's α, every other order 0.
+/// Returns one sample a row for each equation. The values are not finite where Euler's step is unstable.
+///
+/// # Errors
+/// [`Error::Structure`] naming the equation whose orders are not whole.
+#[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -> Result<Vec<Vec<f64>>> {
+    let whole = |order: f64| (order - order.round()).abs() < ORDER_GRAIN && order >= 0.0;
+    let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
+    let alpha: Vec<usize> = equations.iter().map(|e| e.structure.order.round() as usize).collect();
+    for (i, equation) in equations.iter().enumerate() {
+        let structure = &equation.structure;
+        structure.check(signals.len(), |s| !outputs.contains(&s))?;
+        let fits = |term: &crate::equation::Term| match outputs.iter().position(|&o| o == term.signal) {
+            Some(j) => whole(term.order) && (term.order.round() as usize) < alpha[j],
+            None => term.order.abs() < ORDER_GRAIN,
+        };
+        if !whole(structure.order) || !structure.terms.iter().all(fits) {
+            return Err(Error::Structure {
+                what: format!("equation {i} has orders that explicit Euler cannot step"),
+                remedy: "use whole orders below each output's own and order 0 for inputs, or the series simulation"
+                    .into(),
+            });
+        }
+    }
+    let rows = signals.iter().map(Vec::len).min().unwrap_or(0);
+    // states[i][ν] is D^ν of output i.
+    let mut states: Vec<Vec<f64>> = alpha.iter().map(|&a| vec![0.0; a]).collect();
+    let mut out = vec![Vec::with_capacity(rows); equations.len()];
+    for row in 0..rows {
+        let highest: Vec<f64> = equations
+            .iter()
+            .map(|equation| {
+                let terms = equation.structure.terms.iter().zip(&equation.coefficients);
+                terms
+                    .map(|(term, c)| {
+                        c * match outputs.iter().position(|&o| o == term.signal) {
+                            Some(j) => states[j][term.order.round() as usize],
+                            None => signals[term.signal][row],
+                        }
+                    })
+                    .sum()
+            })
+            .collect();
+        for ((samples, state), high) in out.iter_mut().zip(&mut states).zip(highest) {
+            samples.push(state[0]);
+            for nu in 0..state.len() {
+                let slope = state.get(nu + 1).copied().unwrap_or(high);
+                state[nu] += step * slope;
+            }
+        }
+    }
+    Ok(out)
+}
