@@ -1,7 +1,7 @@
 //! Response of an equation and of a coupled model, the two errors of a model, and the explicit Euler baseline.
 
-use crate::equation::{Equation, Initial, ORDER_GRAIN};
-use crate::error::{Error, Result};
+use crate::equation::{Equation, Initial, Structure, ORDER_GRAIN};
+use crate::error::{check_length, Error, Result};
 use crate::estimate::least_squares;
 use crate::fractional::block_pulse_kernel;
 use crate::regressors::Record;
@@ -240,4 +240,81 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
         }
     }
     Ok(out)
+}
+
+/// Σ|y − ŷ| (45) of the free run, at rest, for each row of coefficients of one structure: the convergence of a
+/// recursion. Regressors are made once; each row costs one division.
+///
+/// # Errors
+/// Orders or signals that make no equation, a row of another length.
+pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -> Result<Vec<f64>> {
+    structure.check(record.len(), |_| true)?;
+    let m = record.m();
+    let parts: Vec<(bool, Vec<f64>)> = (0..structure.terms.len())
+        .map(|k| {
+            let (term, eta) = (structure.terms[k], structure.integration(k));
+            if term.signal == structure.output {
+                (true, block_pulse_kernel(eta, m, record.step()))
+            } else {
+                (false, record.integral(term.signal, eta))
+            }
+        })
+        .collect();
+    let measured = record.signal(structure.output);
+    rows.iter()
+        .map(|row| {
+            check_length("coefficients", parts.len(), row.len())?;
+            let mut divisor = vec![0.0; m];
+            divisor[0] = 1.0;
+            let mut numerator = vec![0.0; m];
+            for ((own, part), c) in parts.iter().zip(row) {
+                if *own {
+                    divisor.iter_mut().zip(part).for_each(|(d, v)| *d -= c * v);
+                } else {
+                    numerator.iter_mut().zip(part).for_each(|(n, v)| *n += c * v);
+                }
+            }
+            let response = series::divide(&numerator, &divisor)?;
+            let error: f64 = measured.iter().zip(response).map(|(y, v)| (y - v).abs()).sum();
+            Ok(if error.is_nan() { f64::INFINITY } else { error })
+        })
+        .collect()
+}
+
+/// Margin of the block-pulse scheme itself at the Nyquist frequency, for own-output terms (coefficient, η = α − ν).
+///
+/// The divisor 1 − Σ c F^η at z = −1 is 1 − Σ c h^η A(η)/Γ(η+2) with A(η) = 4(1 − 2^{η+2})·ζ(−η−1), the Abel sum of the
+/// alternating kernel (A(1) = 0, A(2) = −1/2). Where it is not positive the scheme has a mode that grows from pulse to
+/// pulse although the model may be stable: the step must be refined. For D²y = −c y the margin is 1 − c·h²/12.
+#[must_use]
+pub fn nyquist_margin(own_terms: &[(f64, f64)], step: f64) -> f64 {
+    1.0 - own_terms
+        .iter()
+        .map(|&(c, eta)| c * libm::pow(step, eta) * alternating_sum(eta) / libm::tgamma(eta + 2.0))
+        .sum::<f64>()
+}
+
+/// A(η) through the functional equation of ζ: A = 4(1 − 2^{s+1})·2^{−s}π^{−s−1}·sin(−πs/2)·Γ(1+s)·ζ(1+s), s = η + 1.
+fn alternating_sum(eta: f64) -> f64 {
+    use std::f64::consts::PI;
+    let s = eta + 1.0;
+    let zeta =
+        -libm::pow(2.0, -s) * libm::pow(PI, -s - 1.0) * libm::sin(PI * s / 2.0) * libm::tgamma(1.0 + s) * zeta(1.0 + s);
+    4.0 * (1.0 - libm::exp2(s + 1.0)) * zeta
+}
+
+/// ζ(x), x > 1, by Euler–Maclaurin after 16 terms.
+fn zeta(x: f64) -> f64 {
+    const TERMS: f64 = 16.0;
+    let mut sum = 0.0;
+    let mut n = 1.0;
+    while n < TERMS {
+        sum += libm::pow(n, -x);
+        n += 1.0;
+    }
+    let last = libm::pow(TERMS, -x);
+    let slope = x * last / TERMS;
+    let third = slope * (x + 1.0) * (x + 2.0) / (TERMS * TERMS);
+    let fifth = third * (x + 3.0) * (x + 4.0) / (TERMS * TERMS);
+    sum + last * TERMS / (x - 1.0) + 0.5 * last + slope / 12.0 - third / 720.0 + fifth / 30240.0
 }

@@ -1,1 +1,72 @@
-"""temporary"""
+"""Fractional-order models of flexible machines from measured data.
+
+Public names in the order in which a measurement passes them: runs, operators, equations and models, identification and
+order search, simulation and validation.
+"""
+
+from ftlm._core import __version__
+from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
+from ftlm.files import load
+from ftlm.flexible_link import PARAMETERS, LinkParameters, flexible_link, link_model, order_law
+from ftlm.identification import Identification, Trace, identify, multi_innovation_trace
+from ftlm.models import Equation, Model, Order, SensorFilter, Structure, Term, equation, load_model
+from ftlm.operators import (
+    block_pulse_matrix,
+    fractional_derivative,
+    fractional_integral,
+    haar_inverse,
+    haar_matrix,
+    haar_transform,
+    operational_matrix,
+)
+from ftlm.order_search import Lattice, SearchResult, SearchRow, lattice, search_orders
+from ftlm.runs import Run
+from ftlm.simulation import explicit_euler, simulate
+from ftlm.validation import Comparison, Metrics, compare, metrics
+
+__all__ = [
+    "PARAMETERS",
+    "Comparison",
+    "ConvergenceError",
+    "DataError",
+    "Equation",
+    "FtlmError",
+    "Identification",
+    "InternalError",
+    "Lattice",
+    "LinkParameters",
+    "Metrics",
+    "Model",
+    "ModelError",
+    "Order",
+    "RigFault",
+    "Run",
+    "SearchResult",
+    "SearchRow",
+    "SensorFilter",
+    "Structure",
+    "Term",
+    "Trace",
+    "__version__",
+    "block_pulse_matrix",
+    "compare",
+    "equation",
+    "explicit_euler",
+    "flexible_link",
+    "fractional_derivative",
+    "fractional_integral",
+    "haar_inverse",
+    "haar_matrix",
+    "haar_transform",
+    "identify",
+    "lattice",
+    "link_model",
+    "load",
+    "load_model",
+    "metrics",
+    "multi_innovation_trace",
+    "operational_matrix",
+    "order_law",
+    "search_orders",
+    "simulate",
+]

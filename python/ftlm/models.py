@@ -250,7 +250,8 @@ def _derivative(order: Order, signal: str) -> str:
     if not order.names and order.constant == 0:
         return signal
     text = str(order)
-    return f"D^{text if re.fullmatch(r'[\w.]+', text) else f'({text})'} {signal}"
+    plain = re.fullmatch(r"[\w.]+", text)
+    return f"D^{text if plain else f'({text})'} {signal}"
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,9 @@ mod _core {
     use super::estimate::{least_squares, multi_innovation};
 
     #[pymodule_export]
-    use super::simulate::{equation_error, explicit_euler, metrics, respond, respond_with_initial};
+    use super::simulate::{
+        equation_error, explicit_euler, metrics, nyquist_margin, respond, respond_with_initial, trace_errors,
+    };
 
     #[pymodule_export]
     use super::search::{lattice_size, search, search_stage};

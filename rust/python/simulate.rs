@@ -3,7 +3,9 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::arrays::{equations, initial, record, rows, stacked, vector, EquationArg, InitialArg, RecordArg};
+use super::arrays::{
+    equations, initial, record, rows, stacked, structure, vector, EquationArg, InitialArg, RecordArg, StructureArg,
+};
 use super::errors::detached;
 use crate::error::{check_finite, check_length, check_step};
 use crate::simulate::{self, OutputFilter};
@@ -85,6 +87,27 @@ pub fn explicit_euler<'py>(
         simulate::explicit_euler(&equations, &signals, step)
     })?;
     stacked(py, &outputs)
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn trace_errors<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    equation: StructureArg,
+    inputs: Vec<bool>,
+    trace: PyReadonlyArray2<'py, f64>,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let record = record(&run)?;
+    let structure = structure(equation, record.len(), &inputs)?;
+    let rows = rows(&trace);
+    Ok(PyArray1::from_vec(py, detached(py, || simulate::trace_errors(&structure, &record, &rows))?))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn nyquist_margin(own_terms: Vec<(f64, f64)>, step: f64) -> f64 {
+    simulate::nyquist_margin(&own_terms, step)
 }
 
 #[pyfunction]

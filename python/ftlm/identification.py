@@ -1,0 +1,434 @@
+"""From measured runs to a model: orders, coefficients, both errors and what to beware of."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.errors import ModelError
+from ftlm.models import Model, Structure, numeric
+from ftlm.order_search import Lattice, SearchResult, Settings, named_coefficients, prepare, search_orders
+from ftlm.records import initial_tuple, structure_tuple
+from ftlm.validation import Comparison, Metrics, as_runs, compare
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from ftlm.runs import Run
+
+__all__ = ["Identification", "Trace", "identify", "multi_innovation_trace"]
+
+METHODS = ("multi-innovation", "least-squares")
+LATER = ("output-error", "instrumental-variables", "genetic")
+#: A coefficient that the prior moves by more than this share is not the data's alone.
+PULLED = 0.05
+#: Two coefficients further apart than this share do not obey the coefficient law.
+LAW_BROKEN = 0.05
+
+
+@dataclass(frozen=True)
+class Identification:
+    """An identified model with everything that is known about it.
+
+    Parameters
+    ----------
+    model
+        The model.
+    method
+        Estimator of the coefficients.
+    comparison
+        Both errors on the runs it was identified from.
+    searches
+        The order searches that gave its orders: by output, or under ``"stage"`` for a search under the order law;
+        empty where all orders were given.
+    settings
+        Of the estimator.
+    warnings
+        What makes the model doubtful, in words.
+    """
+
+    model: Model
+    method: str
+    comparison: Comparison
+    searches: dict[str, SearchResult]
+    settings: dict[str, Any]
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def orders(self) -> dict[str, float]:
+        """Free orders by name."""
+        return dict(self.model.orders)
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Coefficients by name."""
+        return self.model.coefficients
+
+    @property
+    def equation_error(self) -> dict[str, Metrics]:
+        """Figures of the equation error by output."""
+        return self.comparison.equation_error
+
+    @property
+    def output_error(self) -> dict[str, Metrics]:
+        """Figures of the free run by output."""
+        return self.comparison.output_error
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """Fit of the free run in percent, by output."""
+        return self.comparison.fit_percent
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "method": self.method,
+            "settings": self.settings,
+            "equations": {e.output: numeric(e) for e in self.model.equations},
+            "orders": self.orders,
+            "coefficients": self.coefficients,
+            **self.comparison.to_dict(),
+            "searches": {name: s.to_dict() for name, s in self.searches.items()},
+            "warnings": list(self.warnings),
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{self.model.structure.name}: {self.method}, {_settings_in_words(self.settings)}"]
+        lines += [f"  {numeric(e)}" for e in self.model.equations]
+        reference = self.model.structure.reference
+        if self.orders:
+            lines.append("orders        " + "  ".join(f"{n} = {v:g}" for n, v in self.orders.items()))
+        for name, value in self.coefficients.items():
+            stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
+            lines.append(f"  {name:<12}{value:>14.6g}{stated}")
+        lines.append(str(replace(self.comparison, warnings=())))
+        for name, search in self.searches.items():
+            pruned = ", ".join(f"{count} {reason}" for reason, count in search.pruned.items() if count)
+            lines.append(f"order search ({name}): {search.candidates} candidates, {len(search.table)} kept, {pruned}")
+        initial = _initial_in_words(self.comparison)
+        lines += initial
+        lines += [f"warning: {w}" for w in self.warnings]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        from html import escape  # noqa: PLC0415 — only notebooks need it
+
+        return f"<pre>{escape(str(self))}</pre>"
+
+
+def _settings_in_words(settings: Mapping[str, Any]) -> str:
+    words = f"M = {settings['m']}"
+    if "innovation_length" in settings:
+        words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}, {settings['rows']} rows"
+    return f"{words}, initial terms: {settings['initial']}"
+
+
+def _initial_in_words(comparison: Comparison) -> list[str]:
+    lines = []
+    for (run, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True):
+        for output, terms in initial.items():
+            if terms:
+                listed = ", ".join(f"{v:.4g} t^{e:g}" for e, v in terms.items())
+                lines.append(f"initial terms of {output} in {run} (of that run alone): {listed}")
+    return lines
+
+
+def identify(
+    runs: Run | Sequence[Run],
+    structure: Structure,
+    *,
+    method: Literal["multi-innovation", "least-squares"] = "multi-innovation",
+    criterion: Literal["output-error", "equation-error"] = "output-error",
+    lattice: Lattice | None = None,
+    norm: Literal["l1", "l2"] = "l1",
+    innovation_length: int = 7,
+    prior_covariance: float = 1.0,
+    rows: Literal["haar", "time"] = "haar",
+    m: int | None = None,
+    keep: int = 20,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Identification:
+    """Identify a structure from measured runs.
+
+    Free orders are searched on the lattice: each equation on its own, or all under their order law. At the orders
+    found, or given, the coefficients are those of the estimator.
+
+    Parameters
+    ----------
+    runs
+        One run or several with the same names and units, in one fit; each keeps its own initial terms.
+    structure
+        What to identify; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
+    method
+        ``"multi-innovation"``: the paper's (44) in closed form. ``"least-squares"``: its limit for a weak prior.
+    criterion, lattice, norm, keep, threads, progress
+        Of the order search; see :func:`ftlm.search_orders`.
+    innovation_length, prior_covariance, rows
+        p, K0 and the coordinates of paper (42)-(44). p is a weight of the data against the prior, nothing else.
+    m
+        Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows).
+
+    Returns
+    -------
+    Identification
+        Prints well; ``.model`` simulates, compares and saves.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit the structure, or a constant output.
+    ModelError
+        A method that is not known, a lattice without or with too many candidates, settings out of range.
+    ConvergenceError
+        Regressors that cannot be told apart at the given orders.
+    """
+    found = as_runs(runs)
+    if method in LATER:
+        raise ModelError(f"method = {method!r} is not in this version; use {' or '.join(map(repr, METHODS))}")
+    if method not in METHODS:
+        raise ModelError(f"method = {method!r} is not known; use {' or '.join(map(repr, METHODS))}")
+    if not isinstance(structure, Structure):
+        raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
+    settings = Settings.check(criterion, norm, method, innovation_length, prior_covariance, rows, keep, threads)
+
+    searches: dict[str, SearchResult] = {}
+    orders: dict[str, float] = {}
+    if structure.order_names:
+        parts = {"stage": structure} if structure.has_order_law else {
+            e.output: structure.equation(e.output) for e in structure.equations if e.order_names
+        }  # fmt: skip
+        _check_lattice_names(lattice, structure)
+        for name, part in parts.items():
+            searches[name] = search_orders(
+                found, part, _lattice_of(lattice, part), criterion=criterion, coefficients=method, norm=norm,
+                innovation_length=innovation_length, prior_covariance=prior_covariance, rows=rows, m=m, keep=keep,
+                threads=threads, progress=progress,
+            )  # fmt: skip
+            orders |= searches[name].orders
+    structure_at = structure.with_orders(orders)
+    coefficients, pulled, pulses, initial = _estimate(found, structure_at, settings, m)
+    about: dict[str, str | float | int | bool | None] = {
+        "method": method, "runs": ", ".join(r.name for r in found), **settings.to_dict(),
+    }  # fmt: skip
+    model = Model(
+        structure_at.with_coefficients(coefficients),
+        orders=orders,
+        units={n: u for n, u in found[0].units.items() if n in structure.signals},
+        m=pulses,
+        about=about,
+    )
+    comparison = compare(model, found, m=pulses)
+    warnings = list(comparison.warnings) + pulled + _broken_law(model)
+    for search in searches.values():
+        warnings += [f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in search.edges.items()]
+    warnings += [f"run {r.name}: {w}" for r in found for w in r.warnings]
+    warnings += discretisation(model, comparison)
+    used = {**settings.to_dict(), "m": pulses, "initial": initial}
+    return Identification(model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)))
+
+
+def _check_lattice_names(given: Lattice | None, structure: Structure) -> None:
+    for name in given.orders if given is not None else ():
+        if name not in structure.order_names and name != "alpha":
+            free = ", ".join(structure.order_names)
+            raise ModelError(f"lattice order {name!r} is no free order; free are {free}")
+
+
+def _lattice_of(given: Lattice | None, part: Structure) -> Lattice | None:
+    if given is None:
+        return None
+    names = (*part.order_names, "alpha")
+    return replace(given, orders={n: v for n, v in given.orders.items() if n in names})
+
+
+def _estimate(
+    runs: Sequence[Run], structure: Structure, settings: Settings, m: int | None
+) -> tuple[dict[str, float], list[str], int, str]:
+    """Coefficients by name at given orders, warnings about the prior, M, and the initial terms in words."""
+    records = prepare(runs, structure, m, power_of_two=settings.needs_haar)
+    initial = initial_tuple(records[0].initial)
+    cores = [r.core() for r in records]
+    inputs = list(records[0].inputs)
+    coefficients: dict[str, float] = {}
+    warnings: list[str] = []
+    for item in structure.equations:
+        fixed = [t.fixed for t in item.terms]
+        core_structure = structure_tuple(item, records[0].signals)
+        if settings.coefficients == "least-squares":
+            raw, _, _, _ = _core.least_squares(cores, core_structure, inputs, fixed, initial)
+        else:
+            (raw, _, _, _), _ = _core.multi_innovation(
+                cores, core_structure, inputs, fixed, initial, settings.innovation_length, settings.prior_covariance,
+                settings.rows == "haar", False,
+            )  # fmt: skip
+            warnings += _pulled(item.output, raw, cores, core_structure, inputs, fixed, initial, settings)
+        coefficients |= named_coefficients(item, raw)
+    words = records[0].initial if isinstance(records[0].initial, str) else f"t^{list(records[0].initial)}"
+    return coefficients, warnings, records[0].m, str(words)
+
+
+def _pulled(
+    output: str,
+    raw: list[float],
+    cores: list[Any],
+    core_structure: Any,
+    inputs: list[bool],
+    fixed: list[float | None],
+    initial: tuple[bool, list[float]],
+    settings: Settings,
+) -> list[str]:
+    """Say so where the prior, not the data, decides the size of a coefficient."""
+    weak, _ = _core.multi_innovation(
+        cores, core_structure, inputs, fixed, initial, settings.innovation_length,
+        settings.prior_covariance * 1e12, settings.rows == "haar", False,
+    )  # fmt: skip
+    shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak[0], strict=True) if b]
+    worst = max(shares, default=0.0)
+    if worst <= PULLED:
+        return []
+    return [
+        f"{output}: the prior (K0 = {settings.prior_covariance:g}, coefficients near 0) moves a coefficient by "
+        f"{100 * min(worst, 9.99):.0f} % from what the data alone say; p = {settings.innovation_length} only weighs the "
+        "data against it. Raise prior_covariance or use method='least-squares'"
+    ]
+
+
+def _broken_law(model: Model) -> list[str]:
+    """Distance of freely estimated coefficients from the coefficient law, in words."""
+    law, values = model.structure.coefficient_law, model.coefficients
+    warnings = []
+    for name, sign, factors in law:
+        known = [values[f] for f in factors if f in values]
+        if name not in values or len(known) != len(factors):
+            continue
+        wanted = sign * math.prod(known)
+        if abs(values[name] - wanted) > LAW_BROKEN * max(abs(wanted), abs(values[name])):
+            warnings.append(
+                f"coefficient law: {name} = {values[name]:.4g}, but the other equation gives {wanted:.4g}; "
+                "the equation-error estimators do not impose the law"
+            )
+    ratios = {}
+    for name, sign, factors in law:
+        free = [f for f in factors if f not in values]
+        known = [values[f] for f in factors if f in values]
+        if name in values and len(free) == 1 and known and math.prod(known):
+            ratios.setdefault(free[0], []).append((name, sign * values[name] / math.prod(known)))
+    for ratio, found in ratios.items():
+        wrong = [(n, v) for n, v in found if not v > 1]
+        if wrong:
+            listed = ", ".join(f"{v:.4g} by {n}" for n, v in wrong)
+            warnings.append(f"coefficient law: the inertia ratio {ratio} must exceed 1, but is {listed}")
+    return warnings
+
+
+def discretisation(model: Model, comparison: Comparison) -> list[str]:
+    """Warn where the block-pulse scheme itself is unstable at this number of pulses.
+
+    An own-output order alpha - nu > 1 of a stiff equation gives the scheme a mode at its Nyquist frequency that the
+    model does not have.
+    """
+    warnings = []
+    for item in model.equations:
+        own = [
+            (float(t.fixed or 0.0), item.order.constant - t.order.constant)
+            for t in item.terms
+            if t.signal == item.output
+        ]
+        margin = min(_core.nyquist_margin(own, step) for step in comparison.step)
+        if margin <= 0:
+            warnings.append(
+                f"{item.output}: at {comparison.m} pulses the discretisation itself is unstable (margin {margin:.2g}), "
+                "whether or not the model is; raise m"
+            )
+    return warnings
+
+
+@dataclass(frozen=True)
+class Trace:
+    """How the recursion (44) converged on one equation.
+
+    Parameters
+    ----------
+    step
+        Steps at which the rest is given, from 1.
+    coefficients
+        By name, after each of these steps.
+    error
+        Error (45) of the free run of the model after each of these steps, at rest; infinite where it diverged.
+    innovation_length
+        p.
+    """
+
+    step: NDArray[np.int64]
+    coefficients: dict[str, NDArray[np.float64]]
+    error: NDArray[np.float64]
+    innovation_length: int
+
+
+def multi_innovation_trace(
+    run: Run,
+    equation: Structure,
+    *,
+    innovation_length: int = 7,
+    prior_covariance: float = 1.0,
+    rows: Literal["haar", "time"] = "haar",
+    m: int | None = None,
+    every: int = 1,
+) -> Trace:
+    """Run the recursion (44) step by step: coefficients, and error (45) of the model they make, after every step.
+
+    Parameters
+    ----------
+    run
+        One run that starts at rest.
+    equation
+        One equation whose orders are numbers.
+    innovation_length, prior_covariance, rows, m
+        See :func:`identify`.
+    every
+        Give every n-th step (and the last).
+
+    Returns
+    -------
+    Trace
+        The last row equals the closed form to rounding.
+
+    Raises
+    ------
+    ModelError
+        More than one equation, free orders, settings out of range.
+
+    Notes
+    -----
+    O(m k^3) for the recursion and one division of series for each step given.
+    """
+    settings = Settings.check(
+        "output-error", "l1", "multi-innovation", innovation_length, prior_covariance, rows, 1, 1
+    )
+    if len(equation.equations) != 1 or equation.order_names:
+        raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
+    if int(every) != every or every < 1:
+        raise ModelError(f"every = {every!r} is no whole number from 1")
+    rest = replace(equation, initial="rest")
+    rec = prepare([run], rest, m, power_of_two=settings.needs_haar)[0]
+    item = equation.equations[0]
+    core_structure = structure_tuple(item, rec.signals)
+    inputs = list(rec.inputs)
+    _, trace = _core.multi_innovation(
+        [rec.core()], core_structure, inputs, [t.fixed for t in item.terms], (False, []),
+        settings.innovation_length, settings.prior_covariance, settings.rows == "haar", True,
+    )  # fmt: skip
+    step = np.unique(np.append(np.arange(int(every), trace.shape[0] + 1, int(every)), trace.shape[0]))
+    kept = np.ascontiguousarray(trace[step - 1])
+    error = _core.trace_errors(rec.core(), core_structure, inputs, kept)
+    names = {
+        t.coefficient: kept[:, k] / t.factor for k, t in enumerate(item.terms) if isinstance(t.coefficient, str)
+    }
+    return Trace(step, names, error, settings.innovation_length)

@@ -1,0 +1,560 @@
+"""Exhaustive order searches over one equation, or over a stage under its order law."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+from ftlm import _core
+from ftlm.errors import ModelError
+from ftlm.models import MAX_ORDER, Equation, Model, Order, Structure, grid, parse_values
+from ftlm.records import check_m, default_m, initial_tuple, record
+from ftlm.validation import as_runs
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from ftlm.records import Record
+    from ftlm.runs import Run
+
+__all__ = ["Lattice", "SearchResult", "SearchRow", "lattice", "search_orders"]
+
+Criterion = Literal["output-error", "equation-error"]
+Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
+
+#: The paper's step.
+STEP = 0.05
+#: The interval of alpha: a flexible link is second order or a little less.
+ALPHA = (1.05, 2.0)
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Intervals and step of an order search.
+
+    Parameters
+    ----------
+    step
+        Step of every order that has no step of its own.
+    alpha
+        (low, high) of every highest order.
+    orders
+        Other orders by name: a number, (low, high), (low, high, step), ``"low:high:step"`` or values.
+    """
+
+    step: float = STEP
+    alpha: tuple[float, float] = ALPHA
+    orders: Mapping[str, Any] = field(default_factory=dict)
+
+    def values(self, structure: Structure) -> dict[str, tuple[float, ...]]:
+        """Values of each free order of a structure.
+
+        What the structure or this lattice does not name runs over all multiples of the step from 0 to the largest
+        alpha; the search itself keeps an own-output order below alpha and any other at most alpha.
+
+        Raises
+        ------
+        ModelError
+            A name that is no free order, an interval out of range.
+        """
+        free = structure.order_names
+        for name in self.orders:
+            if name not in free and name != "alpha":
+                raise ModelError(f"lattice order {name!r} is no free order; free are {', '.join(free) or 'none'}")
+        highest = [n for e in structure.equations for n in e.order.names if e.order.is_single]
+        values: dict[str, tuple[float, ...]] = {}
+        for name in free:
+            if name in self.orders:
+                values[name] = self._axis(name, self.orders[name])
+            elif name in structure.order_values:
+                values[name] = structure.order_values[name]
+            elif name in highest:
+                values[name] = self._axis(name, self.orders.get("alpha", self.alpha))
+        fixed = [e.order.constant for e in structure.equations if not e.order.names]
+        top = max([max(values[n]) for n in highest if n in values] + fixed, default=2.0)
+        for name in free:
+            if name not in values:
+                values[name] = grid(name, 0.0, min(top, MAX_ORDER), self.step)
+        return {name: values[name] for name in free}
+
+    def _axis(self, name: str, spec: Any) -> tuple[float, ...]:
+        if not isinstance(spec, (str, int, float)) and len(spec) == 2:
+            spec = (*spec, self.step)
+        if not isinstance(spec, (str, int, float)) and len(spec) == 3 and isinstance(spec, tuple):
+            return grid(name, *spec)
+        values = parse_values(name, spec)
+        return (values,) if isinstance(values, float) else values
+
+
+def lattice(step: float = STEP, alpha: tuple[float, float] = ALPHA, **orders: Any) -> Lattice:
+    """Intervals and step of an order search.
+
+    Every own-output order takes all values 0 <= nu < alpha on the step (distinct, unordered within a signal), every
+    other signal's 0 <= nu <= alpha, unless named here.
+
+    Parameters
+    ----------
+    step
+        Step, positive; the paper's is 0.05.
+    alpha
+        (low, high) of the highest order, in (0, 3].
+    **orders
+        Other orders by name, see :class:`Lattice`.
+
+    Raises
+    ------
+    ModelError
+        A step that is not positive, an interval that is empty or out of range.
+    """
+    low, high = alpha
+    if not 0 < low <= MAX_ORDER:
+        raise ModelError(f"alpha interval {low:g}:{high:g} starts outside (0, 3]; choose a positive order")
+    grid("alpha", low, high, step)
+    return Lattice(step, (float(low), float(high)), dict(orders))
+
+
+@dataclass(frozen=True)
+class SearchRow:
+    """One kept candidate.
+
+    Parameters
+    ----------
+    rank
+        From 1.
+    index
+        Index of the candidate in the lattice, by which ties are broken.
+    score
+        Its score: error (45) for norm l1, RMSE for l2; for a stage the sum of the equations' scores, each divided by
+        its scale.
+    orders
+        Free orders by name.
+    coefficients
+        Coefficients by name.
+    """
+
+    rank: int
+    index: int
+    score: float
+    orders: dict[str, float]
+    coefficients: dict[str, float]
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """A ranked table, the best model and what became of every candidate.
+
+    Parameters
+    ----------
+    table
+        Kept rows, best first.
+    model
+        Model of the first row.
+    candidates
+        Number of candidates.
+    pruned
+        Candidates not in the table, by reason. Kept rows and these are all candidates.
+    failures
+        The first candidates without a score: (orders by name, reason).
+    m
+        Block pulses a run.
+    settings
+        Criterion, norm, coefficients, innovation length, prior covariance, rows, initial terms.
+    edges
+        Orders of the first row that stand on the edge of their interval, by name with the edge.
+    """
+
+    table: list[SearchRow]
+    model: Model
+    candidates: int
+    pruned: dict[str, int]
+    failures: list[tuple[dict[str, float], str]]
+    m: int
+    settings: dict[str, Any]
+    edges: dict[str, float]
+
+    @property
+    def orders(self) -> dict[str, float]:
+        """Free orders of the best model."""
+        return self.table[0].orders
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Coefficients of the best model."""
+        return self.table[0].coefficients
+
+    @property
+    def score(self) -> float:
+        """Score of the best model."""
+        return self.table[0].score
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "candidates": self.candidates,
+            "pruned": self.pruned,
+            "m": self.m,
+            "settings": self.settings,
+            "table": [
+                {
+                    "rank": r.rank,
+                    "index": r.index,
+                    "score": r.score,
+                    "orders": r.orders,
+                    "coefficients": r.coefficients,
+                }
+                for r in self.table
+            ],
+            "failures": [{"orders": o, "reason": reason} for o, reason in self.failures],
+            "edges": self.edges,
+        }
+
+    def __str__(self) -> str:
+        names, coefficients = list(self.orders), list(self.coefficients)
+        what = "error" if self.settings["norm"] == "l1" else "RMSE"
+        head = f"{'rank':>4}{what:>12}" + "".join(f"{n:>9}" for n in names) + "".join(f"{n:>12}" for n in coefficients)
+        lines = [head]
+        for row in self.table:
+            orders = "".join(f"{row.orders[n]:>9.5g}" for n in names)
+            values = "".join(f"{row.coefficients[n]:>12.5g}" for n in coefficients)
+            lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}")
+        pruned = ", ".join(f"{count} {reason}" for reason, count in self.pruned.items() if count)
+        lines.append(f"{self.candidates} candidates: {len(self.table)} kept" + (f", {pruned}" if pruned else ""))
+        lines += [f"warning: order {n} = {v:g} is on the edge of its interval; widen it" for n, v in self.edges.items()]
+        return "\n".join(lines)
+
+
+def available_threads() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS or Windows
+        return os.cpu_count() or 1
+
+
+def check_threads(threads: int | None) -> int:
+    """Threads to use: all cores by default.
+
+    Raises
+    ------
+    ModelError
+        Fewer than one or more than 1 024.
+    """
+    if threads is None:
+        return available_threads()
+    if isinstance(threads, bool) or int(threads) != threads or not 1 <= threads <= 1024:
+        raise ModelError(f"threads = {threads!r} is outside [1, 1024]; leave it out to use all cores")
+    return int(threads)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Checked settings of a search."""
+
+    criterion: str
+    norm: str
+    coefficients: str
+    innovation_length: int
+    prior_covariance: float
+    rows: str
+    keep: int
+    threads: int
+    early_stopping: bool = True
+
+    @classmethod
+    def check(
+        cls,
+        criterion: str,
+        norm: str,
+        coefficients: str,
+        innovation_length: int,
+        prior_covariance: float,
+        rows: str,
+        keep: int,
+        threads: int | None,
+        early_stopping: bool = True,
+    ) -> Settings:
+        """Refuse words and numbers that mean nothing.
+
+        Raises
+        ------
+        ModelError
+            Naming the argument and what it may be.
+        """
+        for name, value, known in (
+            ("criterion", criterion, ("output-error", "equation-error")),
+            ("norm", norm, ("l1", "l2")),
+            ("coefficients", coefficients, ("multi-innovation", "least-squares")),
+            ("rows", rows, ("haar", "time")),
+        ):
+            if value not in known:
+                raise ModelError(f"{name} = {value!r} is not known in this version; use {' or '.join(map(repr, known))}")
+        if isinstance(keep, bool) or int(keep) != keep or not 1 <= keep <= 100_000:
+            raise ModelError(f"keep = {keep!r} is outside [1, 100000]; keep as many rows as you will read")
+        if isinstance(innovation_length, bool) or int(innovation_length) != innovation_length or innovation_length < 1:
+            raise ModelError(f"innovation length p = {innovation_length!r} is no whole number from 1; the paper's is 7")
+        if not (math.isfinite(prior_covariance) and prior_covariance > 0):
+            raise ModelError(f"prior covariance K0 = {prior_covariance!r} is not positive; a large one is a weak prior")
+        return cls(
+            criterion, norm, coefficients, int(innovation_length), float(prior_covariance), rows, int(keep),
+            check_threads(threads), early_stopping,
+        )  # fmt: skip
+
+    @property
+    def needs_haar(self) -> bool:
+        """Whether m must be a power of two."""
+        return self.coefficients == "multi-innovation" and self.rows == "haar"
+
+    def core(self) -> tuple[str, str, int, float, bool, int, int, bool]:
+        """As the core takes them."""
+        p = self.innovation_length if self.coefficients == "multi-innovation" else 0
+        haar = self.rows == "haar"
+        return self.criterion, self.norm, p, self.prior_covariance, haar, self.keep, self.threads, self.early_stopping
+
+    def to_dict(self) -> dict[str, Any]:
+        """For results and reports."""
+        out: dict[str, Any] = {"criterion": self.criterion, "norm": self.norm, "coefficients": self.coefficients}
+        if self.coefficients == "multi-innovation":
+            out |= {"innovation_length": self.innovation_length, "prior_covariance": self.prior_covariance}
+            out["rows"] = self.rows
+        return out
+
+
+def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_of_two: bool) -> list[Record]:
+    """Records of runs for an estimator on the equation error.
+
+    Raises
+    ------
+    DataError
+        A signal that a run lacks, or a constant output.
+    ModelError
+        An m that the runs do not carry.
+    """
+    chosen = default_m(runs, power_of_two=power_of_two) if m is None else m
+    m = check_m(chosen, runs, power_of_two=power_of_two)
+    for run in runs:
+        run.require_outputs([o for o in structure.outputs if o in run])
+    records = [record(run, structure, m) for run in runs]
+    if any(r.initial == "caputo" for r in records):
+        # One rule for all runs of a fit: initial terms that a run at rest does not need are estimated as zero.
+        records = [record(run, replace(structure, initial="caputo"), m) for run in runs]
+    return records
+
+
+def search_orders(
+    runs: Run | Sequence[Run],
+    equation: Structure,
+    lattice: Lattice | None = None,
+    *,
+    criterion: Criterion = "output-error",
+    coefficients: Coefficients = "multi-innovation",
+    norm: Literal["l1", "l2"] = "l1",
+    innovation_length: int = 7,
+    prior_covariance: float = 1.0,
+    rows: Literal["haar", "time"] = "haar",
+    m: int | None = None,
+    keep: int = 20,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    early_stopping: bool = True,
+) -> SearchResult:
+    """Exhaustive search over the orders of an equation, or of a stage under its order law.
+
+    Each candidate gets its coefficients on the equation error, then its score; the table is that of evaluating every
+    candidate to the end, the same bits for any number of threads (paper Table 2, steps 5-7).
+
+    Parameters
+    ----------
+    runs
+        One run or several with the same names and units; scores add up.
+    equation
+        Structure with free orders; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
+    lattice
+        Intervals and step; see :func:`ftlm.lattice`.
+    criterion
+        ``"output-error"``: the free run, each equation driven by the measured other outputs. ``"equation-error"``:
+        measured signals on the right-hand side; it prefers near-identities.
+    coefficients
+        ``"multi-innovation"`` (closed form of paper (44)) or ``"least-squares"``.
+    norm
+        ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
+    innovation_length, prior_covariance, rows
+        p and K0 of paper (43)-(44), and whether rows come in Haar coordinates or in the order of time.
+    m
+        Block pulses a run; default 2 048, or what the runs carry.
+    keep
+        Rows of the table.
+    threads
+        Threads; default all cores.
+    progress
+        Called about twenty times a second with (candidates done, candidates in all).
+    early_stopping
+        Whether to leave a candidate once it cannot be kept; False is brute force, with the same table.
+
+    Returns
+    -------
+    SearchResult
+        Table, best model and counts.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit, or a constant output.
+    ModelError
+        Nothing to search, a lattice without or with too many candidates, settings out of range.
+    KeyboardInterrupt
+        Ctrl-C, within half a second.
+
+    Notes
+    -----
+    One Gram matrix of distinct regressors serves all candidates; each costs a k x k solve and, for the output error,
+    a division of series that ends as soon as it has lost.
+    """
+    found = as_runs(runs)
+    settings = Settings.check(
+        criterion, norm, coefficients, innovation_length, prior_covariance, rows, keep, threads, early_stopping
+    )
+    if not isinstance(equation, Structure):
+        raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
+    if not equation.order_names:
+        raise ModelError("every order is a number, so there is nothing to search; name one, as in D^alpha y")
+    if len(equation.equations) > 1 and not equation.has_order_law:
+        raise ModelError(
+            "the equations share no order law, so they are searched one by one: pass .equation('theta12') or use identify"
+        )
+    values = (lattice or Lattice()).values(equation)
+    records = prepare(found, equation, m, power_of_two=settings.needs_haar)
+    search = _search_law if equation.has_order_law else _search_one
+    return search(found, equation, values, records, settings, progress)
+
+
+def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float]:
+    """Values of an order that is a number or one free order."""
+    return list(values[order.names[0]]) if order.names else [order.constant]
+
+
+def _search_one(
+    runs: Sequence[Run],
+    structure: Structure,
+    values: Mapping[str, tuple[float, ...]],
+    records: list[Record],
+    settings: Settings,
+    progress: Callable[[int, int], None] | None,
+) -> SearchResult:
+    item = structure.equations[0]
+    signals = records[0].signals
+    axes = [
+        (signals.index(t.signal), axis_of(t.order, values), bool(t.order.names) and t.fixed is None)
+        for t in item.terms
+    ]
+    found = _core.search(
+        [r.core() for r in records],
+        (signals.index(item.output), axis_of(item.order, values), axes),
+        list(records[0].inputs),
+        [t.fixed for t in item.terms],
+        initial_tuple(records[0].initial),
+        settings.core(),
+        progress,
+    )
+
+    def named(alpha: float, orders: list[float]) -> dict[str, float]:
+        pairs = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
+        return {o.names[0]: v for o, v in pairs if o.names}
+
+    table = [
+        SearchRow(rank, index, score, named(alpha, orders), named_coefficients(item, c))
+        for rank, (index, score, alpha, orders, c, _) in enumerate(found["rows"], 1)
+    ]
+    failures = [(named(alpha, orders), reason) for _, alpha, orders, reason in found["failures"]]
+    return _result(runs, structure, values, table, found["counts"], failures, records, settings)
+
+
+def _search_law(
+    runs: Sequence[Run],
+    structure: Structure,
+    values: Mapping[str, tuple[float, ...]],
+    records: list[Record],
+    settings: Settings,
+    progress: Callable[[int, int], None] | None,
+) -> SearchResult:
+    names = list(values)
+    signals = records[0].signals
+
+    def affine(order: Order) -> tuple[float, list[float]]:
+        weights = dict(order.weights)
+        return order.constant, [weights.get(n, 0.0) for n in names]
+
+    laws = [
+        (signals.index(e.output), affine(e.order), [(signals.index(t.signal), affine(t.order)) for t in e.terms])
+        for e in structure.equations
+    ]
+    # Each output's deviation makes radians of hub and of deflection weigh alike.
+    points = sum(r.m for r in records)
+    spread = [
+        math.sqrt(sum(float(((r.of(e.output) - r.of(e.output).mean()) ** 2).sum()) for r in records) / points)
+        for e in structure.equations
+    ]
+    scales = [s * points if settings.norm == "l1" else s for s in spread]
+    found = _core.search_stage(
+        [r.core() for r in records],
+        [list(values[n]) for n in names],
+        laws,
+        list(records[0].inputs),
+        [[t.fixed for t in e.terms] for e in structure.equations],
+        scales,
+        initial_tuple(records[0].initial),
+        settings.core(),
+        progress,
+    )
+    if not found["rows"]:
+        raise ModelError(f"none of {found['counts']['candidates']} candidates has a finite score; check the data and the orders")
+    table = []
+    for rank, (index, score, free, parts) in enumerate(found["rows"], 1):
+        coefficients: dict[str, float] = {}
+        for item, (_, _, _, c, _) in zip(structure.equations, parts, strict=True):
+            coefficients |= named_coefficients(item, c)
+        table.append(SearchRow(rank, index, score, dict(zip(names, free, strict=True)), coefficients))
+    return _result(runs, structure, values, table, found["counts"], [], records, settings)
+
+
+def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:
+    """Free coefficients by name from the core's products of factor and coefficient."""
+    return {
+        t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)
+    }
+
+
+def _result(
+    runs: Sequence[Run],
+    structure: Structure,
+    values: Mapping[str, tuple[float, ...]],
+    table: list[SearchRow],
+    counts: Mapping[str, int],
+    failures: list[tuple[dict[str, float], str]],
+    records: list[Record],
+    settings: Settings,
+) -> SearchResult:
+    if not table:
+        raise ModelError(f"none of {counts['candidates']} candidates has a finite score; check the data and the orders")
+    best = table[0]
+    model = Model(
+        structure.with_orders(best.orders).with_coefficients(best.coefficients),
+        orders=best.orders,
+        units={n: u for n, u in runs[0].units.items() if n in structure.signals},
+        m=records[0].m,
+        about={"runs": ", ".join(r.name for r in runs), "orders from": "order search", **settings.to_dict()},
+    )
+    edges = {
+        n: v for n, v in best.orders.items() if len(values[n]) > 2 and v in (values[n][0], values[n][-1]) and v != 0
+    }
+    # alpha = 2 is where the physics puts it, not an accident of the interval.
+    edges = {n: v for n, v in edges.items() if not (v == 2.0 and n in _highest(structure))}
+    pruned = {k: int(v) for k, v in counts.items() if k not in ("candidates", "kept")}
+    return SearchResult(
+        table, model, int(counts["candidates"]), pruned, failures, records[0].m, settings.to_dict(), edges
+    )
+
+
+def _highest(structure: Structure) -> set[str]:
+    return {n for e in structure.equations for n in e.order.names}
