@@ -125,7 +125,7 @@ pub enum Error {
     },
 }
 
-/// The family of an [`Error`]; each becomes one exception class in Python.
+/// The family of an [`enum@Error`]; each becomes one exception class in Python.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
     /// The data given cannot be used.

@@ -48,7 +48,7 @@ impl Record {
         self.signals[0].len()
     }
 
-    /// Pulse width [s].
+    /// Pulse width in seconds.
     #[must_use]
     pub fn step(&self) -> f64 {
         self.step

@@ -216,6 +216,7 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
     // states[i][ν] is D^ν of output i.
     let mut states: Vec<Vec<f64>> = alpha.iter().map(|&a| vec![0.0; a]).collect();
     let mut out = vec![Vec::with_capacity(rows); equations.len()];
+    let read = |signal: usize, row: usize| signals[signal][row];
     for row in 0..rows {
         let highest: Vec<f64> = equations
             .iter()
@@ -225,7 +226,7 @@ pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -
                     .map(|(term, c)| {
                         c * match outputs.iter().position(|&o| o == term.signal) {
                             Some(j) => states[j][term.order.round() as usize],
-                            None => signals[term.signal][row],
+                            None => read(term.signal, row),
                         }
                     })
                     .sum()

@@ -76,8 +76,7 @@ pub fn solve_gram(gram: &mut [f64], rhs: &mut [f64], needed: usize, scale: &mut 
         for l in 0..i {
             pivot -= gram[i * k + l] * gram[i * k + l];
         }
-        // Negated so that NaN counts as dependent.
-        if !(pivot > PIVOT_FLOOR) {
+        if pivot.is_nan() || pivot <= PIVOT_FLOOR {
             if i < needed {
                 return Err(Error::Singular { index: i, count: k });
             }

@@ -1,1 +1,8 @@
+//! Tests of the mathematics: reference numbers, naive oracles, identities and orders of convergence.
+//!
+//! One module a topic; `common` holds what they share. Every random number has a fixed seed.
+#![allow(missing_docs, clippy::unwrap_used, clippy::expect_used, clippy::panic)]
 
+mod common;
+
+mod kernels;

@@ -1,0 +1,60 @@
+# `make demo` and `make test` do all set-up in .venv. On Windows use the pip lines of README.md.
+VENV := .venv
+BIN := $(VENV)/bin
+PYTHON ?= python3
+CORE := $(shell find rust -name '*.rs') Cargo.toml Cargo.lock pyproject.toml
+export RUSTDOCFLAGS := -D warnings
+
+.PHONY: demo test test-slow test-rust test-python lint bench wheel wheel-test clean
+
+demo: $(VENV)/.built
+	$(BIN)/ftlm demo -o demo --force
+
+test: lint test-rust test-python wheel-test
+
+$(VENV)/.tools: requirements-test.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-test.txt
+	@touch $@
+
+$(VENV)/.built: $(VENV)/.tools $(CORE)
+	. $(BIN)/activate && maturin develop --release --quiet
+	@touch $@
+
+lint: $(VENV)/.built
+	cargo fmt --check
+	cargo clippy --release --all-targets --quiet -- -D warnings
+	cargo clippy --release --all-targets --features python --quiet -- -D warnings
+	cargo doc --no-deps --quiet
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/python -m mypy.stubtest ftlm._core
+
+test-rust:
+	cargo test --release
+
+test-python: $(VENV)/.built
+	$(BIN)/python -m pytest
+
+test-slow: $(VENV)/.built
+	$(BIN)/python -m pytest -m slow --timeout 7200
+
+bench: $(VENV)/.built
+	cargo bench --bench kernels
+	$(BIN)/python benches/search.py
+
+wheel: $(VENV)/.tools
+	rm -rf wheels
+	. $(BIN)/activate && maturin build --release --quiet --out wheels
+
+# The wheel alone, in an environment that has nothing else: what a user gets from pip.
+wheel-test: wheel
+	rm -rf $(VENV)-wheel
+	$(PYTHON) -m venv $(VENV)-wheel
+	$(VENV)-wheel/bin/python -m pip install --quiet --disable-pip-version-check wheels/*.whl
+	cd wheels && ../$(VENV)-wheel/bin/ftlm demo --step 0.1 -o demo
+	rm -rf $(VENV)-wheel wheels/demo
+
+clean:
+	rm -rf $(VENV) $(VENV)-wheel wheels demo target

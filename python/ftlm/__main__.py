@@ -1,0 +1,5 @@
+"""``python -m ftlm`` is the command line."""
+
+from ftlm.cli import main
+
+main()

@@ -1,0 +1,698 @@
+"""The command line: results to standard output, progress to standard error, exit codes that scripts can read."""
+
+from __future__ import annotations
+
+import functools
+import json
+import os
+import platform
+import sys
+from dataclasses import replace
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+import ftlm
+from ftlm.errors import DataError, FtlmError, InternalError, ModelError, RigFault
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ftlm.models import Structure
+    from ftlm.order_search import Lattice
+    from ftlm.runs import Run
+
+__all__ = ["app", "main"]
+
+EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
+
+app = typer.Typer(
+    name="ftlm",
+    help="Fractional-order models of flexible machines from measured data.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+class Method(str, Enum):
+    """Estimators of the coefficients."""
+
+    multi_innovation = "multi-innovation"
+    least_squares = "least-squares"
+
+
+class Criterion(str, Enum):
+    """Errors that rank the candidates."""
+
+    output_error = "output-error"
+    equation_error = "equation-error"
+
+
+class Norm(str, Enum):
+    """Sums of an error."""
+
+    l1 = "l1"
+    l2 = "l2"
+
+
+class Coupling(str, Enum):
+    """What drives an equation."""
+
+    measured = "measured"
+    simulated = "simulated"
+
+
+class InputOrder(str, Enum):
+    """Orders of the current in the deflection's equation."""
+
+    published = "published"
+    derived = "derived"
+
+
+class Laws(str, Enum):
+    """Which laws tie a flexible link's orders."""
+
+    none = "none"
+    orders = "orders"
+
+
+class Rows(str, Enum):
+    """Coordinates of the rows of the recursion."""
+
+    haar = "haar"
+    time = "time"
+
+
+
+
+# ------------------------------------------------------------------------------------------------ options
+
+Files = Annotated[list[str], typer.Argument(metavar="FILE...", help="csv or .mat files; several files are several runs.")]
+Time = Annotated[str | None, typer.Option("--time", help="Column of time.")]
+Step = Annotated[float | None, typer.Option("--sampling", help="Sampling step [s] of files without a time column.")]
+Inputs = Annotated[list[str] | None, typer.Option("-u", "--input", metavar="NAME=COLUMN", help="An input.")]
+Outputs = Annotated[list[str] | None, typer.Option("-y", "--output", metavar="NAME=COLUMN", help="An output.")]
+Units = Annotated[list[str] | None, typer.Option("--unit", metavar="NAME=UNIT", help="Unit of a signal, such as deg.")]
+Columns = Annotated[str | None, typer.Option("--columns", metavar="TOML", help="File that names columns and units.")]
+Between = Annotated[
+    list[str] | None,
+    typer.Option("--intersample", metavar="NAME=zoh|foh", help="foh for a measured input; a command is zoh."),
+]
+Slice = Annotated[str | None, typer.Option("--slice", metavar="FROM:TO", help="Seconds since the first row.")]
+Resample = Annotated[float | None, typer.Option("--resample", metavar="STEP", help="Interpolate onto this step [s].")]
+Json = Annotated[bool, typer.Option("--json", help="Results as JSON.")]
+Force = Annotated[bool, typer.Option("--force", help="Overwrite files.")]
+Threads = Annotated[int | None, typer.Option("--threads", help="Threads; default all cores.")]
+M = Annotated[int | None, typer.Option("--m", help="Block pulses a run; default 2048, or what the runs carry.")]
+Out = Annotated[str | None, typer.Option("-o", "--out", metavar="FILE", help="Where to write.")]
+StructureOption = Annotated[
+    str,
+    typer.Option("--structure", help="flexible-link:1, flexible-link:2, flexible-link:both, or an equation in words."),
+]
+OnlyOutput = Annotated[str | None, typer.Option("--only", metavar="OUTPUT", help="Only the equation of this output.")]
+CouplingOption = Annotated[Coupling, typer.Option("--coupling", help="What drives free runs of a flexible link.")]
+CrossStage = Annotated[bool, typer.Option("--cross-stage", help="Add the other stage's angles and current.")]
+Friction = Annotated[bool, typer.Option("--friction", help="Add a Coulomb term.")]
+LawsOption = Annotated[Laws, typer.Option("--laws", help="orders: search all equations under the order law.")]
+InputOrderOption = Annotated[InputOrder, typer.Option("--input-order", help="Order of the current, see the manual.")]
+StockFilter = Annotated[bool, typer.Option("--stock-filter", help="Deflections passed the stock 2 Hz low-pass.")]
+Orders = Annotated[list[str] | None, typer.Option("--order", metavar="NAME=VALUE", help="Fix an order.")]
+Fixed = Annotated[list[str] | None, typer.Option("--fixed", metavar="NAME=VALUE", help="Fix a coefficient.")]
+Delay = Annotated[list[str] | None, typer.Option("--delay", metavar="INPUT=SECONDS", help="Delay of an input.")]
+InitialOption = Annotated[str, typer.Option("--initial", help="auto, rest, caputo, or exponents of t: 0,1.")]
+LatticeOption = Annotated[
+    list[str] | None,
+    typer.Option("--lattice", metavar="NAME=LOW:HIGH:STEP", help="Values of an order; alpha means every alpha."),
+]
+LatticeStep = Annotated[float, typer.Option("--step", help="Step of the order lattice.")]
+CriterionOption = Annotated[Criterion, typer.Option("--criterion", help="Error that ranks the candidates.")]
+NormOption = Annotated[Norm, typer.Option("--norm", help="l1 is (45), l2 is (46).")]
+P = Annotated[int, typer.Option("--p", help="Innovation length.")]
+K0 = Annotated[float, typer.Option("--k0", help="Prior covariance of the coefficients.")]
+RowsOption = Annotated[Rows, typer.Option("--rows", help="Coordinates of the rows of (44).")]
+Keep = Annotated[int, typer.Option("--keep", help="Rows of the ranked table.")]
+MethodOption = Annotated[Method, typer.Option("--method", help="Estimator of the coefficients.")]
+
+
+# ------------------------------------------------------------------------------------------------ helpers
+
+
+def guarded(command: Callable[..., None]) -> Callable[..., None]:
+    """Turn errors into one line on standard error and an exit code."""
+
+    @functools.wraps(command)
+    def run(*args: Any, **options: Any) -> None:
+        try:
+            command(*args, **options)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            print("ftlm: interrupted; nothing was written", file=sys.stderr)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except BrokenPipeError:
+            # The reader of a pipe has gone; what it did not read is nobody's loss.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from None
+        except FtlmError as error:
+            print(f"ftlm: {error}", file=sys.stderr)
+            raise typer.Exit(exit_code(error)) from None
+
+    return run
+
+
+def exit_code(error: FtlmError) -> int:
+    """Exit code of an error: 1 internal, 2 usage, 3 data refused, 5 rig."""
+    if isinstance(error, InternalError):
+        return EXIT_INTERNAL
+    if isinstance(error, ModelError):
+        return EXIT_USAGE
+    return EXIT_RIG if isinstance(error, RigFault) else EXIT_DATA
+
+
+def pairs(option: str, given: list[str] | None) -> dict[str, str]:
+    """NAME=VALUE options as a dictionary; a bare NAME stands for NAME=NAME.
+
+    Raises
+    ------
+    ModelError
+        An empty name or value, or a name given twice.
+    """
+    found: dict[str, str] = {}
+    for item in given or []:
+        name, equals, value = item.partition("=")
+        value = value if equals else name
+        if not name or not value:
+            raise ModelError(f"{option} {item!r} is not NAME=VALUE")
+        if name in found:
+            raise ModelError(f"{option} names {name!r} twice")
+        found[name] = value
+    return found
+
+
+def numbers(option: str, given: list[str] | None) -> dict[str, float]:
+    """NAME=NUMBER options.
+
+    Raises
+    ------
+    ModelError
+        A value that is no number.
+    """
+    found = {}
+    for name, value in pairs(option, given).items():
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise ModelError(f"{option} {name}={value}: {value!r} is no number") from None
+    return found
+
+
+def interval(text: str | None) -> tuple[float | None, float | None] | None:
+    """FROM:TO in seconds, either end optional.
+
+    Raises
+    ------
+    ModelError
+        Anything else.
+    """
+    if text is None:
+        return None
+    parts = text.split(":")
+    try:
+        if len(parts) != 2:
+            raise ValueError
+        start, stop = (float(p) if p.strip() else None for p in parts)
+    except ValueError:
+        raise ModelError(f"--slice {text!r} is no FROM:TO in seconds, such as 1.1:19.5") from None
+    return start, stop
+
+
+def load_runs(files: list[str], sliced: str | None, **options: Any) -> list[Run]:
+    """Each file a run; .mat files that hold one signal each are one run together.
+
+    Raises
+    ------
+    DataError
+        Naming the file.
+    """
+    options = {name: value for name, value in options.items() if value}
+    span = interval(sliced)
+    if span is not None:
+        options["slice"] = span
+    if len(files) > 1 and all(f.lower().endswith(".mat") for f in files):
+        try:
+            ftlm.load(files[0], **options)
+        except DataError:
+            # The first file alone lacks a column that is asked for, so the files belong together.
+            run = ftlm.load(files, **options)
+            print(f"ftlm: {len(files)} .mat files read as one run", file=sys.stderr)
+            return [run]
+    return [ftlm.load(f, **options) for f in files]
+
+
+def load_options(
+    time: str | None,
+    sampling: float | None,
+    inputs: list[str] | None,
+    outputs: list[str] | None,
+    units: list[str] | None,
+    columns: str | None,
+    between: list[str] | None,
+    resample: float | None,
+) -> dict[str, Any]:
+    """Options of :func:`ftlm.load` from those of the command line."""
+    return {
+        "time": time,
+        "step": sampling,
+        "inputs": pairs("-u", inputs),
+        "outputs": pairs("-y", outputs),
+        "units": pairs("--unit", units),
+        "columns": columns,
+        "intersample": pairs("--intersample", between),
+        "resample": resample,
+    }
+
+
+def structure_of(
+    text: str,
+    *,
+    only: str | None,
+    coupling: Coupling,
+    cross_stage: bool,
+    friction: bool,
+    laws: Laws,
+    input_order: InputOrder,
+    stock_filter: bool,
+    orders: list[str] | None,
+    fixed: list[str] | None,
+    delay: list[str] | None,
+    initial: str,
+) -> Structure:
+    """The structure that the options describe.
+
+    Raises
+    ------
+    ModelError
+        A structure, order or coefficient that is not known.
+    """
+    if text.startswith("flexible-link"):
+        _, _, stage = text.partition(":")
+        stages: dict[str, Any] = {"1": 1, "2": 2, "both": "both"}
+        if stage not in stages:
+            raise ModelError(f"--structure {text!r} is not known; use flexible-link:1, :2 or :both, or an equation")
+        structure = ftlm.flexible_link(
+            stage=stages[stage], input_order=input_order.value, coupling=coupling.value, cross_stage=cross_stage,
+            friction=friction, laws=("orders", "coefficients") if laws is Laws.orders else (),
+            sensor_filter="stock" if stock_filter else None,
+        )  # fmt: skip
+    else:
+        structure = ftlm.equation(text)
+        if len(structure.equations) > 1:
+            structure = replace(structure, coupling=coupling.value)
+    if only is not None:
+        structure = structure.equation(only)
+    if initial not in ("auto", "rest", "caputo"):
+        try:
+            exponents: Any = tuple(float(e) for e in initial.split(","))
+        except ValueError:
+            raise ModelError(f"--initial {initial!r} is not auto, rest, caputo or exponents such as 0,1") from None
+        initial = exponents
+    from ftlm.models import check_initial  # noqa: PLC0415 — the public constructor of equations checks it otherwise
+
+    structure = replace(structure, initial=check_initial(initial), delay=numbers("--delay", delay))
+    return structure.with_orders(numbers("--order", orders)).with_coefficients(numbers("--fixed", fixed))
+
+
+def lattice_of(given: list[str] | None, step: float) -> Lattice:
+    """The lattice that the options describe.
+
+    Raises
+    ------
+    ModelError
+        An interval that cannot be read, a step that is not positive.
+    """
+    named: dict[str, Any] = dict(pairs("--lattice", given))
+    alpha = named.pop("alpha", None)
+    found = ftlm.lattice(step=step, **named)
+    return found if alpha is None else replace(found, orders={**found.orders, "alpha": alpha})
+
+
+def check_writable(paths: list[str | None], *, force: bool) -> None:
+    """Refuse before any work what could not be written after it.
+
+    Raises
+    ------
+    DataError
+        A file that exists, or a folder that does not.
+    """
+    for path in paths:
+        if path is None:
+            continue
+        if Path(path).exists() and not force:
+            raise DataError(f"{path} exists; choose another name, or overwrite it with --force")
+        if not Path(path).resolve().parent.is_dir():
+            raise DataError(f"{Path(path).parent} is no folder; make it first")
+
+
+def show(result: Any, *, as_json: bool) -> None:
+    """A result for people, or as JSON."""
+    if as_json:
+        print(json.dumps(result.to_dict(), indent=1, ensure_ascii=False, allow_nan=False, default=plain))
+    else:
+        print(result)
+
+
+def plain(value: Any) -> Any:
+    """NumPy scalars and arrays as JSON knows them."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)
+
+
+# ------------------------------------------------------------------------------------------------ commands
+
+
+@app.callback(invoke_without_command=True)
+def version(
+    show_version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+) -> None:
+    """Fractional-order models of flexible machines from measured data."""
+    if show_version:
+        print(f"ftlm {ftlm.__version__}")
+        raise typer.Exit
+
+
+@app.command()
+@guarded
+def demo(
+    out: Annotated[str, typer.Option("-o", "--out", metavar="FOLDER", help="Where to write.")] = "ftlm-demo",
+    step: LatticeStep = 0.05,
+    noise: Annotated[float, typer.Option("--noise", help="Noise on every angle [rad].")] = 1e-4,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the noise.")] = 1,
+    threads: Threads = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Simulate both stages, identify every equation with p = 1, 3, 5, 7, compare, save, draw."""
+    from ftlm.demo import run_demo  # noqa: PLC0415 — a command imports what it needs when it runs
+    from ftlm.progress import Progress  # noqa: PLC0415
+    from ftlm.report.demo import demo_page, demo_text  # noqa: PLC0415
+
+    with Progress("", quiet=as_json) as progress:
+        found = run_demo(
+            Path(out), step=step, noise=noise, seed=seed, threads=threads, force=force, say=progress.say,
+            progress=progress,
+        )  # fmt: skip
+    page = demo_page(found, Path(out) / "demo.html", force=force)
+    found.files.append(page)
+    if as_json:
+        show(found, as_json=True)
+    else:
+        print(demo_text(found))
+        print("\nwritten: " + ", ".join(str(f) for f in found.files))
+
+
+@app.command()
+@guarded
+def inspect(
+    files: Files,
+    time: Time = None,
+    sampling: Step = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    units: Units = None,
+    columns: Columns = None,
+    between: Between = None,
+    sliced: Slice = None,
+    resample: Resample = None,
+    as_json: Json = False,
+) -> None:
+    """Show what a run holds: ranges, noise, quantisation, rest."""
+    from ftlm.inspection import inspect_run  # noqa: PLC0415
+
+    options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
+    found = [inspect_run(run) for run in load_runs(files, sliced, **options)]
+    if as_json:
+        print(json.dumps([f.to_dict() for f in found], indent=1, ensure_ascii=False))
+    else:
+        print("\n\n".join(str(f) for f in found))
+
+
+@app.command()
+@guarded
+def identify(
+    files: Files,
+    structure: StructureOption,
+    method: MethodOption = Method.multi_innovation,
+    time: Time = None,
+    sampling: Step = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    units: Units = None,
+    columns: Columns = None,
+    between: Between = None,
+    sliced: Slice = None,
+    resample: Resample = None,
+    only: OnlyOutput = None,
+    coupling: CouplingOption = Coupling.simulated,
+    cross_stage: CrossStage = False,
+    friction: Friction = False,
+    laws: LawsOption = Laws.none,
+    input_order: InputOrderOption = InputOrder.published,
+    stock_filter: StockFilter = False,
+    orders: Orders = None,
+    fixed: Fixed = None,
+    delay: Delay = None,
+    initial: InitialOption = "auto",
+    criterion: CriterionOption = Criterion.output_error,
+    norm: NormOption = Norm.l1,
+    lattice: LatticeOption = None,
+    step: LatticeStep = 0.05,
+    p: P = 7,
+    k0: K0 = 1.0,
+    rows: RowsOption = Rows.haar,
+    m: M = None,
+    keep: Keep = 20,
+    threads: Threads = None,
+    out: Out = None,
+    report: Annotated[str | None, typer.Option("--report", metavar="HTML", help="Page to write.")] = None,
+    validation: Annotated[str | None, typer.Option("--validation", metavar="FILE", help="Another run.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Identify a model: orders on a lattice, coefficients, both errors, warnings in words."""
+    from ftlm.progress import Progress  # noqa: PLC0415
+
+    check_writable([out, report], force=force)
+    wanted = structure_of(
+        structure, only=only, coupling=coupling, cross_stage=cross_stage, friction=friction, laws=laws,
+        input_order=input_order, stock_filter=stock_filter, orders=orders, fixed=fixed, delay=delay, initial=initial,
+    )  # fmt: skip
+    options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
+    runs = load_runs(files, sliced, **options)
+    others = load_runs([validation], None, **options) if validation is not None else []
+    with Progress("searching orders", quiet=as_json) as progress:
+        found = ftlm.identify(
+            runs, wanted, method=method.value, criterion=criterion.value, lattice=lattice_of(lattice, step),
+            norm=norm.value, innovation_length=p, prior_covariance=k0, rows=rows.value, m=m, keep=keep,
+            threads=threads, progress=progress,
+        )  # fmt: skip
+    if out is not None:
+        found.model.save(out, force=force)
+    if report is not None:
+        from ftlm.report.page import identification_page  # noqa: PLC0415
+
+        identification_page(found, report, validation=others or None, force=force)
+    show(found, as_json=as_json)
+    if others and not as_json:
+        print(f"\nvalidation on {', '.join(r.name for r in others)}\n{found.model.compare(others)}")
+
+
+@app.command()
+@guarded
+def search(
+    files: Files,
+    structure: StructureOption,
+    method: MethodOption = Method.multi_innovation,
+    time: Time = None,
+    sampling: Step = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    units: Units = None,
+    columns: Columns = None,
+    between: Between = None,
+    sliced: Slice = None,
+    resample: Resample = None,
+    only: OnlyOutput = None,
+    coupling: CouplingOption = Coupling.simulated,
+    cross_stage: CrossStage = False,
+    friction: Friction = False,
+    laws: LawsOption = Laws.none,
+    input_order: InputOrderOption = InputOrder.published,
+    stock_filter: StockFilter = False,
+    orders: Orders = None,
+    fixed: Fixed = None,
+    delay: Delay = None,
+    initial: InitialOption = "auto",
+    criterion: CriterionOption = Criterion.output_error,
+    norm: NormOption = Norm.l1,
+    lattice: LatticeOption = None,
+    step: LatticeStep = 0.05,
+    p: P = 7,
+    k0: K0 = 1.0,
+    rows: RowsOption = Rows.haar,
+    m: M = None,
+    keep: Keep = 20,
+    threads: Threads = None,
+    as_json: Json = False,
+) -> None:
+    """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
+    from ftlm.progress import Progress  # noqa: PLC0415
+
+    wanted = structure_of(
+        structure, only=only, coupling=coupling, cross_stage=cross_stage, friction=friction, laws=laws,
+        input_order=input_order, stock_filter=stock_filter, orders=orders, fixed=fixed, delay=delay, initial=initial,
+    )  # fmt: skip
+    options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
+    runs = load_runs(files, sliced, **options)
+    parts = {"stage": wanted} if wanted.has_order_law else {
+        e.output: wanted.equation(e.output) for e in wanted.equations
+    }  # fmt: skip
+    chosen = lattice_of(lattice, step)
+    known = {"alpha", *wanted.order_names}
+    for name in chosen.orders:
+        if name not in known:
+            raise ModelError(f"--lattice {name!r} is no free order; free are {', '.join(wanted.order_names) or 'none'}")
+    found = {}
+    for name, part in parts.items():
+        own = {n: v for n, v in chosen.orders.items() if n == "alpha" or n in part.order_names}
+        with Progress(f"searching orders of {name}", quiet=as_json) as progress:
+            found[name] = ftlm.search_orders(
+                runs, part, replace(chosen, orders=own), criterion=criterion.value, coefficients=method.value,
+                norm=norm.value, innovation_length=p, prior_covariance=k0, rows=rows.value, m=m, keep=keep,
+                threads=threads, progress=progress,
+            )  # fmt: skip
+    if as_json:
+        data = {n: r.to_dict() for n, r in found.items()}
+        print(json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False, default=plain))
+    else:
+        print("\n\n".join(f"{name}\n{result}" for name, result in found.items()))
+
+
+@app.command()
+@guarded
+def compare(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="A saved model.")],
+    files: Files,
+    min_fit: Annotated[
+        float | None, typer.Option("--min-fit", help="Exit with 4 where a free run fits less than this percentage.")
+    ] = None,
+    time: Time = None,
+    sampling: Step = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    units: Units = None,
+    columns: Columns = None,
+    between: Between = None,
+    sliced: Slice = None,
+    resample: Resample = None,
+    m: M = None,
+    as_json: Json = False,
+) -> None:
+    """Equation error and output error of a saved model on measured runs."""
+    loaded = ftlm.load_model(model)
+    options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
+    found = loaded.compare(load_runs(files, sliced, **options), m=m)
+    show(found, as_json=as_json)
+    if min_fit is not None:
+        # Negated so that a fit that is not a number is too low.
+        low = {name: fit for name, fit in found.fit_percent.items() if not fit >= min_fit}
+        if low:
+            listed = ", ".join(f"{name} {fit:.4g} %" for name, fit in low.items())
+            print(f"ftlm: fit below {min_fit:g} %: {listed}", file=sys.stderr)
+            raise typer.Exit(EXIT_VALIDATION)
+
+
+@app.command()
+@guarded
+def simulate(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="A saved model.")],
+    file: Annotated[str, typer.Argument(metavar="FILE", help="A run whose inputs drive the model.")],
+    out: Annotated[str, typer.Option("-o", "--out", metavar="CSV", help="Where to write the simulated run.")],
+    time: Time = None,
+    sampling: Step = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    units: Units = None,
+    columns: Columns = None,
+    between: Between = None,
+    sliced: Slice = None,
+    resample: Resample = None,
+    tolerance: Annotated[float, typer.Option("--tolerance", help="Relative change at which refinement ends.")] = 1e-6,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Free run of a saved model on a run's inputs, written as csv."""
+    check_writable([out], force=force)
+    loaded = ftlm.load_model(model)
+    options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
+    (run,) = load_runs([file], sliced, **options)
+    found = loaded.simulate(run, tolerance=tolerance)
+    found.to_csv(out, force=force)
+    if as_json:
+        print(json.dumps({"written": out, "rows": found.length, "outputs": list(found.outputs)}, ensure_ascii=False))
+    else:
+        print(f"{found.length} rows of {', '.join(found.outputs)} written to {out}")
+
+
+@app.command()
+@guarded
+def doctor(as_json: Json = False) -> None:
+    """Show versions, cores, vector unit, and whether the rig's driver is there."""
+    from importlib import metadata  # noqa: PLC0415
+
+    from ftlm import _core  # noqa: PLC0415
+    from ftlm.order_search import available_threads  # noqa: PLC0415
+
+    def installed(package: str) -> str | None:
+        try:
+            return metadata.version(package)
+        except metadata.PackageNotFoundError:
+            return None
+
+    found: dict[str, Any] = {
+        "ftlm": ftlm.__version__,
+        "core": _core.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cores": available_threads(),
+        "simd": _core.SIMD,
+        "numpy": installed("numpy"),
+        "scipy": installed("scipy"),
+        "rig driver": driver_state(),
+    }
+    if as_json:
+        print(json.dumps(found, indent=1))
+        return
+    for name, value in found.items():
+        print(f"{name:<12}{value if value is not None else 'not installed'}")
+    if found["scipy"] is None:
+        print("scipy is needed for .mat files: pip install 'ftlm[mat]'")
+
+
+def driver_state() -> str:
+    """Whether the vendor's Python package for the Q8-USB board can be loaded, in words."""
+    try:
+        from importlib import import_module  # noqa: PLC0415
+
+        import_module("quanser.hardware")
+    except ImportError:
+        return "not found: the vendor's Python package (quanser.hardware) is not installed"
+    except OSError as error:
+        return f"found without its library (hil): {error}"
+    return "found"
+
+
+def main() -> None:
+    """Entry point."""
+    app()

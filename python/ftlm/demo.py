@@ -1,0 +1,302 @@
+"""The main job from end to end on simulated runs of both stages: identify, compare, tabulate, draw, save."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ftlm.errors import DataError, ModelError
+from ftlm.flexible_link import flexible_link, link_model
+from ftlm.identification import Identification, identify, multi_innovation_trace
+from ftlm.models import Model
+from ftlm.order_search import Lattice
+from ftlm.runs import Run
+from ftlm.simulation import explicit_euler, simulate
+from ftlm.validation import Metrics, compare, metrics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from numpy.typing import NDArray
+
+    from ftlm.identification import Trace
+
+    Floats = NDArray[np.float64]
+
+__all__ = ["Demo", "StageRow", "demo_plant", "demo_run", "run_demo"]
+
+#: Innovation lengths of the paper's Tables 4 and 5.
+INNOVATION_LENGTHS = (1, 3, 5, 7)
+#: Steps between two points of a convergence curve: 128 points are more than a page shows.
+TRACE_EVERY = 16
+#: The demonstration's arm: the effective coefficients, with fractional damping and friction in the link.
+PLANTS: dict[int, tuple[dict[str, float], dict[str, float]]] = {
+    1: (
+        {"alpha1": 2.0, "alpha2": 2.0, "gamma1": 0.95, "beta2": 0.1, "mu2": 0.85},
+        {"a1": 628.89, "b1": -62.956, "d1": 6.63, "g1": 140.47, "r": (0.0635 + 0.1704) / 0.1704},
+    ),
+    2: (
+        {"alpha3": 2.0, "alpha4": 2.0, "gamma3": 0.9, "beta4": 0.2, "mu4": 0.8},
+        {"a3": 2271.117, "b3": -496.763, "d3": 28.351, "g3": 288.122, "r": (0.00301955 + 0.0064387) / 0.0064387},
+    ),
+}  # fmt: skip
+
+
+def demo_plant(stage: int) -> Model:
+    """The simulated arm of a stage: effective coefficients, fractional orders, coefficient law obeyed."""
+    orders, free = PLANTS[stage]
+    h, d, r = 2 * stage - 1, 2 * stage, free["r"]
+    law = {f"a{d}": -free[f"a{h}"] * r, f"b{d}": -free[f"b{h}"], f"d{d}": -free[f"d{h}"] * r, f"g{d}": -free[f"g{h}"]}
+    coefficients = {name: value for name, value in free.items() if name != "r"} | law
+    return link_model(stage=1 if stage == 1 else 2, orders=orders, coefficients=coefficients)
+
+
+def demo_run(shape: str, *, duration: float = 10.0, step: float = 0.002, noise: float = 1e-4, seed: int = 1) -> Run:
+    """A run of both simulated stages under the paper's inputs.
+
+    Parameters
+    ----------
+    shape
+        ``"square"``: 0.3 A, period 2 s, duty 50 %. ``"sine"``: 0.6 A at 6.3 rad/s. Both currents alike, held over
+        a sample.
+    duration, step
+        Length and sampling step [s].
+    noise
+        Standard deviation of the noise on every angle [rad].
+    seed
+        Of the noise.
+
+    Returns
+    -------
+    Run
+        I1, I2 [A]; theta11, theta12, theta21, theta22 [rad], point samples.
+
+    Raises
+    ------
+    ModelError
+        Another shape, or a noise that is negative.
+    """
+    if not (np.isfinite(noise) and noise >= 0):
+        raise ModelError(f"noise = {noise} rad is not a non-negative number")
+    rows = round(duration / step) + 1
+    t = np.arange(rows) * step
+    if shape == "square":
+        # Half a sample of slack keeps rounding from moving an edge.
+        current = np.where((t + step / 2) % 2.0 < 1.0, 0.3, -0.3)
+    elif shape == "sine":
+        current = 0.6 * np.sin(6.3 * t)
+    else:
+        raise ModelError(f"shape = {shape!r} is not known; use 'square' or 'sine'")
+    inputs = {"I1": current, "I2": current}
+    rng = np.random.default_rng([seed, ("square", "sine").index(shape)])
+    outputs: dict[str, Floats] = {}
+    for stage in (1, 2):
+        names = (f"theta{stage}1", f"theta{stage}2")
+        blank = Run.from_arrays(step=step, inputs=inputs, outputs={n: np.zeros(rows) for n in names}, name=shape)
+        truth = simulate(demo_plant(stage), blank, tolerance=1e-5)
+        outputs |= {n: truth[n] + noise * rng.standard_normal(rows) for n in names}
+    units = {n: "A" for n in inputs} | {n: "rad" for n in outputs}
+    return Run.from_arrays(step=step, inputs=inputs, outputs=outputs, units=units, name=shape)
+
+
+@dataclass(frozen=True)
+class StageRow:
+    """One row of a table in the shape of the paper's Tables 4 and 5, for one output.
+
+    Parameters
+    ----------
+    label
+        Which model.
+    output
+        Which equation.
+    orders, coefficients
+        By name; an integer-order model without the term has none.
+    equation_error, output_error
+        On the run that the model was identified from.
+    validation
+        Output error on the other run.
+    """
+
+    label: str
+    output: str
+    orders: Mapping[str, float]
+    coefficients: Mapping[str, float]
+    equation_error: Metrics
+    output_error: Metrics
+    validation: Metrics
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Everything the demonstration made.
+
+    Parameters
+    ----------
+    square, sine
+        The runs.
+    rows
+        Table rows by stage.
+    results
+        Identifications by stage and label.
+    traces
+        Convergence by output and p.
+    files
+        What was written.
+    """
+
+    square: Run
+    sine: Run
+    rows: dict[int, list[StageRow]]
+    results: dict[int, dict[str, Identification]]
+    traces: dict[str, dict[int, Trace]]
+    files: list[Path]
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "rows": {
+                str(stage): [
+                    {
+                        "model": r.label,
+                        "output": r.output,
+                        "orders": dict(r.orders),
+                        "coefficients": dict(r.coefficients),
+                        "equation_error": r.equation_error.to_dict(),
+                        "output_error": r.output_error.to_dict(),
+                        "validation": r.validation.to_dict(),
+                    }
+                    for r in rows
+                ]
+                for stage, rows in self.rows.items()
+            },
+            "warnings": {
+                f"stage {stage}, {label}": list(result.warnings)
+                for stage, results in self.results.items()
+                for label, result in results.items()
+            },
+            "files": [str(f) for f in self.files],
+        }
+
+
+def integer_rows(stage: int, square: Run, sine: Run) -> list[StageRow]:
+    """The maker's integer-order model, stepped by explicit Euler at the run's step, as the paper's first rows."""
+    model = link_model(stage=1 if stage == 1 else 2)
+    on_square, on_sine = compare(replace_coupling(model), square), None
+    responses = {run.name: explicit_euler(model, run) for run in (square, sine)}
+    rows = []
+    for item in model.equations:
+        name = item.output
+        figures = {run.name: metrics(run[name], responses[run.name][name]) for run in (square, sine)}
+        orders = {t.name: t.order.constant for t in item.terms if t.name is not None}
+        index = item.terms[0].name[1:] if item.terms[0].name else ""
+        named = {f"alpha{index}": item.order.constant}
+        named |= {f"{g}{index}": orders[f"{c}{index}"] for g, c in (("beta", "a"), ("gamma", "b"), ("mu", "d"))}
+        coefficients = {t.name: float(t.coefficient) for t in item.terms if t.name is not None}
+        rows.append(
+            StageRow(
+                "integer-order, stated", name, named, coefficients,
+                on_square.equation_error[name], figures["square"], figures["sine"],
+            )
+        )  # fmt: skip
+    return rows
+
+
+def replace_coupling(model: Model) -> Model:
+    """The model with each equation driven by the measured other output."""
+    return replace(model, structure=replace(model.structure, coupling="measured"))
+
+
+def run_demo(
+    folder: Path,
+    *,
+    step: float = 0.05,
+    noise: float = 1e-4,
+    seed: int = 1,
+    threads: int | None = None,
+    force: bool = False,
+    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Demo:
+    """Simulate, identify every equation with p = 1, 3, 5, 7 and by least squares, compare, save.
+
+    Parameters
+    ----------
+    folder
+        Where runs and models go; made if it is not there.
+    step
+        Step of the order lattice; the paper's is 0.05.
+    noise, seed
+        See :func:`demo_run`.
+    threads, progress
+        See :func:`ftlm.search_orders`.
+    force
+        Whether to overwrite.
+    say
+        Called with a line about what happens next.
+
+    Returns
+    -------
+    Demo
+        Tables and files.
+
+    Raises
+    ------
+    DataError
+        A file is there already and ``force`` is not set, or the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{folder} cannot be made: {error.strerror or error}; choose another folder") from error
+    wanted = ["square.csv", "sine.csv", *(f"stage{s}-{n}.json" for s in (1, 2) for n in ("paper", "least-squares"))]
+    there = [n for n in (*wanted, "demo.html") if (folder / n).exists()]
+    if there and not force:
+        raise DataError(f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or --force")
+    say("simulating both stages under a square and a sine current")
+    square = demo_run("square", noise=noise, seed=seed)
+    sine = demo_run("sine", noise=noise, seed=seed)
+    files = []
+    for run in (square, sine):
+        path = folder / f"{run.name}.csv"
+        run.to_csv(path, force=force)
+        files.append(path)
+    rows: dict[int, list[StageRow]] = {}
+    results: dict[int, dict[str, Identification]] = {}
+    traces: dict[str, dict[int, Trace]] = {}
+    for stage in (1, 2):
+        structure = flexible_link(stage=1 if stage == 1 else 2, coupling="measured", laws=())
+        own = list(structure.signals)
+        on, off = square.select(own), sine.select(own)
+        rows[stage], results[stage] = integer_rows(stage, on, off), {}
+        for p in (*INNOVATION_LENGTHS, None):
+            label = f"p = {p}" if p else "least squares"
+            say(f"stage {stage}: searching the orders of both equations, {label}")
+            result = identify(
+                on, structure, method="multi-innovation" if p else "least-squares", innovation_length=p or 1,
+                lattice=Lattice(step=step), threads=threads, progress=progress,
+            )  # fmt: skip
+            results[stage][label] = result
+            validation = result.model.compare(off)
+            for item, free in zip(result.model.equations, structure.equations, strict=True):
+                name = item.output
+                rows[stage].append(
+                    StageRow(
+                        label, name,
+                        {n: result.orders[n] for n in free.order_names},
+                        {n: result.coefficients[n] for n in free.coefficient_names},
+                        result.equation_error[name], result.output_error[name], validation.output_error[name],
+                    )
+                )  # fmt: skip
+                if p:
+                    at = structure.equation(name).with_orders({n: result.orders[n] for n in free.order_names})
+                    traces.setdefault(name, {})[p] = multi_innovation_trace(
+                        on, at, innovation_length=p, every=TRACE_EVERY
+                    )
+        for label, stem in ((f"p = {INNOVATION_LENGTHS[-1]}", "paper"), ("least squares", "least-squares")):
+            path = folder / f"stage{stage}-{stem}.json"
+            results[stage][label].model.save(path, force=force)
+            files.append(path)
+    return Demo(square, sine, rows, results, traces, files)
