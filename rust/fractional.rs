@@ -24,7 +24,8 @@ const TERMS_FAR: usize = 8;
 #[must_use]
 pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
-    (1..=m).map(|n| scale * second_difference(eta, n).0).collect()
+    let differences = SecondDifferences::new(eta);
+    (1..=m).map(|n| scale * differences.value(n)).collect()
 }
 
 /// Derivative of [`block_pulse_kernel`] with respect to η.
@@ -32,47 +33,85 @@ pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
 /// Uses d/dη of `h^η/Γ(η+2)`, that is ln h − ψ(η+2), and the term-by-term derivative of the binomial sum.
 #[must_use]
 pub fn block_pulse_kernel_derivative(eta: f64, m: usize, step: f64) -> Vec<f64> {
+    kernel_with_derivative(eta, m, step).1
+}
+
+/// [`block_pulse_kernel`] and its derivative with respect to η, for little more than the price of one.
+#[must_use]
+pub fn kernel_with_derivative(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
     let slope = libm::log(step) - digamma(eta + 2.0);
+    let differences = SecondDifferences::new(eta);
     (1..=m)
         .map(|n| {
-            let (v, dv) = second_difference(eta, n);
-            scale * (v * slope + dv)
+            let (v, dv) = differences.value_and_slope(n);
+            (scale * v, scale * (v * slope + dv))
         })
-        .collect()
+        .unzip()
 }
 
 /// `v_n = n^{η+1} − 2(n−1)^{η+1} + (n−2)^{η+1}` (v₁ = 1) and its derivative with respect to η, both to a few ε.
 #[must_use]
-#[allow(clippy::cast_precision_loss)]
 pub fn second_difference(eta: f64, n: usize) -> (f64, f64) {
-    match n {
-        0 => (0.0, 0.0),
-        1 => (1.0, 0.0),
-        2 => {
-            let ln2 = std::f64::consts::LN_2;
-            (2.0 * libm::expm1(eta * ln2), 2.0 * libm::exp2(eta) * ln2)
-        }
-        _ => {
-            let centre = (n - 1) as f64;
-            let terms = if n - 1 < NEAR { TERMS_NEAR } else { TERMS_FAR };
-            let shrink = 1.0 / (centre * centre);
-            let (mut c, mut dc) = (1.0, 0.0);
-            let (mut power, mut sum, mut dsum) = (1.0, 0.0, 0.0);
-            for k in 0..terms {
-                for j in [2 * k, 2 * k + 1] {
-                    // η + 1 − j, but exactly η at j = 1: for small η the rounding of η + 1 would be the whole error.
-                    let factor = if j == 0 { eta + 1.0 } else { eta - (j as f64 - 1.0) };
-                    let divisor = (j + 1) as f64;
-                    dc = (dc * factor + c) / divisor;
-                    c = c * factor / divisor;
-                }
-                power *= shrink;
-                sum += c * power;
-                dsum += dc * power;
+    SecondDifferences::new(eta).value_and_slope(n)
+}
+
+/// The even binomial coefficients C(η+1, 2k), k = 1 … K, and their derivatives with respect to η: all n share them.
+struct SecondDifferences {
+    eta: f64,
+    coefficients: [f64; TERMS_NEAR],
+    slopes: [f64; TERMS_NEAR],
+}
+
+impl SecondDifferences {
+    #[allow(clippy::cast_precision_loss)]
+    fn new(eta: f64) -> Self {
+        let (mut coefficients, mut slopes) = ([0.0; TERMS_NEAR], [0.0; TERMS_NEAR]);
+        let (mut c, mut dc) = (1.0, 0.0);
+        for (k, (kept, slope)) in coefficients.iter_mut().zip(&mut slopes).enumerate() {
+            for j in [2 * k, 2 * k + 1] {
+                // η + 1 − j, but exactly η at j = 1: for small η the rounding of η + 1 would be the whole error.
+                let factor = if j == 0 { eta + 1.0 } else { eta - (j as f64 - 1.0) };
+                let divisor = (j + 1) as f64;
+                dc = (dc * factor + c) / divisor;
+                c = c * factor / divisor;
             }
-            let outer = 2.0 * libm::pow(centre, eta + 1.0);
-            (outer * sum, outer * (sum * libm::log(centre) + dsum))
+            (*kept, *slope) = (c, dc);
+        }
+        Self { eta, coefficients, slopes }
+    }
+
+    /// Σ_k a_k x^k over the terms that count at this distance, smallest first.
+    fn sum(coefficients: &[f64; TERMS_NEAR], centre: usize, shrink: f64) -> f64 {
+        let terms = if centre < NEAR { TERMS_NEAR } else { TERMS_FAR };
+        coefficients[..terms].iter().rev().fold(0.0, |sum, &c| (sum + c) * shrink)
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn value(&self, n: usize) -> f64 {
+        match n {
+            0 => 0.0,
+            1 => 1.0,
+            2 => 2.0 * libm::expm1(self.eta * std::f64::consts::LN_2),
+            _ => {
+                let centre = (n - 1) as f64;
+                let sum = Self::sum(&self.coefficients, n - 1, 1.0 / (centre * centre));
+                2.0 * libm::pow(centre, self.eta + 1.0) * sum
+            }
+        }
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn value_and_slope(&self, n: usize) -> (f64, f64) {
+        let value = self.value(n);
+        match n {
+            0 | 1 => (value, 0.0),
+            2 => (value, 2.0 * libm::exp2(self.eta) * std::f64::consts::LN_2),
+            _ => {
+                let centre = (n - 1) as f64;
+                let slope = Self::sum(&self.slopes, n - 1, 1.0 / (centre * centre));
+                (value, value * libm::log(centre) + 2.0 * libm::pow(centre, self.eta + 1.0) * slope)
+            }
         }
     }
 }
@@ -167,11 +206,12 @@ pub fn fractional_integral(x: &[f64], eta: f64, step: f64, rule: IntegralRule) -
             Ok(out)
         }
         IntegralRule::Trapezoidal => {
+            let differences = SecondDifferences::new(eta);
             // The block-pulse kernel is also the trapezoidal weight of every sample but the first.
             let mut out = series::multiply(&block_pulse_kernel(eta, m, step), x, m);
             let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
             for (n, value) in out.iter_mut().enumerate() {
-                *value += x[0] * scale * (first_sample_weight(eta, n) - second_difference(eta, n + 1).0);
+                *value += x[0] * scale * (first_sample_weight(eta, n) - differences.value(n + 1));
             }
             if let Some(first) = out.first_mut() {
                 *first = 0.0;
@@ -230,18 +270,18 @@ pub fn fractional_derivative(
         return Err(Error::Length { name: "x".into(), expected: whole + 2, found: m });
     }
     // Initial values and the highest whole derivative that the L1 formula still integrates.
+    let mut x = x.to_vec();
+    x[0] = initial.first().copied().unwrap_or(x[0]);
     let mut starts = Vec::with_capacity(whole);
-    let mut highest = x.to_vec();
+    let mut highest = Vec::new();
     for k in 0..whole {
-        if k > 0 {
-            highest = difference(&highest, step);
-        }
+        highest = difference(&x, k, step);
         starts.push(initial.get(k).copied().unwrap_or(highest[0]));
         highest[0] = starts[k];
     }
     #[allow(clippy::cast_precision_loss)]
     let fraction = alpha - (whole - 1) as f64;
-    let mut out = if fraction == 1.0 { difference(&highest, step) } else { l1(&highest, fraction, step) };
+    let mut out = if fraction == 1.0 { difference(&x, whole, step) } else { l1(&highest, fraction, step) };
     if definition == Derivative::RiemannLiouville && fraction < 1.0 {
         #[allow(clippy::cast_precision_loss)]
         for (k, &start) in starts.iter().enumerate() {
@@ -278,15 +318,30 @@ fn l1(x: &[f64], order: f64, step: f64) -> Vec<f64> {
     series::multiply(&weights, &rises, m)
 }
 
-/// First derivative by central differences, one-sided at the ends; second order in h. Needs three samples.
-fn difference(x: &[f64], step: f64) -> Vec<f64> {
-    let m = x.len();
-    let mut out = vec![0.0; m];
-    for n in 1..m - 1 {
-        out[n] = (x[n + 1] - x[n - 1]) / (2.0 * step);
-    }
-    out[0] = (-3.0 * x[0] + 4.0 * x[1] - x[2]) / (2.0 * step);
-    out[m - 1] = (3.0 * x[m - 1] - 4.0 * x[m - 2] + x[m - 3]) / (2.0 * step);
+/// Derivative of whole order k ≤ 3 by central differences, one-sided towards the ends; second order in h at every
+/// sample. Needs k + 2 samples.
+///
+/// Each k has its own formula: first differences repeated would lose an order at the ends every time.
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_possible_wrap)]
+fn difference(x: &[f64], k: usize, step: f64) -> Vec<f64> {
+    // Weights at the first samples, counted from the first, and those around every sample further in.
+    let (ends, centre): (&[&[f64]], &[f64]) = match k {
+        0 => return x.to_vec(),
+        1 => (&[&[-1.5, 2.0, -0.5]], &[-0.5, 0.0, 0.5]),
+        2 => (&[&[2.0, -5.0, 4.0, -1.0]], &[1.0, -2.0, 1.0]),
+        _ => (&[&[-2.5, 9.0, -12.0, 7.0, -1.5], &[-1.5, 5.0, -6.0, 3.0, -0.5]], &[-0.5, 1.0, 0.0, -1.0, 0.5]),
+    };
+    let (m, reach) = (x.len(), ends.len());
+    let scale = step.powi(-(k as i32));
+    // Read backwards, a derivative of odd order changes its sign.
+    let mirrored = if k % 2 == 1 { -scale } else { scale };
+    let mut out: Vec<f64> = Vec::with_capacity(m);
+    let weighted = |weights: &[f64], values: &mut dyn Iterator<Item = &f64>| -> f64 {
+        weights.iter().zip(values).map(|(w, v)| w * v).sum()
+    };
+    out.extend(ends.iter().map(|weights| scale * weighted(weights, &mut x.iter())));
+    out.extend(x.windows(2 * reach + 1).map(|window| scale * weighted(centre, &mut window.iter())));
+    out.extend(ends.iter().rev().map(|weights| mirrored * weighted(weights, &mut x.iter().rev())));
     out
 }
 

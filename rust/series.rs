@@ -139,7 +139,9 @@ pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<V
     for b in rhs {
         check_length("right-hand side", m, b.len())?;
     }
-    let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(|s| s.as_ref()[0])).collect();
+    // An empty series starts with nothing, which cannot be divided by either.
+    let first = |s: &S| s.as_ref().first().copied().unwrap_or(0.0);
+    let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(first)).collect();
     let inverse = crate::small::inverse(&leading, n)?;
     let mut division = Division::new(n, m);
     let mut start = 0;

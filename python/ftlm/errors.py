@@ -21,9 +21,20 @@ class ConvergenceError(FtlmError):
     """An estimator that ended without an answer that can be trusted."""
 
 
-class RigFault(FtlmError):
+class RigFault(FtlmError):  # noqa: N818 — a fault, as people at a rig say
     """A fault of the rig, with its cause in words."""
 
 
 class InternalError(FtlmError):
     """A fault in ftlm itself; please report it with the message."""
+
+
+def whole_number(value: object) -> int | None:
+    """Return a value that is a whole number as an int, anything else as None; the message is the caller's."""
+    if isinstance(value, (str, bytes, bytearray, bool)):
+        return None
+    try:
+        number = int(value)  # type: ignore[call-overload]
+        return number if number == value else None
+    except (TypeError, ValueError, OverflowError):
+        return None

@@ -44,7 +44,7 @@ class LinkParameters:
 
     @property
     def inertia_ratio(self) -> float:
-        """r = (J_1 + J_2) / J_2, by which the coefficients of the deflection exceed those of the hub."""
+        """Inertia ratio r = (J_1 + J_2) / J_2, by which the coefficients of the deflection exceed those of the hub."""
         return (self.hub_inertia + self.link_inertia) / self.link_inertia
 
     def coefficients(self, stage: int) -> dict[str, float]:
@@ -122,7 +122,7 @@ def flexible_link(
     parameters: Literal["effective", "table-3"] = "effective",
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
 ) -> Structure:
-    """The paper's structure (22)-(25): two equations a stage.
+    """Make the paper's structure (22)-(25): two equations a stage.
 
     Parameters
     ----------
@@ -253,7 +253,7 @@ def link_model(
     input_order: Literal["published", "derived"] = "published",
     coupling: Literal["simulated", "measured"] = "simulated",
 ) -> Model:
-    """The arm with everything known: by default the integer-order model of the maker's manual.
+    """Make the arm with everything known: by default the integer-order model of the maker's manual.
 
     Parameters
     ----------

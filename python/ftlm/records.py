@@ -66,16 +66,17 @@ class Record:
         return int(self.means.shape[1])
 
     def core(self) -> tuple[float, Floats, Floats | None]:
-        """The record as the core takes it."""
+        """Return the record as the core takes it."""
         return self.step, self.means, self.sensor
 
     def of(self, name: str) -> Floats:
-        """Pulse means of a signal."""
-        return self.means[self.signals.index(name)]
+        """Return the pulse means of a signal."""
+        row: Floats = self.means[self.signals.index(name)]
+        return row
 
 
 def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
-    """The paper's 2 048 pulses, or as many as the shortest run carries (a power of two for Haar coordinates)."""
+    """Return the paper's 2 048 pulses, or as many as the shortest run carries (a power of two for Haar coordinates)."""
     carried = min(run.length for run in runs) - 1
     m = min(PAPER_M, carried)
     return 1 << (m.bit_length() - 1) if power_of_two and m > 0 else m
@@ -166,7 +167,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
 
 
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
-    """The structure's sensor filter as a series, or None."""
+    """Return the structure's sensor filter as a series, or None."""
     sensor = structure.sensor_filter
     return None if sensor is None else _core.filter_series(list(sensor.numerator), list(sensor.denominator), m, step)
 
@@ -205,12 +206,12 @@ def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float,
 def equation_tuple(
     item: Equation, signals: Sequence[str]
 ) -> tuple[tuple[int, float, list[tuple[int, float]]], list[float]]:
-    """An identified equation."""
+    """Return an identified equation: its structure and its coefficients."""
     return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
 
 
 def initial_tuple(initial: Initial) -> tuple[bool, list[float]]:
-    """Initial terms, decided."""
+    """Return decided initial terms: whether Caputo's, else their exponents."""
     if initial == "caputo":
         return True, []
     return False, [] if isinstance(initial, str) else list(initial)

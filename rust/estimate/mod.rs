@@ -1,4 +1,5 @@
-//! Estimators of the coefficients at given orders, one file each.
+//! Estimators, one file each: of the coefficients at given orders, and of orders and coefficients together.
 
 pub mod least_squares;
 pub mod multi_innovation;
+pub mod output_error;

@@ -1,13 +1,16 @@
-//! Least squares and multi-innovation least squares at given orders.
+//! Least squares and multi-innovation least squares at given orders; joint output error.
 
-use numpy::PyArray2;
+use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 
-use super::arrays::{initial, records, stacked, structure, InitialArg, RecordArg, StructureArg};
+use super::arrays::{initial, record, records, rows, stacked, structure, vector, InitialArg, RecordArg, StructureArg};
 use super::errors::detached;
+use crate::equation::AffineOrder;
+use crate::error::{check_finite, check_length, Error};
 use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
-use crate::estimate::{least_squares as batch, multi_innovation as stepwise};
+use crate::estimate::{least_squares as batch, multi_innovation as stepwise, output_error as joint};
 
 /// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);
@@ -57,4 +60,108 @@ pub fn multi_innovation<'py>(
     }
     let estimate = detached(py, || stepwise::closed_form(&records, &structure, &fixed, &initial, &innovation))?;
     Ok((tuple(estimate), None))
+}
+
+/// (constant, weight of each free order).
+type AffineArg = (f64, Vec<f64>);
+/// (known factor, (coefficient, power) pairs).
+type MonomialArg = (f64, Vec<(usize, i32)>);
+/// (output, alpha, [(signal, order, coefficient), …]).
+type FreeEquationArg = (usize, AffineArg, Vec<(usize, AffineArg, MonomialArg)>);
+/// (record, pulses a sample interval, samples of each output, filter of simulated outputs, weight of each output).
+type ExperimentArg<'py> =
+    (RecordArg<'py>, usize, PyReadonlyArray2<'py, f64>, Option<(PyReadonlyArray1<'py, f64>, Vec<bool>)>, Vec<f64>);
+
+fn affine((constant, weights): AffineArg) -> AffineOrder {
+    AffineOrder { constant, weights }
+}
+
+fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
+    let record = record(&argument.0)?;
+    let every = argument.1;
+    if every == 0 || record.m() % every != 0 {
+        let what = format!("{} pulses are no multiple of {every} a sample interval", record.m());
+        return Err(Error::Structure { what, remedy: "refine every interval alike".into() }.into());
+    }
+    let samples = rows(&argument.2);
+    for (i, row) in samples.iter().enumerate() {
+        check_finite(&format!("samples of output {i}"), row)?;
+    }
+    let filter = match &argument.3 {
+        None => None,
+        Some((series, applies)) => {
+            let series = vector("filter", series)?;
+            check_length("filter", record.m(), series.len())?;
+            check_length("filtered outputs", samples.len(), applies.len())?;
+            Some((series, applies.clone()))
+        }
+    };
+    check_finite("weights", &argument.4)?;
+    Ok(joint::Experiment { record, every, samples, filter, weights: argument.4.clone() })
+}
+
+#[pyfunction]
+#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
+pub fn output_error<'py>(
+    py: Python<'py>,
+    runs: Vec<ExperimentArg<'py>>,
+    laws: Vec<FreeEquationArg>,
+    order_bounds: Vec<(f64, f64)>,
+    coordinates: Vec<String>,
+    coupled: bool,
+    terms: InitialArg,
+    start_orders: Vec<f64>,
+    start_coefficients: Vec<f64>,
+    evaluations: usize,
+    tolerance: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
+    let (orders, coefficients) = (order_bounds.len(), coordinates.len());
+    let signals = experiments.first().map_or(0, |e| e.record.len());
+    let mut equations = Vec::with_capacity(laws.len());
+    for (output, order, terms) in laws {
+        let mut known = Vec::with_capacity(terms.len());
+        for (signal, order, (factor, powers)) in terms {
+            if signal >= signals || output >= signals || powers.iter().any(|&(i, _)| i >= coefficients) {
+                let what = "an equation names a signal or a coefficient that is not there".to_owned();
+                return Err(Error::Structure { what, remedy: "number them from 0".into() }.into());
+            }
+            check_length("weights of an order", orders, order.1.len())?;
+            known.push((signal, affine(order), joint::Monomial { factor, powers }));
+        }
+        equations.push(joint::FreeEquation { output, order: affine(order), terms: known });
+    }
+    let coordinates = coordinates
+        .iter()
+        .map(|name| match name.as_str() {
+            "plain" => Ok(joint::Coordinate::Plain),
+            "logarithm" => Ok(joint::Coordinate::Logarithm),
+            "excess" => Ok(joint::Coordinate::ExcessLogarithm),
+            other => Err(Error::Structure {
+                what: format!("coordinate '{other}' is not known"),
+                remedy: "use plain, logarithm or excess".into(),
+            }),
+        })
+        .collect::<Result<Vec<_>, _>>()?;
+    let model = joint::FreeModel { equations, order_bounds, coordinates, coupled, initial: initial(terms)? };
+    let settings = joint::Settings { evaluations, tolerance };
+    let fit = detached(py, || joint::fit(&model, &experiments, &start_orders, &start_coefficients, settings))?;
+    let dict = PyDict::new(py);
+    dict.set_item("orders", fit.orders)?;
+    dict.set_item("coefficients", fit.coefficients)?;
+    dict.set_item("cost", fit.cost)?;
+    dict.set_item("residuals", PyArray1::from_vec(py, fit.residuals))?;
+    dict.set_item("jacobian", stacked(py, &fit.jacobian)?)?;
+    dict.set_item("initial", fit.initial)?;
+    dict.set_item("exponents", fit.exponents)?;
+    dict.set_item("evaluations", fit.evaluations)?;
+    dict.set_item(
+        "status",
+        match fit.status {
+            joint::Status::Converged => "converged",
+            joint::Status::Exhausted => "exhausted",
+            joint::Status::Stalled => "stalled",
+        },
+    )?;
+    Ok(dict)
 }

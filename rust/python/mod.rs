@@ -23,7 +23,7 @@ mod _core {
     };
 
     #[pymodule_export]
-    use super::estimate::{least_squares, multi_innovation};
+    use super::estimate::{least_squares, multi_innovation, output_error};
 
     #[pymodule_export]
     use super::simulate::{

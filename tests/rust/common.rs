@@ -120,10 +120,13 @@ pub fn relative_distance(a: &[f64], b: &[f64]) -> f64 {
 /// max|a/b − 1|, where b is 0 only if a is.
 pub fn relative_error(a: &[f64], b: &[f64]) -> f64 {
     assert_eq!(a.len(), b.len());
-    a.iter()
-        .zip(b)
-        .map(|(&x, &y)| if x == y { 0.0 } else { ((x - y) / y).abs() })
-        .fold(0.0, |worst, e| if e.is_nan() { f64::INFINITY } else { worst.max(e) })
+    a.iter().zip(b).map(|(&x, &y)| if x == y { 0.0 } else { ((x - y) / y).abs() }).fold(0.0, |worst, e| {
+        if e.is_nan() {
+            f64::INFINITY
+        } else {
+            worst.max(e)
+        }
+    })
 }
 
 pub fn bits(x: &[f64]) -> Vec<u64> {
@@ -145,8 +148,7 @@ pub fn dense_solve(matrix: &[f64], rhs: &[f64]) -> Vec<f64> {
     let n = rhs.len();
     let (mut a, mut x) = (matrix.to_vec(), rhs.to_vec());
     for column in 0..n {
-        let pivot =
-            (column..n).max_by(|&i, &j| a[i * n + column].abs().total_cmp(&a[j * n + column].abs())).unwrap();
+        let pivot = (column..n).max_by(|&i, &j| a[i * n + column].abs().total_cmp(&a[j * n + column].abs())).unwrap();
         for j in 0..n {
             a.swap(column * n + j, pivot * n + j);
         }

@@ -5,4 +5,10 @@
 
 mod common;
 
+mod equation;
+mod fractional;
+mod haar;
 mod kernels;
+mod means;
+mod metrics;
+mod series;

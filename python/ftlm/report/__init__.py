@@ -1,6 +1,6 @@
 """Reports: one HTML file with tables and charts that opens offline, and the same tables for a terminal."""
 
-from ftlm.report.figures import Figure, comparison_charts, error_chart, line_chart, trace_chart
+from ftlm.report.figures import Figure, comparison_charts, error_chart, line_chart, pulse_times, trace_chart
 from ftlm.report.page import Section, identification_page, write_page
 from ftlm.report.tables import (
     Exact,
@@ -16,6 +16,7 @@ from ftlm.report.tables import (
     search_summary,
     search_top,
     settings_table,
+    symbol,
 )
 
 __all__ = [
@@ -35,9 +36,11 @@ __all__ = [
     "paper_table",
     "paper_table_text",
     "parameter_table",
+    "pulse_times",
     "search_summary",
     "search_top",
     "settings_table",
+    "symbol",
     "trace_chart",
     "write_page",
 ]

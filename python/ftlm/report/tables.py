@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import dataclass, field
+from numbers import Integral
 from typing import TYPE_CHECKING
 
 from markupsafe import Markup, escape
+
+from ftlm.errors import ModelError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -39,11 +42,14 @@ __all__ = [
 
 #: Significant digits of every estimated number: more than any estimate here deserves, enough to compare with the paper.
 DIGITS = 5
+#: Columns from which a table is set smaller, so that the paper's fifteen fit a laptop's screen.
+DENSE = 12
 DIVERGED = "diverged"
 NOT_IN_MODEL = "–"
 
 _GREEK = {
-    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "theta": "θ", "mu": "μ", "phi": "φ", "omega": "ω", "tau": "τ",
+    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "theta": "θ", "mu": "μ", "tau": "τ", "phi": "φ",
+    "omega": "ω",
 }  # fmt: skip
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -78,11 +84,11 @@ Cell = str | float | None
 
 
 def number(value: float, digits: int = DIGITS) -> str:
-    """Return a number with this many significant digits; ∞ and the word "diverged" for one that is not finite."""
-    if isinstance(value, int):
+    """Return a number with this many significant digits; infinity is ∞ with the word "diverged"."""
+    if isinstance(value, Integral):
         return f"{value:,}".replace(",", "\u202f")
     if math.isnan(value):
-        return f"undefined ({DIVERGED})"
+        return "undefined"
     if math.isinf(value):
         return f"{'−' if value < 0 else ''}∞ {DIVERGED}"
     if value == 0:
@@ -138,7 +144,9 @@ class Table:
         """Which columns hold numbers, and are set flush right."""
         columns = [[row[k] for row in self.rows] for k in range(len(self.columns))]
         return [
-            bool(cells) and all(c is None or not isinstance(c, str) for c in cells) and any(c is not None for c in cells)
+            bool(cells)
+            and all(c is None or not isinstance(c, str) for c in cells)
+            and any(c is not None for c in cells)
             for cells in columns
         ]
 
@@ -159,9 +167,11 @@ class Table:
     def to_html(self) -> Markup:
         """Return the table in a container that scrolls by itself on a narrow screen."""
         classes = [Markup(' class="{}"').format(c) if c else Markup("") for c in self._classes()]
-        out = [Markup('<div class="table">')]
-        out.append(Markup('<div class="scroll" role="region" tabindex="0" aria-label="{}">').format(self.title))
-        out.append(Markup("<table><caption>{}</caption><thead>").format(self.title))
+        # The title stands outside of what scrolls, so that it wraps; the label tells it to those who listen.
+        dense = " dense" if len(self.columns) >= DENSE else ""
+        out = [Markup('<div class="table{}"><p class="title">{}</p>').format(dense, self.title)]
+        out.append(Markup('<div class="scroll" role="group" tabindex="0" aria-label="{}">').format(self.title))
+        out.append(Markup('<table aria-label="{}"><thead>').format(self.title))
         if self.groups:
             heads = Markup("").join(
                 Markup('<th scope="colgroup" colspan="{}" class="g">{}</th>').format(width, text)
@@ -201,11 +211,11 @@ def equation_html(item: Equation) -> Markup:
     parts = [Markup("{} = ").format(_derivative_html(item.order, item.output))]
     for k, term in enumerate(item.terms):
         value = term.fixed or 0.0
-        sign = ("−" if value < 0 else "") if k == 0 else (" − " if value < 0 else " + ")
+        sign = ("−" if value < 0 else "") if k == 0 else ("− " if value < 0 else "+ ")
         factor = Markup('<data value="{}">{}</data>').format(repr(abs(value)), number(abs(value)))
         derivative = _derivative_html(term.order, term.signal)
-        # A term stays on one line; the equation breaks between terms.
-        parts.append(Markup('{}<span class="term">{} {}</span>').format(sign, factor, derivative))
+        # A term stays on one line with its sign; the equation breaks between terms.
+        parts.append(Markup('{}<span class="term">{}{} {}</span>').format(" " if k else "", sign, factor, derivative))
     return Markup('<span class="equation">{}</span>').format(Markup("").join(parts))
 
 
@@ -223,7 +233,7 @@ def parameter_table(model: Model, *, title: str = "Orders and coefficients") -> 
     """Return free orders and coefficients with the place of each, beside the values that the maker states."""
     reference = model.structure.reference
     rows: list[list[Cell]] = [
-        [symbol_html(name), "free order", Exact(value), None] for name, value in model.orders.items()
+        [symbol_html(name), Exact(value), None, "free order"] for name, value in model.orders.items()
     ]
     for item in model.equations:
         for term in item.terms:
@@ -235,18 +245,19 @@ def parameter_table(model: Model, *, title: str = "Orders and coefficients") -> 
             stated = reference.get(term.name)
             # + 0.0 makes the negative zero of a product of signs a plain zero.
             rows.append([
-                symbol_html(term.name), place, float(term.coefficient), None if stated is None else stated + 0.0
+                symbol_html(term.name), float(term.coefficient), None if stated is None else stated + 0.0, place
             ])  # fmt: skip
-    note = "This estimator gives no standard errors: how many of the digits mean something is not known."
+    note = "No standard errors are given here: this table does not say how many of the digits mean something."
     if not reference:
-        return Table(title, ("parameter", "what it is", "value"), [row[:3] for row in rows], note=note)
+        return Table(title, ("parameter", "value", "what it is"), [[*row[:2], row[3]] for row in rows], note=note)
     note += " Stated values belong to the integer orders of the maker's model."
-    return Table(title, ("parameter", "what it is", "value", "stated"), rows, note=note)
+    return Table(title, ("parameter", "value", "stated", "what it is"), rows, note=note)
 
 
-def settings_table(result: Identification, *, title: str = "Settings") -> Table:
+def settings_table(result: Identification, *, title: str = "What the result depends on") -> Table:
     """Return what the result depends on besides the data: estimator, criterion, M, p, K₀, initial terms, runs."""
     used, structure = result.settings, result.model.structure
+    coordinates = {"haar": "Haar coordinates", "time": "order of time"}
     initial = {"rest": "none, the records start at rest", "caputo": "Caputo's, estimated for each run"}
     rows: list[list[Cell]] = [
         ["structure", structure.name],
@@ -258,7 +269,7 @@ def settings_table(result: Identification, *, title: str = "Settings") -> Table:
         rows += [
             ["innovation length, p", int(used["innovation_length"])],
             [Markup("prior covariance, K<sub>0</sub>"), Exact(used["prior_covariance"])],
-            ["rows of the recursion", {"haar": "Haar coordinates", "time": "order of time"}.get(used["rows"], used["rows"])],
+            ["rows of the recursion", coordinates.get(used["rows"], used["rows"])],
         ]  # fmt: skip
     rows.append(["initial terms", initial.get(str(used["initial"]), str(used["initial"]))])
     if result.searches:
@@ -343,7 +354,7 @@ def _four(figures: Metrics) -> list[Cell]:
     return [figures.error, figures.rmse, figures.nr, figures.fit]
 
 
-# ------------------------------------------------------------------------------------------------ the paper's Tables 4, 5
+# ------------------------------------------------------------------------------------------------ the paper's tables
 
 
 @dataclass(frozen=True)
@@ -379,8 +390,16 @@ _COEFFICIENTS = ("a", "b", "d", "g")
 
 
 def paper_row(label: str, model: Model, comparison: Comparison, output: str) -> PaperRow:
-    """Return the row of one equation of an arm's model, whose coefficients are called a, b, d, g with an index."""
-    item = next(e for e in model.equations if e.output == output)
+    """Return the row of one equation of an arm's model, whose coefficients are called a, b, d, g with an index.
+
+    Raises
+    ------
+    ModelError
+        No such output.
+    """
+    item = next((e for e in model.equations if e.output == output), None)
+    if item is None:
+        raise ModelError(f"the model has no output {output!r}; it has {', '.join(model.outputs)}")
     orders: dict[str, float] = {"alpha": item.order.constant}
     coefficients: dict[str, float] = {}
     for term in item.terms:
@@ -437,7 +456,9 @@ def paper_table_text(rows: Sequence[PaperRow]) -> str:
     heads = [symbol(n) for n in (*_ORDERS, *_COEFFICIENTS)] + ["error", "RMSE", "NR"] * 2
     left, right = sum(_TEXT_WIDTHS[:8]) + _LABEL, sum(_TEXT_WIDTHS[8:11])
     lines = [
-        " " * left + " equation error ".center(right - 1, "-").rjust(right) + " free run ".center(right - 1, "-").rjust(right),
+        " " * left
+        + " equation error ".center(right - 1, "-").rjust(right)
+        + " free run ".center(right - 1, "-").rjust(right),
         "model".ljust(_LABEL) + "".join(h.rjust(w) for h, w in zip(heads, _TEXT_WIDTHS, strict=True)),
     ]
     starts, infinite = _halves(rows), False
@@ -445,8 +466,7 @@ def paper_table_text(rows: Sequence[PaperRow]) -> str:
         if i in starts:
             lines.append(symbol(starts[i]))
         label = rows[i].label
-        line = (label if len(label) < _LABEL - 2 else label[: _LABEL - 4] + "…").rjust(0)
-        line = f"  {line}".ljust(_LABEL)
+        line = f"  {label if len(label) <= _LABEL - 3 else label[: _LABEL - 4] + '…'}".ljust(_LABEL)
         for value, width in zip(cells[1:], _TEXT_WIDTHS, strict=True):
             infinite = infinite or (isinstance(value, float) and not math.isfinite(value))
             line += _fitted(value, width - 1).rjust(width)
@@ -461,7 +481,7 @@ def _fitted(value: Cell, width: int) -> str:
     if value is None or isinstance(value, str):
         return NOT_IN_MODEL
     if not math.isfinite(value):
-        return "-∞" if value < 0 else "∞"
+        return "?" if math.isnan(value) else "∞"
     texts = [f"{value:.{digits}g}".replace("e-0", "e-").replace("e+0", "e") for digits in range(DIGITS, 0, -1)]
     return next((t for t in texts if len(t) <= width), texts[-1])
 
@@ -469,7 +489,7 @@ def _fitted(value: Cell, width: int) -> str:
 # ------------------------------------------------------------------------------------------------ order searches
 
 
-def search_summary(searches: Mapping[str, SearchResult], *, title: str = "Order searches") -> Table:
+def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What became of the candidates") -> Table:
     """Return what became of every candidate: kept, or left out for a reason; kept and left out are all candidates."""
     reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.pruned))
     rows: list[list[Cell]] = [

@@ -1,0 +1,213 @@
+"""The compiled core: series algebra, estimators, searches and simulation, on arrays checked once at this boundary.
+
+Arrays are float64. A signal is a vector of pulse means unless it says samples; a record holds one signal a row.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Final, Literal, TypeAlias, TypedDict
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "SIMD",
+    "__version__",
+    "block_pulse_kernel",
+    "block_pulse_matrix",
+    "delayed",
+    "equation_error",
+    "explicit_euler",
+    "filter_series",
+    "fractional_derivative",
+    "fractional_integral",
+    "grunwald_letnikov_weights",
+    "haar_inverse",
+    "haar_matrix",
+    "haar_transform",
+    "lattice_size",
+    "least_squares",
+    "metrics",
+    "multi_innovation",
+    "nyquist_margin",
+    "operational_matrix",
+    "output_error",
+    "point_samples",
+    "pulse_means",
+    "respond",
+    "respond_with_initial",
+    "search",
+    "search_stage",
+    "series_divide",
+    "series_multiply",
+    "trace_errors",
+]
+
+_Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
+_Matrix: TypeAlias = np.ndarray[tuple[int, int], np.dtype[np.float64]]
+_Floats: TypeAlias = NDArray[np.float64]
+
+#: (step [s], signals as rows, series of the sensor filter or None)
+_Record: TypeAlias = tuple[float, _Floats, _Floats | None]
+#: (output, alpha, [(signal, order), ...]); signals by row of the record
+_Structure: TypeAlias = tuple[int, float, Sequence[tuple[int, float]]]
+#: a structure and one coefficient a term
+_Equation: TypeAlias = tuple[_Structure, Sequence[float]]
+#: (whether Caputo's powers, else these exponents)
+_Initial: TypeAlias = tuple[bool, Sequence[float]]
+#: (criterion, norm, p or 0 for least squares, K0, Haar rows, keep, threads, early stopping)
+_Options: TypeAlias = tuple[str, str, int, float, bool, int, int, bool]
+#: (output, values of alpha, [(signal, values, interchangeable), ...])
+_Lattice: TypeAlias = tuple[int, Sequence[float], Sequence[tuple[int, Sequence[float], bool]]]
+#: (constant, weight of each free order)
+_Affine: TypeAlias = tuple[float, Sequence[float]]
+#: (output, alpha, [(signal, order), ...])
+_LawEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine]]]
+#: (known factor, [(coefficient, power), ...])
+_Monomial: TypeAlias = tuple[float, Sequence[tuple[int, int]]]
+#: (output, alpha, [(signal, order, coefficient), ...])
+_FreeEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine, _Monomial]]]
+#: (record, pulses a sample interval, samples of each output as rows, filter of simulated outputs, weights of outputs)
+_Experiment: TypeAlias = tuple[_Record, int, _Floats, tuple[_Floats, Sequence[bool]] | None, Sequence[float]]
+_Progress: TypeAlias = Callable[[int, int], object]
+
+#: (coefficients, initial terms per record, their exponents, dropped (record, position) pairs)
+_Estimate: TypeAlias = tuple[list[float], list[list[float]], list[float], list[tuple[int, int]]]
+
+_Counts = TypedDict(
+    "_Counts",
+    {"candidates": int, "kept": int, "beaten": int, "stopped early": int, "singular": int, "diverged": int},
+)
+
+class _Found(TypedDict):
+    #: (index, score, alpha, orders, coefficients, initial terms per record)
+    rows: list[tuple[int, float, float, list[float], list[float], list[list[float]]]]
+    counts: _Counts
+    #: (index, alpha, orders, reason)
+    failures: list[tuple[int, float, list[float], Literal["singular", "diverged"]]]
+
+class _FoundStage(TypedDict):
+    #: (index, score, free orders, per equation (score, alpha, orders, coefficients, initial terms per record))
+    rows: list[tuple[int, float, list[float], list[tuple[float, float, list[float], list[float], list[list[float]]]]]]
+    counts: _Counts
+    #: distinct candidates of each equation
+    distinct: list[int]
+
+class _Fit(TypedDict):
+    orders: list[float]
+    coefficients: list[float]
+    #: half the weighted sum of squared residuals
+    cost: float
+    #: weighted residuals, records one after the other, outputs within
+    residuals: _Vector
+    #: one row a free order, then one a coefficient
+    jacobian: _Matrix
+    #: initial terms per record and equation, and their exponents per equation
+    initial: list[list[list[float]]]
+    exponents: list[list[float]]
+    evaluations: int
+    status: Literal["converged", "exhausted", "stalled"]
+
+__version__: Final[str]
+SIMD: Final[str]
+
+# ---------------------------------------------------------------------------------------------- kernels and transforms
+
+def block_pulse_kernel(order: float, m: int, step: float, *, derivative: bool = False) -> _Vector: ...
+def grunwald_letnikov_weights(order: float, m: int) -> _Vector: ...
+def haar_transform(x: _Floats) -> _Matrix: ...
+def haar_inverse(x: _Floats) -> _Matrix: ...
+def haar_matrix(m: int) -> _Matrix: ...
+def block_pulse_matrix(order: float, m: int, step: float) -> _Matrix: ...
+def operational_matrix(order: float, m: int, step: float, *, dense: bool = False) -> _Matrix: ...
+def series_multiply(a: _Floats, b: _Floats, m: int, *, naive: bool = False) -> _Vector: ...
+def series_divide(numerator: _Floats, divisor: _Floats, *, naive: bool = False) -> _Vector: ...
+def fractional_integral(x: _Floats, order: float, step: float, rule: str) -> _Matrix: ...
+def fractional_derivative(x: _Floats, order: float, step: float, definition: str, initial: _Floats) -> _Matrix: ...
+
+# -------------------------------------------------------------------------------------------------- samples to records
+
+def pulse_means(samples: _Floats, m: int, hold: bool) -> _Vector: ...
+def point_samples(means: _Floats) -> _Vector: ...
+def delayed(samples: _Floats, delay: float, before: float) -> _Vector: ...
+def filter_series(
+    numerator: Sequence[tuple[float, float]], denominator: Sequence[tuple[float, float]], m: int, step: float
+) -> _Vector: ...
+
+# ---------------------------------------------------------------------------------------------------------- estimators
+
+def least_squares(
+    runs: Sequence[_Record],
+    equation: _Structure,
+    inputs: Sequence[bool],
+    fixed: Sequence[float | None],
+    terms: _Initial,
+) -> _Estimate: ...
+def multi_innovation(
+    runs: Sequence[_Record],
+    equation: _Structure,
+    inputs: Sequence[bool],
+    fixed: Sequence[float | None],
+    terms: _Initial,
+    length: int,
+    prior_covariance: float,
+    haar: bool,
+    recursion: bool,
+) -> tuple[_Estimate, _Matrix | None]: ...
+
+def output_error(
+    runs: Sequence[_Experiment],
+    laws: Sequence[_FreeEquation],
+    order_bounds: Sequence[tuple[float, float]],
+    coordinates: Sequence[str],
+    coupled: bool,
+    terms: _Initial,
+    start_orders: Sequence[float],
+    start_coefficients: Sequence[float],
+    evaluations: int,
+    tolerance: float,
+) -> _Fit: ...
+
+# ---------------------------------------------------------------------------------------------------------- simulation
+
+def respond(
+    run: _Record,
+    model: Sequence[_Equation],
+    inputs: Sequence[bool],
+    terms: Sequence[Sequence[tuple[float, float]]],
+) -> _Matrix: ...
+def respond_with_initial(
+    run: _Record,
+    model: Sequence[_Equation],
+    inputs: Sequence[bool],
+    terms: _Initial,
+    filter: tuple[_Floats, Sequence[bool]] | None,
+) -> tuple[_Matrix, list[list[float]], list[list[float]]]: ...
+def equation_error(run: _Record, equation: _Equation, inputs: Sequence[bool], terms: _Initial) -> _Vector: ...
+def explicit_euler(signals: _Floats, step: float, model: Sequence[_Equation], inputs: Sequence[bool]) -> _Matrix: ...
+def trace_errors(run: _Record, equation: _Structure, inputs: Sequence[bool], trace: _Floats) -> _Vector: ...
+def nyquist_margin(own_terms: Sequence[tuple[float, float]], step: float) -> float: ...
+def metrics(measured: _Floats, residuals: _Floats) -> tuple[float, float, float, float]: ...
+
+# ------------------------------------------------------------------------------------------------------------ searches
+
+def lattice_size(orders: _Lattice, inputs: Sequence[bool]) -> int: ...
+def search(
+    runs: Sequence[_Record],
+    orders: _Lattice,
+    inputs: Sequence[bool],
+    fixed: Sequence[float | None],
+    terms: _Initial,
+    settings: _Options,
+    progress: _Progress | None,
+) -> _Found: ...
+def search_stage(
+    runs: Sequence[_Record],
+    axes: Sequence[Sequence[float]],
+    laws: Sequence[_LawEquation],
+    inputs: Sequence[bool],
+    fixed: Sequence[Sequence[float | None]],
+    scales: Sequence[float],
+    terms: _Initial,
+    settings: _Options,
+    progress: _Progress | None,
+) -> _FoundStage: ...

@@ -1,0 +1,629 @@
+"""Joint output error: all equations, all runs, continuous orders, from an automatic start to intervals.
+
+For white measurement noise the estimate is maximum likelihood. The core minimises from a start
+(Levenberg-Marquardt with an analytic Jacobian); this file finds starts, weighs outputs by their noise, refines the grid
+until it no longer matters, and turns the optimum into numbers with intervals.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.errors import ConvergenceError, FtlmError, ModelError
+from ftlm.models import MAX_ORDER, Order, Structure
+from ftlm.records import initial_tuple, record, sensor_series
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
+    from numpy.typing import NDArray
+
+    from ftlm.records import Record
+    from ftlm.runs import Run
+
+    Floats = NDArray[np.float64]
+
+__all__ = ["JointFit", "fit_output_error"]
+
+#: Half-width of a 95 % interval in standard errors.
+NORMAL_95 = 1.959963984540054
+#: Samples a run of the coarse fits that compare starts; the best ones continue on all samples.
+COARSE_SAMPLES = 1200
+#: Pulses of the record on which starts are searched.
+START_M = 1024
+#: Step of the lattice on which starts are searched; a start within half of it leads to the optimum.
+START_STEP = 0.2
+#: Prefilters of the start's lattice in units of the frequency below which 90 % of an output's power lies; None: none.
+PREFILTERS = (1.0, 2.0, 4.0, 8.0, None)
+#: Rows of each prefilter's table, and how many of them become starts: those that differ by APART in some order.
+ROWS_PER_FILTER = 400
+STARTS_PER_FILTER = 5
+APART = 0.35
+#: Coarse fits that continue on all samples.
+FINALISTS = 3
+#: Two costs closer than this share are the same optimum.
+SAME_COST = 1e-3
+#: Refinement ends when halving the step moves no estimate by this share of its standard error.
+REFINED = 0.1
+#: Finest grid: pulses a sample interval.
+FINEST = 16
+#: Own bounds of orders where the structure gives none.
+ALPHA_BOUNDS = (0.05, MAX_ORDER)
+#: Lags of the residuals' autocovariance that the robust covariance takes in, as a power of the sample count.
+LAG_POWER = 1.0 / 3.0
+
+
+@dataclass(frozen=True)
+class JointFit:
+    """An optimum of the joint output error.
+
+    Parameters
+    ----------
+    orders, coefficients
+        Free orders and free coefficients by name; under a coefficient law the free ones of the law.
+    covariance
+        Of orders, then coefficients, robust to coloured residuals.
+    noise
+        Standard deviation of the residuals by output.
+    cost
+        Half the sum of squared weighted residuals.
+    samples
+        Number of residuals.
+    refinement
+        Pulses a sample interval.
+    converged
+        Whether neither cost nor parameters moved any more.
+    starts
+        Coarse cost (per residual) and origin of every start, best first.
+    residuals
+        By run and output.
+    """
+
+    orders: dict[str, float]
+    coefficients: dict[str, float]
+    covariance: Floats
+    noise: dict[str, float]
+    cost: float
+    samples: int
+    refinement: int
+    converged: bool
+    starts: list[tuple[float, str]]
+    residuals: list[dict[str, Floats]]
+
+    @property
+    def names(self) -> list[str]:
+        """Parameters in the order of the covariance."""
+        return [*self.orders, *self.coefficients]
+
+    @property
+    def values(self) -> Floats:
+        """Parameters in the order of the covariance."""
+        return np.array([*self.orders.values(), *self.coefficients.values()])
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard error of each parameter."""
+        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % interval of each parameter."""
+        errors = self.standard_errors
+        pairs = zip(self.names, self.values.tolist(), strict=True)
+        return {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in pairs}
+
+    @property
+    def correlation(self) -> Floats:
+        """Correlation matrix of the parameters."""
+        spread = np.sqrt(np.diag(self.covariance))
+        return self.covariance / np.outer(spread, spread)
+
+
+# ------------------------------------------------------------------------------------------------ what is free
+
+
+@dataclass(frozen=True)
+class FreeProblem:
+    """A structure as the core takes it: orders affine in free ones, coefficients products of free ones."""
+
+    structure: Structure
+    orders: tuple[str, ...]
+    coefficients: tuple[str, ...]
+    bounds: tuple[tuple[float, float], ...]
+    products: Mapping[str, tuple[float, tuple[str, ...]]]
+
+    @classmethod
+    def of(cls, structure: Structure) -> FreeProblem:
+        """Free orders, free coefficients and their bounds."""
+        law = {name: (sign, factors) for name, sign, factors in structure.coefficient_law}
+        named = structure.coefficient_names
+        products = {n: law[n] for n in named if n in law}
+        free = [n for n in named if n not in products]
+        free += [f for _, factors in products.values() for f in factors if f not in named]
+        highest = {n for e in structure.equations if e.order.is_single for n in e.order.names}
+        bounds = []
+        for name in structure.order_names:
+            if name in structure.order_values:
+                values = structure.order_values[name]
+                bounds.append((values[0], values[-1]))
+            else:
+                bounds.append(ALPHA_BOUNDS if name in highest else (0.0, MAX_ORDER))
+        return cls(structure, structure.order_names, tuple(dict.fromkeys(free)), tuple(bounds), products)
+
+    def coordinates(self, start: Sequence[float], *, plain: bool) -> list[str]:
+        """Logarithms where the start allows them."""
+        ratios = {f for _, factors in self.products.values() for f in factors if f not in self.structure.coefficient_names}
+        out = []
+        for name, value in zip(self.coefficients, start, strict=True):
+            if plain or value == 0:
+                out.append("plain")
+            else:
+                out.append("excess" if name in ratios and value > 1 else "logarithm")
+        return out
+
+    def laws(self, signals: Sequence[str]) -> list[Any]:
+        """Equations with affine orders and monomial coefficients."""
+        index = {n: i for i, n in enumerate(self.coefficients)}
+
+        def affine(order: Order) -> tuple[float, list[float]]:
+            weights = dict(order.weights)
+            return order.constant, [weights.get(n, 0.0) for n in self.orders]
+
+        def monomial(coefficient: str | float, factor: float) -> tuple[float, list[tuple[int, int]]]:
+            if not isinstance(coefficient, str):
+                return factor * coefficient, []
+            sign, factors = self.products.get(coefficient, (1.0, (coefficient,)))
+            return factor * sign, [(index[f], 1) for f in factors]
+
+        return [
+            (
+                signals.index(e.output),
+                affine(e.order),
+                [(signals.index(t.signal), affine(t.order), monomial(t.coefficient, t.factor)) for t in e.terms],
+            )
+            for e in self.structure.equations
+        ]
+
+    def named(self, values: Sequence[float]) -> dict[str, float]:
+        """Every coefficient of the structure by name from the free ones."""
+        free = dict(zip(self.coefficients, values, strict=True))
+        out = {}
+        for name in self.structure.coefficient_names:
+            sign, factors = self.products.get(name, (1.0, (name,)))
+            out[name] = sign * math.prod(free[f] for f in factors)
+        return out
+
+    def free_from(self, estimated: Mapping[str, float]) -> list[float]:
+        """Free coefficients from freely estimated ones; ratios as the median of what the equations say, above 1."""
+        out = []
+        for name in self.coefficients:
+            if name in estimated:
+                out.append(estimated[name])
+                continue
+            said = []
+            for dependent, (sign, factors) in self.products.items():
+                others = [estimated[f] for f in factors if f != name and f in estimated]
+                if name in factors and math.prod(others):
+                    said.append(sign * estimated[dependent] / math.prod(others))
+            usable = [s for s in said if math.isfinite(s) and 1.05 < s < 20]
+            out.append(float(np.median(usable)) if usable else 1.5)
+        return out
+
+
+# ------------------------------------------------------------------------------------------------ one fit
+
+
+def experiment(
+    run: Run, problem: FreeProblem, initial: Any, weights: Sequence[float], *, every: int = 1, decimation: int = 1
+) -> tuple[Any, ...]:
+    """A run as the core compares with it: ``every`` pulses a sample interval, each ``decimation``-th sample."""
+    structure = replace(problem.structure, initial=initial)
+    rows = (run.length - 1) // decimation * decimation + 1
+    if rows != run.length:
+        run = run.slice(None, rows * run.step - run.step / 2)
+    intervals = (rows - 1) // decimation
+    coupled = structure.coupling == "simulated"
+    rec = record(run, structure, intervals * every, filtered=not coupled)
+    samples = []
+    for output in structure.outputs:
+        measured_through = structure.sensor_filter is not None and output in structure.sensor_filter.outputs
+        if rec.sensor is None or measured_through:
+            samples.append(run[output][::decimation])
+        else:
+            # The equation is compared in filtered signals, so this output passes the filter too.
+            samples.append(_core.point_samples(rec.of(output))[::every])
+    filtered = None
+    if coupled and structure.sensor_filter is not None:
+        applies = [o in structure.sensor_filter.outputs for o in structure.outputs]
+        filtered = (sensor_series(structure, rec.m, rec.step), applies)
+    return rec.core(), every, np.ascontiguousarray(np.stack(samples)), filtered, list(weights)
+
+
+@dataclass
+class Attempt:
+    """A point in the space of parameters, and what the core said about it."""
+
+    orders: list[float]
+    coefficients: list[float]
+    origin: str
+    found: dict[str, Any]
+
+    @property
+    def level(self) -> float:
+        """Cost per residual: 1 at the noise floor if the weights are right."""
+        return 2.0 * float(self.found["cost"]) / len(self.found["residuals"])
+
+
+def descend(
+    problem: FreeProblem,
+    experiments: list[Any],
+    signals: Sequence[str],
+    initial: Any,
+    attempt: Attempt,
+    *,
+    evaluations: int,
+    tolerance: float = 1e-9,
+    plain: bool = False,
+) -> Attempt:
+    """Levenberg-Marquardt from an attempt."""
+    found = _core.output_error(
+        experiments,
+        problem.laws(signals),
+        list(problem.bounds),
+        problem.coordinates(attempt.coefficients, plain=plain),
+        problem.structure.coupling == "simulated",
+        initial_tuple(initial),
+        attempt.orders,
+        attempt.coefficients,
+        evaluations,
+        tolerance,
+    )
+    return Attempt(list(found["orders"]), list(found["coefficients"]), attempt.origin, found)
+
+
+def lowest(problem: FreeProblem, *arguments: Any, evaluations: int) -> Attempt:
+    """Descend in logarithmic coordinates, then in plain ones, which may cross zero."""
+    experiments, signals, initial, attempt = arguments
+    first = descend(problem, experiments, signals, initial, attempt, evaluations=evaluations)
+    second = descend(problem, experiments, signals, initial, first, evaluations=evaluations, plain=True)
+    return second if second.found["cost"] <= first.found["cost"] else first
+
+
+# ------------------------------------------------------------------------------------------------ where to start
+
+
+def power_frequency(run: Run, output: str) -> float:
+    """Frequency [rad/s] below which 90 % of an output's power lies."""
+    y = run[output] - np.mean(run[output])
+    power = np.abs(np.fft.rfft(y * np.hanning(y.size))) ** 2
+    share = np.cumsum(power) / np.sum(power)
+    at = int(np.searchsorted(share, 0.9))
+    return 2.0 * math.pi * max(at, 1) / (y.size * run.step)
+
+
+def start_axes(problem: FreeProblem) -> dict[str, list[float]]:
+    """A coarse lattice of the free orders within their bounds."""
+    axes = {}
+    highest = {n for e in problem.structure.equations if e.order.is_single for n in e.order.names}
+    # A link is second order or a little less; any other equation may be anything.
+    usual = (1.2, 2.0) if problem.structure.reference else (0.2, MAX_ORDER)
+    for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
+        if name in highest and (low, high) == ALPHA_BOUNDS:
+            low, high = usual
+        high = min(high, 2.0) if name not in highest else high
+        count = max(int(round((high - low) / START_STEP)), 0)
+        axes[name] = [round(v, 9) for v in np.linspace(low, high, count + 1)] if high > low else [low]
+    return axes
+
+
+def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, threads: int) -> list[Attempt]:
+    """Starts from order lattices on prefiltered records, where least squares suffers less from noise.
+
+    The prefilter commutes with the equation: all signals pass it, so the true coefficients stay the same while noise
+    above the band is gone.
+    """
+    structure = replace(problem.structure, coupling="measured", initial=initial)
+    m = min(START_M, min(run.length for run in runs) - 1)
+    frequency = float(np.median([power_frequency(run, o) for run in runs for o in structure.outputs]))
+    axes = start_axes(problem)
+    attempts: list[Attempt] = []
+    for multiple in PREFILTERS:
+        records = [prefiltered(record(run, structure, m), multiple and multiple * frequency) for run in runs]
+        origin = "no prefilter" if multiple is None else f"prefilter {multiple * frequency:.3g} rad/s"
+        picked: list[list[float]] = []
+        for orders, estimated in lattice_rows(problem, structure, records, axes, threads):
+            values = [orders[n] for n in problem.orders]
+            if any(max((abs(a - b) for a, b in zip(values, p, strict=True)), default=0.0) < APART for p in picked):
+                continue
+            picked.append(values)
+            attempts.append(Attempt(values, problem.free_from(estimated), origin, {}))
+            if len(picked) == STARTS_PER_FILTER:
+                break
+    return attempts
+
+
+def prefiltered(rec: Record, frequency: float | None) -> Record:
+    """All signals and the initial terms through a second-order low-pass."""
+    if frequency is None:
+        return rec
+    omega = frequency
+    low_pass = _core.filter_series(
+        [(omega**2, 0.0)], [(1.0, 2.0), (1.4 * omega, 1.0), (omega**2, 0.0)], rec.m, rec.step
+    )
+    means = np.stack([_core.series_multiply(low_pass, np.ascontiguousarray(row), rec.m) for row in rec.means])
+    sensor = low_pass if rec.sensor is None else _core.series_multiply(low_pass, rec.sensor, rec.m)
+    return replace(rec, means=means, sensor=sensor)
+
+
+def lattice_rows(
+    problem: FreeProblem,
+    structure: Structure,
+    records: list[Record],
+    axes: Mapping[str, list[float]],
+    threads: int,
+) -> list[tuple[dict[str, float], dict[str, float]]]:
+    """Best rows of the coarse lattice: orders by name and freely estimated coefficients by name."""
+    signals = records[0].signals
+    cores = [r.core() for r in records]
+    inputs = list(records[0].inputs)
+    initial = initial_tuple(records[0].initial)
+    settings = ("output-error", "l1", 0, 1.0, False, ROWS_PER_FILTER, threads, True)
+
+    def coefficients(item: Any, raw: Sequence[float]) -> dict[str, float]:
+        terms = zip(item.terms, raw, strict=True)
+        return {t.coefficient: c / t.factor for t, c in terms if isinstance(t.coefficient, str)}
+
+    if structure.has_order_law:
+        names = list(axes)
+
+        def affine(order: Order) -> tuple[float, list[float]]:
+            weights = dict(order.weights)
+            return order.constant, [weights.get(n, 0.0) for n in names]
+
+        laws = [
+            (signals.index(e.output), affine(e.order), [(signals.index(t.signal), affine(t.order)) for t in e.terms])
+            for e in structure.equations
+        ]
+        scales = [sum(float(np.std(r.of(e.output))) * r.m for r in records) for e in structure.equations]
+        fixed = [[t.fixed for t in e.terms] for e in structure.equations]
+        found = _core.search_stage(
+            cores, [axes[n] for n in names], laws, inputs, fixed, scales, initial, settings, None
+        )
+        rows = []
+        for _, _, free, parts in found["rows"]:
+            estimated: dict[str, float] = {}
+            for item, part in zip(structure.equations, parts, strict=True):
+                estimated |= coefficients(item, part[3])
+            rows.append((dict(zip(names, free, strict=True)), estimated))
+        return rows
+    tables = []
+    for item in structure.equations:
+        def axis(order: Order) -> list[float]:
+            return list(axes[order.names[0]]) if order.names else [order.constant]
+
+        terms = [
+            (signals.index(t.signal), axis(t.order), bool(t.order.names) and t.fixed is None) for t in item.terms
+        ]
+        lattice = (signals.index(item.output), axis(item.order), terms)
+        found = _core.search(cores, lattice, inputs, [t.fixed for t in item.terms], initial, settings, None)
+        table = []
+        for _, _, alpha, orders, raw, _ in found["rows"]:
+            every = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
+            table.append(({o.names[0]: v for o, v in every if o.names}, coefficients(item, raw)))
+        tables.append(table)
+    rows = []
+    for rank in range(max(len(t) for t in tables)):
+        orders, estimated = {}, {}
+        for table in tables:
+            row = table[min(rank, len(table) - 1)] if table else ({}, {})
+            orders |= row[0]
+            estimated |= row[1]
+        if len(estimated) == len(structure.coefficient_names):
+            rows.append((orders, estimated))
+    return rows
+
+
+# ------------------------------------------------------------------------------------------------ the whole
+
+
+def fit_output_error(
+    runs: Sequence[Run],
+    structure: Structure,
+    *,
+    threads: int = 1,
+    start: Mapping[str, float] | None = None,
+    refine: bool = True,
+    progress: Callable[[int, int], None] | None = None,
+) -> JointFit:
+    """Fit all equations of a structure on all runs by output error, from an automatic start.
+
+    Parameters
+    ----------
+    runs
+        Runs with the same names and units.
+    structure
+        Free orders and coefficients; a stated coefficient law is imposed. Its initial terms must be decided.
+    threads
+        Threads of the start's lattice.
+    start
+        Values of all free orders and coefficients by name, instead of the automatic start.
+    refine
+        Whether to refine the grid below the samples until it does not matter.
+    progress
+        Called with (starts done, starts in all).
+
+    Returns
+    -------
+    JointFit
+        The best optimum found.
+
+    Raises
+    ------
+    ConvergenceError
+        No start has a finite free run.
+    """
+    problem = FreeProblem.of(structure)
+    initial = structure.initial
+    signals = structure.signals
+    noise = first_noise(runs, structure)
+    decimation = max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES)
+
+    def experiments(weights: Sequence[float], every: int = 1, thinned: int = 1) -> list[Any]:
+        return [experiment(r, problem, initial, weights, every=every, decimation=thinned) for r in runs]
+
+    weights = [1.0 / noise[o] for o in structure.outputs]
+    starts: list[tuple[float, str]] = []
+    if start is None:
+        coarse = experiments(weights, thinned=decimation)
+        attempts = start_attempts(runs, problem, initial, threads)
+        reached = []
+        for done, attempt in enumerate(attempts):
+            if progress is not None:
+                progress(done, len(attempts))
+            try:
+                reached.append(descend(problem, coarse, signals, initial, attempt, evaluations=60))
+            except FtlmError:
+                # A start whose free run is not finite is no start; if none is left, that is said below.
+                continue
+        reached.sort(key=lambda a: a.level)
+        starts = [(a.level, a.origin) for a in reached]
+        finalists = distinct(reached)[:FINALISTS]
+        if progress is not None:
+            progress(len(attempts), len(attempts))
+    else:
+        known = {n: float(start[n]) for n in (*problem.orders, *problem.coefficients)}
+        finalists = [
+            Attempt([known[n] for n in problem.orders], [known[n] for n in problem.coefficients], "given start", {})
+        ]
+    if not finalists:
+        raise ConvergenceError(
+            f"no start of {', '.join(structure.outputs)} has a finite free run; check the signs of the data and the bounds"
+        )
+    full = experiments(weights)
+    best = min(
+        (lowest(problem, full, signals, initial, a, evaluations=120) for a in finalists), key=lambda a: a.level
+    )
+    every = 1
+    for _ in range(4):
+        # Weights follow the residuals, pooled over runs.
+        levels = residual_levels(best, full, structure)
+        weights = [w / max(levels[o], 1e-300) for w, o in zip(weights, structure.outputs, strict=True)]
+        full = experiments(weights, every)
+        best = descend(problem, full, signals, initial, best, evaluations=120, plain=True)
+        if all(abs(v - 1.0) < 0.01 for v in levels.values()):
+            break
+    while refine and every < FINEST:
+        finer = experiments(weights, 2 * every)
+        better = descend(problem, finer, signals, initial, best, evaluations=120, plain=True)
+        errors = np.sqrt(np.diag(covariance(better, finer, structure)))
+        moved = np.abs(np.array(better.orders + better.coefficients) - np.array(best.orders + best.coefficients))
+        best, full, every = better, finer, 2 * every
+        if np.all(moved <= REFINED * errors):
+            break
+    residuals = split_residuals(best, full, structure)
+    return JointFit(
+        orders=dict(zip(problem.orders, best.orders, strict=True)),
+        coefficients=dict(zip(problem.coefficients, best.coefficients, strict=True)),
+        covariance=covariance(best, full, structure),
+        noise={o: levels[o] / w for (o, w) in zip(structure.outputs, weights, strict=True)},
+        cost=float(best.found["cost"]),
+        samples=len(best.found["residuals"]),
+        refinement=every,
+        converged=best.found["status"] == "converged",
+        starts=starts,
+        residuals=residuals,
+    )
+
+
+def first_noise(runs: Sequence[Run], structure: Structure) -> dict[str, float]:
+    """A first guess of the noise of each output, from second differences, but not below a share of its size."""
+    from ftlm.inspection import noise_of  # noqa: PLC0415 — inspection reads records
+
+    out = {}
+    for name in structure.outputs:
+        size = float(np.sqrt(np.mean([np.var(run[name]) for run in runs])))
+        out[name] = max(float(np.median([noise_of(run[name]) for run in runs])), 1e-3 * size)
+    return out
+
+
+def distinct(reached: Sequence[Attempt]) -> list[Attempt]:
+    """Attempts, best first, without those that ended in the optimum of an earlier one."""
+    kept: list[Attempt] = []
+    for attempt in reached:
+        values = np.array(attempt.orders)
+        same = any(
+            abs(k.level - attempt.level) <= SAME_COST * k.level and np.allclose(values, k.orders, atol=0.02)
+            for k in kept
+        )
+        if not same:
+            kept.append(attempt)
+    return kept
+
+
+def split_residuals(attempt: Attempt, experiments: list[Any], structure: Structure) -> list[dict[str, Floats]]:
+    """Weighted residuals by run and output."""
+    flat = np.asarray(attempt.found["residuals"])
+    out, at = [], 0
+    for _, _, samples, _, _ in experiments:
+        compared = samples.shape[1] - 2
+        part = {}
+        for output in structure.outputs:
+            part[output] = flat[at : at + compared]
+            at += compared
+        out.append(part)
+    return out
+
+
+def residual_levels(attempt: Attempt, experiments: list[Any], structure: Structure) -> dict[str, float]:
+    """Root mean square of the weighted residuals by output, over all runs."""
+    parts = split_residuals(attempt, experiments, structure)
+    return {o: float(np.sqrt(np.mean(np.concatenate([p[o] for p in parts]) ** 2))) for o in structure.outputs}
+
+
+def covariance(attempt: Attempt, experiments: list[Any], structure: Structure) -> Floats:
+    """Covariance of the parameters: classical where residuals are white, robust to their colour where not.
+
+    The robust form is the sandwich with Bartlett weights (doi:10.2307/1913610).
+    """
+    jacobian = np.asarray(attempt.found["jacobian"])
+    parts = split_residuals(attempt, experiments, structure)
+    spread = np.linalg.norm(jacobian, axis=1)
+    spread = np.where(spread > 0, spread, 1.0)
+    scaled = jacobian / spread[:, None]
+    bread = np.linalg.pinv(scaled @ scaled.T, rcond=1e-14, hermitian=True)
+    count = jacobian.shape[1]
+    variance = 2.0 * float(attempt.found["cost"]) / max(count - jacobian.shape[0], 1)
+    if all(is_white(series) for part in parts for series in part.values()):
+        middle = variance * bread
+    else:
+        meat = np.zeros_like(bread)
+        at = 0
+        for part in parts:
+            for series in part.values():
+                scores = scaled[:, at : at + series.size] * series
+                at += series.size
+                lags = int(4 * series.size**LAG_POWER)
+                meat += scores @ scores.T
+                for lag in range(1, min(lags, series.size - 1)):
+                    cross = scores[:, lag:] @ scores[:, :-lag].T
+                    meat += (1.0 - lag / lags) * (cross + cross.T)
+        middle = bread @ meat @ bread
+    return middle / np.outer(spread, spread)
+
+
+def is_white(series: Floats, lags: int = 25) -> bool:
+    """Ljung-Box test at 1 %: whether autocorrelations up to ``lags`` could be those of white noise."""
+    e = series - np.mean(series)
+    power = float(e @ e)
+    if power == 0.0 or e.size <= lags + 1:
+        return True
+    correlations = np.array([float(e[k:] @ e[:-k]) / power for k in range(1, lags + 1)])
+    statistic = e.size * (e.size + 2) * float(np.sum(correlations**2 / (e.size - np.arange(1, lags + 1))))
+    # 99 % quantile of chi-squared by Wilson and Hilferty, good to 0.1 % at 25 degrees of freedom.
+    quantile = lags * (1 - 2 / (9 * lags) + 2.3263478740408408 * math.sqrt(2 / (9 * lags))) ** 3
+    return statistic <= quantile

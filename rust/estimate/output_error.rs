@@ -1,0 +1,570 @@
+//! Joint output error: all equations of a model, all records, all orders continuous, by Levenberg–Marquardt.
+//!
+//! For white noise on the outputs this is maximum likelihood. The free run solves A y = b in series; its sensitivity to
+//! a parameter is the same system with another right-hand side, A ∂y = ∂b − ∂A y, so an analytic Jacobian costs one
+//! solve a parameter. Initial terms are linear and projected out (variable projection, Kaufman's form,
+//! doi:10.1007/BF01932995). Records are compared sample by sample: y_k with the mean of the pulses on either side of kh,
+//! on a grid that may be finer than the samples.
+
+use crate::dense;
+use crate::equation::{AffineOrder, Initial, Structure, Term};
+use crate::error::{check_length, Error, Result};
+use crate::fractional::kernel_with_derivative;
+use crate::regressors::Record;
+use crate::series;
+use crate::small::back_substitute;
+
+/// Own-output orders closer to α than this make the equation say that the output equals itself.
+const LEAST_INTEGRATION: f64 = 1e-3;
+
+/// In which coordinate a coefficient is estimated: scales decide whether the optimum is reached.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Coordinate {
+    /// As it is.
+    Plain,
+    /// ln|c|, the sign of the start kept.
+    Logarithm,
+    /// ln(c − 1), for a ratio that exceeds 1.
+    ExcessLogarithm,
+}
+
+/// A signed product of powers of coefficients: factor·Π c_i^{n_i}.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Monomial {
+    /// Known factor.
+    pub factor: f64,
+    /// Free coefficients and their powers.
+    pub powers: Vec<(usize, i32)>,
+}
+
+impl Monomial {
+    fn at(&self, coefficients: &[f64]) -> f64 {
+        self.powers.iter().fold(self.factor, |product, &(i, n)| product * coefficients[i].powi(n))
+    }
+
+    /// Derivative with respect to coefficient i.
+    fn slope(&self, coefficients: &[f64], i: usize) -> f64 {
+        let Some(&(_, n)) = self.powers.iter().find(|&&(j, _)| j == i) else { return 0.0 };
+        let rest = self.powers.iter().filter(|&&(j, _)| j != i);
+        let others = rest.fold(self.factor, |product, &(j, k)| product * coefficients[j].powi(k));
+        others * f64::from(n) * coefficients[i].powi(n - 1)
+    }
+}
+
+/// One equation whose orders and coefficients follow from shared free ones.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FreeEquation {
+    /// Index of the output in the record.
+    pub output: usize,
+    /// α.
+    pub order: AffineOrder,
+    /// Signal, order and coefficient of each term.
+    pub terms: Vec<(usize, AffineOrder, Monomial)>,
+}
+
+/// What is estimated.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FreeModel {
+    /// The equations.
+    pub equations: Vec<FreeEquation>,
+    /// Bounds of each free order.
+    pub order_bounds: Vec<(f64, f64)>,
+    /// Coordinate of each free coefficient.
+    pub coordinates: Vec<Coordinate>,
+    /// Whether the equations' outputs drive each other as simulated, or as measured.
+    pub coupled: bool,
+    /// Initial terms of each record.
+    pub initial: Initial,
+}
+
+/// One run to compare with: pulse means on a grid of which every `every`-th edge is a sample.
+#[derive(Debug, Clone)]
+pub struct Experiment {
+    /// Pulse means of all signals.
+    pub record: Record,
+    /// Pulses a sample interval.
+    pub every: usize,
+    /// Point samples of each equation's output, one more than there are intervals.
+    pub samples: Vec<Vec<f64>>,
+    /// Filter that simulated outputs pass before they are compared, where there is one.
+    pub filter: Option<(Vec<f64>, Vec<bool>)>,
+    /// 1/σ of each equation's output.
+    pub weights: Vec<f64>,
+}
+
+impl Experiment {
+    /// Samples that are compared: all that have a pulse on either side.
+    fn compared(&self) -> usize {
+        (self.record.m() / self.every).saturating_sub(1)
+    }
+}
+
+/// Where the search for the optimum ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Status {
+    /// Neither the cost nor the parameters move any more.
+    Converged,
+    /// The last allowed iteration still moved.
+    Exhausted,
+    /// No step lowers the cost although the gradient is not zero.
+    Stalled,
+}
+
+/// The optimum and what describes it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fit {
+    /// Free orders.
+    pub orders: Vec<f64>,
+    /// Free coefficients.
+    pub coefficients: Vec<f64>,
+    /// Half the weighted sum of squared residuals.
+    pub cost: f64,
+    /// Weighted residuals (y − ŷ)/σ, records one after the other, outputs within.
+    pub residuals: Vec<f64>,
+    /// Their derivatives with respect to orders, then coefficients (plain coordinates), initial terms projected out.
+    pub jacobian: Vec<Vec<f64>>,
+    /// Coefficients of the initial terms per record and equation.
+    pub initial: Vec<Vec<Vec<f64>>>,
+    /// Exponents of the initial terms per equation.
+    pub exponents: Vec<Vec<f64>>,
+    /// Evaluations of residuals.
+    pub evaluations: usize,
+    /// How it ended.
+    pub status: Status,
+}
+
+struct Evaluation {
+    cost: f64,
+    residuals: Vec<f64>,
+    jacobian: Vec<Vec<f64>>,
+    initial: Vec<Vec<Vec<f64>>>,
+    exponents: Vec<Vec<f64>>,
+}
+
+impl FreeModel {
+    fn structures(&self, orders: &[f64]) -> Vec<Structure> {
+        self.equations
+            .iter()
+            .map(|e| Structure {
+                output: e.output,
+                order: raw(&e.order, orders),
+                terms: e.terms.iter().map(|(s, o, _)| Term { signal: *s, order: raw(o, orders) }).collect(),
+            })
+            .collect()
+    }
+
+    /// Residuals and their derivatives at given orders and coefficients.
+    fn evaluate(&self, experiments: &[Experiment], orders: &[f64], coefficients: &[f64]) -> Result<Evaluation> {
+        let structures = self.structures(orders);
+        let count = orders.len() + coefficients.len();
+        let mut out = Evaluation {
+            cost: 0.0,
+            residuals: Vec::new(),
+            jacobian: vec![Vec::new(); count],
+            initial: Vec::new(),
+            exponents: structures.iter().map(|s| s.initial_exponents(&self.initial)).collect(),
+        };
+        for experiment in experiments {
+            self.evaluate_one(experiment, &structures, orders, coefficients, &mut out)?;
+        }
+        out.cost = 0.5 * out.residuals.iter().map(|e| e * e).sum::<f64>();
+        Ok(out)
+    }
+
+    #[allow(clippy::too_many_lines)]
+    fn evaluate_one(
+        &self,
+        experiment: &Experiment,
+        structures: &[Structure],
+        orders: &[f64],
+        coefficients: &[f64],
+        out: &mut Evaluation,
+    ) -> Result<()> {
+        let record = &experiment.record;
+        let (m, n) = (record.m(), structures.len());
+        let outputs: Vec<usize> = structures.iter().map(|s| s.output).collect();
+        // The unknown that a term's signal is, if it is one.
+        let unknown = |i: usize, signal: usize| {
+            if self.coupled {
+                outputs.iter().position(|&o| o == signal)
+            } else {
+                (signal == outputs[i]).then_some(i)
+            }
+        };
+        let mut matrix = vec![vec![vec![0.0; m]; n]; n];
+        let mut rhs = vec![vec![0.0; m]; n];
+        let mut kernels: Vec<Vec<(f64, Vec<f64>, Vec<f64>)>> = Vec::with_capacity(n);
+        for (i, structure) in structures.iter().enumerate() {
+            matrix[i][i][0] += 1.0;
+            let mut row = Vec::with_capacity(structure.terms.len());
+            for (k, term) in structure.terms.iter().enumerate() {
+                let eta = structure.order - term.order;
+                let least = if term.signal == structure.output { LEAST_INTEGRATION } else { 0.0 };
+                if eta < least {
+                    // Reported like a step too far, so that the search shortens it.
+                    return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
+                }
+                let c = self.equations[i].terms[k].2.at(coefficients);
+                let (kernel, slope) = kernel_with_derivative(eta, m, record.step());
+                match unknown(i, term.signal) {
+                    Some(j) => matrix[i][j].iter_mut().zip(&kernel).for_each(|(a, v)| *a -= c * v),
+                    None => {
+                        let driven = series::multiply(&kernel, record.signal(term.signal), m);
+                        rhs[i].iter_mut().zip(driven).for_each(|(b, v)| *b += c * v);
+                    }
+                }
+                row.push((c, kernel, slope));
+            }
+            kernels.push(row);
+        }
+        let solve = |right: &[Vec<f64>]| {
+            let borrowed: Vec<&[f64]> = right.iter().map(Vec::as_slice).collect();
+            series::solve(&matrix, &borrowed)
+        };
+        // Weighted samples of a response, all outputs after one another.
+        let sampled = |response: &[Vec<f64>]| -> Vec<f64> {
+            let mut samples = Vec::with_capacity(n * experiment.compared());
+            for (i, means) in response.iter().enumerate() {
+                let filtered;
+                let means = match &experiment.filter {
+                    Some((filter, applies)) if applies[i] => {
+                        filtered = series::multiply(filter, means, m);
+                        &filtered
+                    }
+                    _ => means,
+                };
+                let w = experiment.weights[i];
+                samples.extend((1..=experiment.compared()).map(|k| {
+                    let edge = k * experiment.every;
+                    0.5 * w * (means[edge - 1] + means[edge])
+                }));
+            }
+            samples
+        };
+        let mut response = solve(&rhs)?;
+        let mut residuals: Vec<f64> = experiment
+            .samples
+            .iter()
+            .zip(&experiment.weights)
+            .flat_map(|(y, w)| y[1..=experiment.compared()].iter().map(move |v| v * w))
+            .collect();
+        residuals.iter_mut().zip(sampled(&response)).for_each(|(e, v)| *e -= v);
+        if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
+            return Err(Error::Diverged { what: "free run".into(), index });
+        }
+
+        // Initial terms: the projection of the residuals on their responses.
+        let mut basis = Vec::new();
+        let mut terms = Vec::new();
+        for (i, list) in out.exponents.iter().enumerate() {
+            for &exponent in list {
+                let mut right = vec![vec![0.0; m]; n];
+                right[i] = record.initial_term(exponent);
+                let column = solve(&right)?;
+                terms.push((i, exponent, sampled(&column), column));
+            }
+        }
+        let columns: Vec<Vec<f64>> = terms.iter().map(|t| t.2.clone()).collect();
+        let (values, _) = super::least_squares::solve(&columns, &residuals, 0)?;
+        for ((_, _, column, _), x) in terms.iter().zip(&values) {
+            residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
+        }
+        for ((_, _, _, column), x) in terms.iter().zip(&values) {
+            for (means, c) in response.iter_mut().zip(column) {
+                means.iter_mut().zip(c).for_each(|(y, v)| *y += x * v);
+            }
+        }
+        let mut initial: Vec<Vec<f64>> = vec![Vec::new(); n];
+        for ((i, _, _, _), &x) in terms.iter().zip(&values) {
+            initial[*i].push(x);
+        }
+        for column in columns {
+            orthonormal(&mut basis, column);
+        }
+
+        for parameter in 0..orders.len() + coefficients.len() {
+            let mut right = vec![vec![0.0; m]; n];
+            let mut touched = false;
+            for (i, equation) in self.equations.iter().enumerate() {
+                for (k, (signal, order, monomial)) in equation.terms.iter().enumerate() {
+                    let (c, kernel, slope) = &kernels[i][k];
+                    let (weight, operator) = if parameter < orders.len() {
+                        let d_eta = equation.order.weights.get(parameter).unwrap_or(&0.0)
+                            - order.weights.get(parameter).unwrap_or(&0.0);
+                        (c * d_eta, slope)
+                    } else {
+                        (monomial.slope(coefficients, parameter - orders.len()), kernel)
+                    };
+                    if weight == 0.0 {
+                        continue;
+                    }
+                    touched = true;
+                    let driver: &[f64] =
+                        unknown(i, *signal).map_or_else(|| record.signal(*signal), |j| response[j].as_slice());
+                    let effect = series::multiply(operator, driver, m);
+                    right[i].iter_mut().zip(effect).for_each(|(b, v)| *b += weight * v);
+                }
+                if parameter < orders.len() {
+                    let moved = initial_slope(self, i, parameter, orders, &initial[i], record)?;
+                    if let Some(moved) = moved {
+                        touched = true;
+                        right[i].iter_mut().zip(moved).for_each(|(b, v)| *b += v);
+                    }
+                }
+            }
+            let mut column = if touched { sampled(&solve(&right)?) } else { vec![0.0; residuals.len()] };
+            for direction in &basis {
+                let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
+                column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
+            }
+            // Residuals fall where the response rises.
+            out.jacobian[parameter].extend(column.iter().map(|v| -v));
+        }
+        out.residuals.extend(residuals);
+        out.initial.push(initial);
+        Ok(())
+    }
+}
+
+/// An affine order without rounding to the grain: it moves continuously here.
+fn raw(law: &AffineOrder, free: &[f64]) -> f64 {
+    law.constant + law.weights.iter().zip(free).map(|(w, x)| w * x).sum::<f64>()
+}
+
+/// How the initial terms of equation i move with a free order, weighted by their coefficients; none if they do not.
+fn initial_slope(
+    model: &FreeModel,
+    i: usize,
+    parameter: usize,
+    orders: &[f64],
+    values: &[f64],
+    record: &Record,
+) -> Result<Option<Vec<f64>>> {
+    // Exponents move linearly with orders, and powers of t smoothly with exponents: a central difference of the
+    // powers has an error of 1e−10, far below what a Jacobian needs.
+    const SHIFT: f64 = 1e-5;
+    if values.is_empty() || model.initial != Initial::Caputo {
+        return Ok(None);
+    }
+    let mut lists = Vec::with_capacity(2);
+    for sign in [1.0, -1.0] {
+        let mut moved = orders.to_vec();
+        moved[parameter] += sign * SHIFT;
+        lists.push(model.structures(&moved)[i].initial_exponents(&model.initial));
+    }
+    if lists.iter().any(|l| l.len() != values.len()) {
+        // An exponent appears or merges here: the projection follows it in the next evaluation.
+        return Ok(None);
+    }
+    let mut out = vec![0.0; record.m()];
+    let mut moved = false;
+    for ((&up, &down), &x) in lists[0].iter().zip(&lists[1]).zip(values) {
+        if (up - down).abs() < 1e-9 || x == 0.0 {
+            continue;
+        }
+        moved = true;
+        let (above, below) = (record.initial_term(up), record.initial_term(down));
+        check_length("initial term", above.len(), below.len())?;
+        out.iter_mut().zip(above.iter().zip(&below)).for_each(|(v, (a, b))| *v += x * (a - b) / (2.0 * SHIFT));
+    }
+    Ok(moved.then_some(out))
+}
+
+/// Adds a column to an orthonormal basis unless it lies in its span.
+fn orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>) {
+    let size = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let whole = size(&column);
+    // Twice is enough (Kahan, Parlett).
+    for _ in 0..2 {
+        for direction in basis.iter() {
+            let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
+            column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
+        }
+    }
+    let left = size(&column);
+    if left > 1e-12 * whole && left.is_finite() {
+        column.iter_mut().for_each(|v| *v /= left);
+        basis.push(column);
+    }
+}
+
+/// Settings of [`fit`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Settings {
+    /// Most evaluations.
+    pub evaluations: usize,
+    /// Relative change of the cost, and of the parameters, at which the search ends.
+    pub tolerance: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { evaluations: 100, tolerance: 1e-10 }
+    }
+}
+
+/// Weighted least squares on the output error from a start, by Levenberg–Marquardt with columns scaled by the Jacobian.
+///
+/// # Errors
+/// A start whose free run is not finite ([`Error::Diverged`]), or that lies outside its bounds or coordinates.
+pub fn fit(
+    model: &FreeModel,
+    experiments: &[Experiment],
+    start_orders: &[f64],
+    start_coefficients: &[f64],
+    settings: Settings,
+) -> Result<Fit> {
+    check_length("orders", model.order_bounds.len(), start_orders.len())?;
+    check_length("coefficients", model.coordinates.len(), start_coefficients.len())?;
+    for experiment in experiments {
+        check_length("outputs", model.equations.len(), experiment.samples.len())?;
+        check_length("weights", model.equations.len(), experiment.weights.len())?;
+        for samples in &experiment.samples {
+            check_length("samples", experiment.record.m() / experiment.every + 1, samples.len())?;
+        }
+    }
+    for (i, (&c, coordinate)) in start_coefficients.iter().zip(&model.coordinates).enumerate() {
+        let fits = match coordinate {
+            Coordinate::Plain => c.is_finite(),
+            Coordinate::Logarithm => c != 0.0 && c.is_finite(),
+            Coordinate::ExcessLogarithm => c > 1.0 && c.is_finite(),
+        };
+        if !fits {
+            return Err(Error::OutOfRange {
+                name: format!("start of coefficient {i}"),
+                value: c,
+                range: "its coordinate".into(),
+                remedy: "start a logarithmic coefficient away from 0, a ratio above 1".into(),
+            });
+        }
+    }
+    let mut orders: Vec<f64> =
+        start_orders.iter().zip(&model.order_bounds).map(|(&o, &(low, high))| o.clamp(low, high)).collect();
+    let mut coefficients = start_coefficients.to_vec();
+    let mut current = model.evaluate(experiments, &orders, &coefficients)?;
+    let mut evaluations = 1;
+    let mut damping = 1e-3;
+    let mut status = Status::Exhausted;
+    'outer: while evaluations < settings.evaluations {
+        let (r, scales) = scaled_factor(model, &current, &coefficients);
+        let k = scales.len();
+        let stride = k + 1;
+        loop {
+            let step = damped_step(&r, k, stride, damping);
+            let mut next_orders = orders.clone();
+            let mut next = coefficients.clone();
+            let mut moved: f64 = 0.0;
+            for i in 0..k {
+                let delta = if scales[i] > 0.0 { step[i] / scales[i] } else { 0.0 };
+                if i < orders.len() {
+                    let (low, high) = model.order_bounds[i];
+                    next_orders[i] = (orders[i] + delta).clamp(low, high);
+                    moved = moved.max((next_orders[i] - orders[i]).abs());
+                } else {
+                    let j = i - orders.len();
+                    next[j] = shifted(model.coordinates[j], coefficients[j], delta);
+                    let size = coefficients[j].abs().max(f64::MIN_POSITIVE);
+                    moved = moved.max((next[j] - coefficients[j]).abs() / size);
+                }
+            }
+            if moved <= settings.tolerance {
+                status = Status::Converged;
+                break 'outer;
+            }
+            evaluations += 1;
+            match model.evaluate(experiments, &next_orders, &next) {
+                Ok(found) if found.cost.is_finite() && found.cost < current.cost => {
+                    let gain = (current.cost - found.cost) / current.cost.max(f64::MIN_POSITIVE);
+                    (orders, coefficients, current) = (next_orders, next, found);
+                    damping = (damping * 0.1).max(1e-12);
+                    if gain <= settings.tolerance {
+                        status = Status::Converged;
+                        break 'outer;
+                    }
+                    break;
+                }
+                // A step that lowers nothing, or leaves the numbers, is shortened.
+                Ok(_) | Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => {
+                    damping *= 10.0;
+                    if damping > 1e12 {
+                        status = Status::Stalled;
+                        break 'outer;
+                    }
+                }
+                Err(error) => return Err(error),
+            }
+            if evaluations >= settings.evaluations {
+                break 'outer;
+            }
+        }
+    }
+    Ok(Fit {
+        orders,
+        coefficients,
+        cost: current.cost,
+        residuals: current.residuals,
+        jacobian: current.jacobian,
+        initial: current.initial,
+        exponents: current.exponents,
+        evaluations,
+        status,
+    })
+}
+
+/// A coefficient moved by `delta` in its coordinate.
+fn shifted(coordinate: Coordinate, value: f64, delta: f64) -> f64 {
+    // A factor of e^5 in one step has left the region in which the linearisation means anything.
+    let bounded = delta.clamp(-5.0, 5.0);
+    match coordinate {
+        Coordinate::Plain => value + delta,
+        Coordinate::Logarithm => value * libm::exp(bounded),
+        Coordinate::ExcessLogarithm => 1.0 + (value - 1.0) * libm::exp(bounded),
+    }
+}
+
+/// Derivative of a coefficient with respect to its coordinate.
+fn stretch(coordinate: Coordinate, value: f64) -> f64 {
+    match coordinate {
+        Coordinate::Plain => 1.0,
+        Coordinate::Logarithm => value,
+        Coordinate::ExcessLogarithm => value - 1.0,
+    }
+}
+
+/// R of the QR factorisation of [J | e] with J in coordinates and unit columns, and the columns' norms.
+fn scaled_factor(model: &FreeModel, current: &Evaluation, coefficients: &[f64]) -> (Vec<f64>, Vec<f64>) {
+    let orders = current.jacobian.len() - coefficients.len();
+    let mut columns = Vec::with_capacity(current.jacobian.len() + 1);
+    let mut scales = Vec::with_capacity(current.jacobian.len());
+    for (i, column) in current.jacobian.iter().enumerate() {
+        let factor = if i < orders { 1.0 } else { stretch(model.coordinates[i - orders], coefficients[i - orders]) };
+        let norm = column.iter().map(|v| (v * factor) * (v * factor)).sum::<f64>().sqrt();
+        let scale = if norm > 0.0 { factor / norm } else { 0.0 };
+        columns.push(column.iter().map(|v| v * scale).collect());
+        scales.push(norm);
+    }
+    columns.push(current.residuals.clone());
+    (dense::triangular_factor(&columns), scales)
+}
+
+/// Minimises ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e].
+fn damped_step(r: &[f64], k: usize, stride: usize, damping: f64) -> Vec<f64> {
+    let mut columns: Vec<Vec<f64>> = (0..k)
+        .map(|j| {
+            let mut column = vec![0.0; 2 * k];
+            for i in 0..=j {
+                column[i] = r[i * stride + j];
+            }
+            column[k + j] = damping.sqrt();
+            column
+        })
+        .collect();
+    let mut target = vec![0.0; 2 * k];
+    for (i, value) in target.iter_mut().take(k).enumerate() {
+        *value = -r[i * stride + k];
+    }
+    columns.push(target);
+    let q = dense::triangular_factor(&columns);
+    let rhs: Vec<f64> = (0..k).map(|i| q[i * (k + 1) + k]).collect();
+    back_substitute(&q, k + 1, &rhs)
+}

@@ -1,0 +1,522 @@
+"""Reports are whole, inert and honest: one file, no request, no script, and every number that of the result."""
+
+import math
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm import report
+from ftlm.report import figures, tables
+
+HOSTILE = "</script><script>alert(1)</script>\"><svg onload=alert(1)> & 'x'"
+VOID = {"meta", "link", "br", "hr", "img", "input"}
+ORDERS = {"gamma1": 0.95, "beta2": 0.1, "mu2": 0.85}
+
+
+def run_of(shape, name, *, seed, seconds=4.0, step=0.004):
+    t = np.arange(round(seconds / step) + 1) * step
+    inputs = {"I1": shape(t)}
+    clean = ftlm.link_model(orders=ORDERS, coefficients={"d1": 6.63, "d2": -9.1}).simulate(
+        ftlm.Run.from_arrays(step=step, inputs=inputs, outputs={"theta11": t}, units={"I1": "A"})
+    )
+    noise = np.random.default_rng(seed)
+    outputs = {n: clean[n] + 1e-5 * noise.standard_normal(t.size) for n in clean.outputs}
+    units = {"I1": "A", "theta11": "rad", "theta12": "rad"}
+    return ftlm.Run.from_arrays(step=step, inputs=inputs, outputs=outputs, units=units, name=name)
+
+
+@pytest.fixture(scope="module")
+def square():
+    return run_of(lambda t: 0.3 * np.sign(np.sin(np.pi * (t + 1e-9))), "square " + HOSTILE, seed=1)
+
+
+@pytest.fixture(scope="module")
+def sine():
+    return run_of(lambda t: 0.3 * np.sin(np.pi * t), "sine", seed=2)
+
+
+@pytest.fixture(scope="module")
+def identified(square):
+    lattice = ftlm.lattice(0.05, alpha1=2.0, alpha2=2.0, gamma1=(0.9, 1.0), beta2=(0.05, 0.15), mu2=(0.8, 0.9))
+    return ftlm.identify(square, ftlm.flexible_link(stage=1), method="least-squares", lattice=lattice)
+
+
+@pytest.fixture(scope="module")
+def page(identified, sine, tmp_path_factory):
+    path = tmp_path_factory.mktemp("report") / "arm.html"
+    assert report.identification_page(identified, path, validation=sine) == path
+    return path.read_text("utf-8")
+
+
+class Page(HTMLParser):
+    """Elements and text of a page; refuses what is not balanced."""
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.open, self.tags, self.attributes, self.text, self.data = [], [], [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open, f"left open: {self.open}"
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value) for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "data":
+            self.data.append(dict(attrs)["value"])
+
+    def handle_startendtag(self, tag, attrs):
+        self.tags.append(tag)
+        self.attributes += [(tag, name, value) for name, value in attrs]
+
+    def handle_endtag(self, tag):
+        assert self.open, f"</{tag}> closes nothing"
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.text.append(data)
+
+
+def written(tmp_path, *sections, **options):
+    return report.write_page(tmp_path / "p.html", title="t", sections=sections, **options).read_text("utf-8")
+
+
+# ------------------------------------------------------------------------------------------------ the page
+
+
+def test_page_is_balanced_and_needs_nothing_else(page):
+    parsed = Page(page)
+    assert "script" not in parsed.tags
+    assert not re.search(r"https?:|url\(|@import|src=|javascript:", page)
+    for tag, name, value in parsed.attributes:
+        assert not name.startswith("on"), (tag, name)
+        if name in ("href", "src", "action", "data", "srcset", "poster"):
+            assert value.startswith("#") or value == "data:,", (tag, name, value)
+    assert len(page.encode()) < 2_000_000
+    ids = [value for _, name, value in parsed.attributes if name == "id"]
+    assert len(ids) == len(set(ids))
+    assert {value[1:] for _, name, value in parsed.attributes if name == "href" and value[0] == "#"} <= set(ids)
+
+
+def test_page_says_what_it_must(page, identified):
+    text = " ".join(Page(page).text)
+    for word in (
+        "Warnings",
+        "Equations",
+        "Errors",
+        "Order search",
+        "Settings",
+        "Initial terms",
+        "equation error",
+        "output error",
+    ):
+        assert word in text
+    assert "estimation" in text
+    assert "validation" in text
+    for name in ("M", "initial terms", "coefficients by"):
+        assert name in text
+    assert "standard error" in text  # that there are none
+    assert text.index("Warnings") < text.index("Equations") < text.index("Errors")
+    assert f"{identified.fit_percent['theta12']:.4g}\u00a0%" in text
+
+
+def test_charts_are_named_for_those_who_cannot_see_them(page):
+    parsed = Page(page)
+    charts = re.findall(r'<svg class="chart [^>]*>', page)
+    assert len(charts) == 2 * 2 * 2  # outputs, runs, wide and narrow
+    assert all('role="img"' in c and "viewBox" in c for c in charts)
+    assert parsed.tags.count("desc") == len(charts)
+    assert "prefers-color-scheme" in page
+
+
+def test_numbers_are_those_of_the_comparison(page, identified, square, sine):
+    shown = {float(v) for v in Page(page).data}
+    for comparison in (identified.model.compare(square), identified.model.compare(sine)):
+        for found in (comparison.equation_error, comparison.output_error):
+            for m in found.values():
+                assert {m.error, m.rmse, m.nr, m.fit} <= shown
+    assert set(identified.coefficients.values()) <= shown
+    assert set(identified.orders.values()) <= shown
+
+
+def test_warnings_come_first(tmp_path, identified):
+    unstable = ftlm.Identification(
+        identified.model, "least-squares", identified.comparison, {}, identified.settings, (HOSTILE, "second")
+    )
+    path = report.identification_page(unstable, tmp_path / "p.html")
+    text = path.read_text("utf-8")
+    parsed = Page(text)
+    assert "2 warnings" in " ".join(parsed.text)
+    assert HOSTILE in parsed.text
+    assert text.index("second") < text.index("Equations</h2>")
+    assert "No validation run was given" in text
+
+
+def test_a_validation_that_validates_nothing_is_said(tmp_path, identified, square):
+    text = report.identification_page(identified, tmp_path / "p.html", validation=[square]).read_text("utf-8")
+    assert "it validates nothing" in text
+
+
+def test_a_lost_fit_is_said(tmp_path, identified, sine):
+    other = ftlm.Run.from_arrays(
+        step=sine.step, inputs={"I1": sine["I1"]}, name="other",
+        outputs={"theta11": -sine["theta11"], "theta12": -sine["theta12"]}, units=sine.units,
+    )  # fmt: skip
+    text = report.identification_page(identified, tmp_path / "p.html", validation=other).read_text("utf-8")
+    assert "validation run other: theta12: the fit falls from" in text
+
+
+def test_hostile_names_are_inert(tmp_path, page):
+    assert "square " + HOSTILE in " ".join(Page(page).text)
+    assert "<script" not in page
+    assert "onload=alert(1)>" not in page
+    chart = report.line_chart([0, 1], [(HOSTILE, [0, 1])], title=HOSTILE, x_label=HOSTILE, y_label=HOSTILE)
+    table = report.Table(HOSTILE, (HOSTILE, "n"), [(HOSTILE, 1.0)], ((HOSTILE, 2),), {0: HOSTILE}, HOSTILE)
+    section = report.Section(HOSTILE, [HOSTILE], [HOSTILE], [table], [chart])
+    text = written(tmp_path, section, lead=HOSTILE)
+    parsed = Page(text)
+    assert "script" not in parsed.tags
+    assert not [a for a in parsed.attributes if a[1].startswith("on")]
+    lone = report.Section("half a pair \ud800")
+    assert "half a pair" in written(tmp_path, lone, force=True)
+
+
+def test_existing_files_are_kept(tmp_path, identified):
+    path = tmp_path / "p.html"
+    path.write_text("mine")
+    with pytest.raises(ftlm.DataError, match="exists"):
+        report.write_page(path, title="t", sections=[])
+    with pytest.raises(ftlm.DataError, match="exists"):
+        report.identification_page(identified, path)
+    assert path.read_text() == "mine"
+    report.write_page(path, title="t", sections=[], force=True)
+    assert path.read_text("utf-8").startswith("<!doctype html>")
+    assert [p.name for p in tmp_path.iterdir()] == ["p.html"]
+
+
+def test_same_result_same_bytes(tmp_path, identified):
+    one, two = (report.identification_page(identified, tmp_path / n).read_bytes() for n in ("a.html", "b.html"))
+    assert one == two
+
+
+def test_a_paragraph_is_not_taken_apart():
+    section = report.Section("h", "one text", "one warning")
+    assert (section.paragraphs, section.warnings) == (("one text",), ("one warning",))
+
+
+def test_many_runs_stay_within_two_megabytes(tmp_path, identified, square):
+    rng = np.random.default_rng(3)
+    c = identified.comparison
+    runs = 120
+    many = ftlm.Comparison(
+        c.output_error, c.equation_error, [(f"run {k}", c.per_run[0][1], c.per_run[0][2]) for k in range(runs)],
+        {o: [rng.standard_normal(c.m)] * runs for o in c.simulated},
+        {o: [rng.standard_normal(c.m)] * runs for o in c.measured},
+        c.step * runs, c.m, [{}] * runs,
+    )  # fmt: skip
+    result = ftlm.Identification(identified.model, identified.method, many, {}, identified.settings)
+    text = report.identification_page(result, tmp_path / "p.html").read_text("utf-8")
+    assert len(text.encode()) < 2_000_000
+    assert "further charts are left out" in text
+
+
+# ------------------------------------------------------------------------------------------------ tables
+
+
+def test_numbers_read_alike():
+    assert tables.number(-863.33256) == "−863.33"
+    assert tables.number(0.1) == "0.10000"
+    assert tables.number(12345.0) == "12345"
+    assert tables.number(1.23456e-7) == "1.2346×10⁻⁷"
+    assert tables.number(313845) == tables.number(np.int64(313845)) == "313\u202f845"
+    assert tables.number(tables.Exact(0.95)) == "0.95"
+    assert tables.number(0.0) == "0"
+    assert tables.number(math.inf) == "∞ diverged"
+    assert tables.number(-math.inf) == "−∞ diverged"
+    assert tables.number(math.nan) == "undefined"
+
+
+def test_names_are_written_by_hand():
+    assert tables.symbol("theta12") == "θ₁₂"
+    assert tables.symbol("I1") == "I₁"
+    assert tables.symbol("motor2") == "motor2"
+    assert tables.symbol("<b>") == "<b>"
+    assert str(tables.symbol_html("mu2")) == "<i>μ</i><sub>2</sub>"
+    assert str(tables.symbol_html("<b>")) == "<i>&lt;b&gt;</i>"
+
+
+def test_equation_reads_as_on_paper():
+    model = ftlm.Model(ftlm.equation("D^1.95 theta12 = -863.3325 D^0.1 theta12 + 2 theta11 - 0.5 u"))
+    parsed = Page(str(report.equation_html(model.equations[0])))
+    assert "".join(parsed.text) == "D1.95 θ12 = −863.33 D0.1 θ12 + 2.0000 θ11 − 0.50000 u"
+    assert parsed.tags.count("sup") == 2
+
+
+def test_errors_table_is_the_comparison(identified, sine):
+    validation = identified.model.compare(sine)
+    table = report.errors_table([("estimation", identified.comparison), ("validation", validation)])
+    rows = iter(table.rows)
+    for found in (identified.comparison, validation):
+        for name in found.output_error:
+            e, o = found.equation_error[name], found.output_error[name]
+            assert next(rows)[1:] == [e.error, e.rmse, e.nr, e.fit, o.error, o.rmse, o.nr, o.fit]
+    assert next(rows, None) is None
+
+
+def test_errors_of_several_runs_together_and_alone(identified, square, sine):
+    found = identified.model.compare([square, sine])
+    table = report.errors_table([("both", found)])
+    assert len(table.rows) == 2 * 3
+    assert table.rows[0][5] == found.output_error["theta11"].error
+    assert table.rows[4][5] == found.per_run[1][2]["theta11"].error
+
+
+def test_parameters_stand_beside_the_stated_ones(identified):
+    table = report.parameter_table(identified.model)
+    values = [row[1] for row in table.rows]
+    assert values == [*identified.orders.values(), *identified.coefficients.values()]
+    stated = identified.model.structure.reference
+    assert [row[2] for row in table.rows[-8:]] == [stated[n] for n in identified.coefficients]
+    plain = report.parameter_table(ftlm.Model(ftlm.equation("D y = a y + b u").with_coefficients({"a": -1, "b": 2})))
+    assert plain.columns == ("parameter", "value", "what it is")
+    assert [row[1] for row in plain.rows] == [-1, 2]
+
+
+def paper_rows(identified):
+    integer = ftlm.link_model()
+    infinite = ftlm.Metrics(math.inf, math.inf, math.inf, -math.inf)
+    rows = []
+    for output in ("theta11", "theta12"):
+        rows.append(report.paper_row("integer-order model of the maker", integer, identified.comparison, output))
+        rows += [report.paper_row(f"p = {p}", identified.model, identified.comparison, output) for p in (1, 3, 5, 7)]
+    rows.append(report.PaperRow("diverged", "theta12", {"alpha": 2.0}, {"a": -1.23456e-5, "g": 1.0}, None, infinite))
+    return rows
+
+
+def test_paper_table_has_the_papers_columns(identified):
+    table = report.paper_table(paper_rows(identified))
+    assert [re.sub("<.*?>", "", c) for c in table.columns[:9]] == ["model", *"γαβμabdg"]
+    assert [text for text, _ in table.groups][3:] == ["equation error", "output error (free run)"]
+    assert sum(width for _, width in table.groups) == len(table.columns) == 15
+    deflection = table.rows[6]
+    o, c, comparison = identified.orders, identified.coefficients, identified.comparison
+    assert deflection[1:5] == [1.05, o["alpha2"], o["beta2"], o["mu2"]]
+    assert deflection[5:9] == [c["a2"], c["b2"], c["d2"], c["g2"]]
+    e, f = comparison.equation_error["theta12"], comparison.output_error["theta12"]
+    assert deflection[9:] == [e.error, e.rmse, e.nr, f.error, f.rmse, f.nr]
+    html = str(table.to_html())
+    Page(html)
+    assert "∞ diverged" in html
+    assert sorted(table.headings) == [0, 5]
+    with pytest.raises(ftlm.ModelError, match="no output 'theta21'"):
+        report.paper_row("p = 7", identified.model, identified.comparison, "theta21")
+
+
+def test_paper_table_fits_a_terminal(identified):
+    lines = report.paper_table_text(paper_rows(identified)).splitlines()
+    assert max(map(len, lines)) <= 120
+    assert lines[-1].startswith("∞: diverged")
+    assert len([line for line in lines if line.startswith("  p = ")]) == 8
+    row = next(line for line in lines if line.startswith("  p = 7")).split()
+    assert float(row[3]) == identified.orders["gamma1"] or identified.orders["gamma1"] in map(float, row[3:7])
+    assert float(row[7]) == pytest.approx(identified.coefficients["a1"], rel=1e-4)
+    assert float(row[-1]) == pytest.approx(identified.output_error["theta11"].nr, rel=0.05)
+
+
+def test_search_tables_account_for_every_candidate(identified):
+    search = identified.searches["stage"]
+    summary = report.search_summary(identified.searches)
+    name, _, candidates, kept, *left_out = summary.rows[0]
+    assert "stage" in name
+    assert candidates == search.candidates == kept + sum(left_out)
+    top = report.search_top("stage", search, rows=5)
+    assert len(top.rows) == min(5, len(search.table))
+    assert top.rows[0][1] == search.score
+    assert top.rows[0][2:] == [*search.orders.values(), *search.coefficients.values()]
+
+
+def test_settings_name_what_the_result_depends_on(identified, square):
+    text = str(report.settings_table(identified).to_html())
+    assert str(identified.settings["m"]) in text
+    assert "least-squares" in text
+    paper = ftlm.identify(square, ftlm.flexible_link().with_orders(identified.orders), prior_covariance=100.0)
+    rows = {str(row[0]): row[1] for row in report.settings_table(paper).rows}
+    assert rows["innovation length, p"] == 7
+    assert rows["prior covariance, K<sub>0</sub>"] == 100
+
+
+# ------------------------------------------------------------------------------------------------ charts
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_ticks_are_sane(seed):
+    rng = np.random.default_rng(seed)
+    low = float(rng.standard_normal() * 10.0 ** rng.integers(-12, 12))
+    high = low + float(abs(rng.standard_normal()) * 10.0 ** rng.integers(-3, 3) * (abs(low) + 1e-12))
+    found = figures.ticks(low, high, 5)
+    steps = np.diff(found.values)
+    slack = 1e-6 * (high - low)
+    assert 2 <= len(found.values) <= 12
+    assert low - slack <= found.values[0]
+    assert found.values[-1] <= high + slack
+    np.testing.assert_allclose(steps, steps[0], rtol=1e-3)
+    mantissa = steps[0] / 10.0 ** math.floor(math.log10(steps[0]) + 1e-9)
+    assert min(abs(mantissa / s - 1) for s in (1, 2, 5, 10)) < 1e-3
+    assert len(set(found.labels)) == len(found.labels)
+
+
+def test_ticks_are_round():
+    assert figures.ticks(0, 10, 5).labels == ["0", "2", "4", "6", "8", "10"]
+    assert figures.ticks(-0.1, 0.1, 5).labels == ["−0.10", "−0.05", "0.00", "0.05", "0.10"]
+    assert figures.ticks(0, 0.3, 3).values == [0, 0.1, 0.2, 0.3]
+    small = figures.ticks(-1e-7, 1e-7, 5)
+    assert (small.labels[0], small.factor) == ("−100", "×10⁻⁹")
+
+
+def test_decimation_keeps_extremes_and_ends():
+    rng = np.random.default_rng(5)
+    y = rng.standard_normal(100_000)
+    y[[12_345, 54_321, 77_777]] = [40.0, -50.0, np.nan]
+    kept = report.figures.decimate(y)
+    assert kept.size <= report.figures.POINTS
+    assert np.all(np.diff(kept) > 0)
+    assert {0, 12_345, 54_321, y.size - 1} <= set(kept.tolist())
+    assert np.all(np.isfinite(y[kept]))
+    # No part of the line is lost: wherever one looks, a smallest and a largest value were kept.
+    for part in np.array_split(np.arange(y.size), 300):
+        inside = kept[(kept >= part[0]) & (kept <= part[-1])]
+        assert inside.size >= 2
+    np.testing.assert_array_equal(report.figures.decimate([1.0, np.inf, 2.0]), [0, 2])
+    assert report.figures.decimate(np.full(3, np.nan)).size == 0
+
+
+def paths_of(svg):
+    """Points of the lines of a chart in tenths of a pixel, one list of strokes a line."""
+    lines = []
+    for d in re.findall(r'class="line\d"[^>]* d="(M-?\d+ ?-?\d+h0[^"]*)"', svg):
+        strokes = []
+        for command, a, b in re.findall(r"([Ml])(-?\d+) ?(-?\d+)", d):
+            point = np.array([int(a), int(b)])
+            if command == "M":
+                strokes.append([point])
+            else:
+                strokes[-1].append(strokes[-1][-1] + point)
+        lines.append([np.array(s) for s in strokes])
+    return lines
+
+
+def test_drawn_line_is_the_data():
+    x = np.linspace(0, 10, 400)
+    y = np.sin(x) * np.exp(-x / 5)
+    chart = report.line_chart(x, [("y", y)], title="t", x_label="x", y_label="y")
+    (strokes,) = paths_of(chart.svg)
+    assert len(strokes) == 1
+    drawn = strokes[0]
+    assert drawn.shape == (400, 2)
+    fitted = np.polyfit(drawn[:, 1], y, 1)
+    np.testing.assert_allclose(np.polyval(fitted, drawn[:, 1]), y, atol=2e-3)
+    assert fitted[0] < 0  # up is up
+    assert not chart.caption
+
+
+def test_what_is_not_finite_leaves_a_gap_and_is_said():
+    x = np.arange(100.0)
+    y = x.copy()
+    y[40:50], y[70] = np.nan, np.inf
+    y[90:] = 1e305  # beyond what can be drawn
+    chart = report.line_chart(x, [("y", y)], title="t", x_label="time [s]", y_label="y", caption="Words.")
+    (strokes,) = paths_of(chart.svg)
+    assert [len(s) for s in strokes] == [40, 20, 19]
+    assert chart.caption.startswith("Words. y: 21 of 100 values are not finite (first at time [s] = 40)")
+    assert "nan" not in chart.svg
+    assert "inf" not in chart.svg
+    nothing = report.line_chart(x, [("y", np.full(100, np.nan))], title="t", x_label="x", y_label="y")
+    assert paths_of(nothing.svg) == []
+    assert "no finite value to draw" in nothing.svg
+    assert "100 of 100" in nothing.caption
+
+
+def test_a_lone_point_is_a_dot():
+    chart = report.line_chart([0, 1, 2], [("y", [np.nan, 1, np.nan])], title="t", x_label="x", y_label="y")
+    assert [len(s) for s in paths_of(chart.svg)[0]] == [1]
+
+
+def test_a_run_that_strays_does_not_flatten_the_measured_one():
+    x = np.linspace(0, 10, 500)
+    measured = np.sin(x)
+    chart = report.line_chart(
+        x, [("measured", measured), ("simulated", np.exp(3 * x))], title="t", x_label="x", y_label="y"
+    )
+    heights = np.concatenate(paths_of(chart.svg)[0])[:, 1]
+    assert np.ptp(heights) > 100  # tenths of a pixel
+    assert "simulated leaves the axis (to 1.07×10¹³)" in chart.caption
+    assert len(chart.svg) < 20_000
+
+
+def test_logarithmic_axis():
+    x = np.arange(1, 1001)
+    y = 1e4 / x**2.0
+    y[5] = 0.0
+    chart = report.line_chart(x, [("p = 7", y)], title="t", x_label="x", y_label="y", log_y=True)
+    (strokes,) = paths_of(chart.svg)
+    assert [len(s) for s in strokes] == [5, 994]
+    drawn, kept = np.concatenate(strokes), np.delete(y, 5)
+    fitted = np.polyfit(drawn[:, 1], np.log10(kept), 1)
+    np.testing.assert_allclose(np.polyval(fitted, drawn[:, 1]), np.log10(kept), atol=0.01)
+    assert "0 or less" in chart.caption
+    for low, high in ((0.1, 1000.0), (3.1, 3.9), (2.0, 60.0), (1e-30, 1e40)):
+        small = report.line_chart([0, 1], [("y", [low, high])], title="t", x_label="x", y_label="y", log_y=True)
+        assert len(re.findall('text-anchor="end">', small.svg)) >= 3
+
+
+def test_lines_are_told_apart_without_colour():
+    lines = [("measured", [0, 1])] + [(f"p = {p}", [p, p]) for p in (1, 3, 5, 7)]
+    chart = report.line_chart([0, 1], lines, title="t", x_label="x", y_label="y")
+    assert len(set(re.findall(r'stroke-dasharray="([\d ]+)"', chart.svg))) >= 3
+    for name, _ in lines:
+        assert f">{name}</text>" in chart.svg
+        assert f">{name}</text>" in chart.narrow
+    heights = [
+        float(y) for y in re.findall(r'<text x="[\d.]+" y="([\d.]+)" text-anchor="start">(?:measured|p = )', chart.svg)
+    ]
+    assert np.min(np.diff(np.sort(heights))) >= figures.LINE - 0.11
+
+
+def test_extreme_data_still_draw():
+    for y in ([0, 0], [5, 5], [-1e299, 1e299], [1e-300, 2e-300], [1, 1 + 1e-15], [0, 5e-324]):
+        chart = report.line_chart([0, 1], [("y", y)], title="t", x_label="x", y_label="y")
+        assert "nan" not in chart.svg
+        Page(chart.svg)
+    chart = report.line_chart([0], [("measured", [1])], title="t", x_label="x", y_label="y")
+    Page(chart.svg)
+
+
+def test_charts_refuse_what_does_not_fit():
+    with pytest.raises(ftlm.DataError, match="at least one line"):
+        report.line_chart([0, 1], [], title="t", x_label="x", y_label="y")
+    with pytest.raises(ftlm.DataError, match="one length"):
+        report.line_chart([0, 1], [("y", [1, 2, 3])], title="t", x_label="x", y_label="y")
+
+
+def test_convergence_and_error_charts(square, identified):
+    equation = identified.model.structure.equation("theta12")
+    free = ftlm.flexible_link(laws=()).equation("theta12")
+    orders = dict(zip(("alpha2", "beta2", "gamma2", "mu2"), (2.0, 0.1, 1.05, 0.85), strict=True))
+    assert equation.outputs == free.outputs
+    traces = [
+        (f"p = {p}", ftlm.multi_innovation_trace(square, free.with_orders(orders), innovation_length=p, every=16))
+        for p in (1, 7)
+    ]
+    chart = report.trace_chart(traces, title="Convergence")
+    assert len(paths_of(chart.svg)) == 2
+    other = ftlm.multi_innovation_trace(square, free.with_orders(orders), every=32)
+    with pytest.raises(ftlm.DataError, match="other steps"):
+        report.trace_chart([*traces, ("x", other)], title="t")
+    found = report.error_chart([("best", identified.comparison)], "theta12", units={"theta12": "rad"})
+    assert "|error| [rad]" in found.svg
+    assert found._repr_html_().startswith("<figure>")

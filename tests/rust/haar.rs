@@ -1,0 +1,185 @@
+//! Haar coordinates and operational matrices: orthogonality, and the fast paths against the dense ones.
+
+use ftlm::error::Error;
+use ftlm::fractional::block_pulse_kernel;
+use ftlm::{dense, haar, operational, series};
+use proptest::prelude::*;
+
+use crate::common::{cases, check, distance, largest, norm, toeplitz, Random};
+
+#[test]
+fn the_haar_matrix_is_orthogonal() {
+    for m in [1, 2, 4, 8, 64, 256, 512] {
+        let phi = haar::matrix(m).unwrap();
+        let mut worst = 0.0_f64;
+        for i in 0..m {
+            for j in 0..=i {
+                let product: f64 = (0..m).map(|k| phi[i * m + k] * phi[j * m + k]).sum();
+                worst = worst.max((product - f64::from(u8::from(i == j))).abs());
+            }
+        }
+        check(&format!("Haar matrix of {m} times its transpose"), worst, 1e-14);
+    }
+}
+
+#[test]
+fn the_haar_matrix_of_four_is_the_printed_one() {
+    let r = 0.5_f64.sqrt();
+    let printed = [0.5, 0.5, 0.5, 0.5, 0.5, 0.5, -0.5, -0.5, r, -r, 0.0, 0.0, 0.0, 0.0, r, -r];
+    assert!(distance(&haar::matrix(4).unwrap(), &printed) < 1e-15);
+    assert_eq!(haar::matrix(1).unwrap(), [1.0]);
+}
+
+#[test]
+fn the_fast_transform_is_the_matrix() {
+    let mut random = Random::new(20);
+    for m in [1, 2, 4, 16, 128, 1024] {
+        let phi = haar::matrix(m).unwrap();
+        let f = random.signal(m);
+        let mut fast = f.clone();
+        haar::transform(&mut fast).unwrap();
+        assert!(distance(&fast, &dense::multiply(&phi, &f, m, m, 1)) < 1e-14 * norm(&f));
+        let mut back = fast.clone();
+        haar::inverse(&mut back).unwrap();
+        assert!(distance(&back, &dense::multiply(&fast, &phi, 1, m, m)) < 1e-14 * norm(&f));
+        assert!(distance(&back, &f) < 1e-14 * norm(&f));
+    }
+}
+
+#[test]
+fn lengths_that_are_no_power_of_two_are_named_with_their_neighbours() {
+    for (m, below, above) in [(12, 8, 16), (2047, 1024, 2048), (2049, 2048, 4096), (3, 2, 4)] {
+        let error = Error::NotPowerOfTwo { m, below, above };
+        let mut x = vec![1.0; m];
+        assert_eq!(haar::transform(&mut x), Err(error.clone()));
+        assert_eq!(haar::inverse(&mut x), Err(error.clone()));
+        assert!(x.iter().all(|&v| v == 1.0), "a refused signal is left as it was");
+        assert_eq!(haar::matrix(m), Err(error.clone()));
+        assert_eq!(operational::operational_matrix(0.5, m, 0.1), Err(error.clone()));
+        assert_eq!(operational::operational_matrix_dense(0.5, m, 0.1), Err(error));
+    }
+    let message = haar::check_power_of_two(12).unwrap_err().to_string();
+    assert_eq!(
+        message,
+        "Haar coordinates need m to be a power of two, not 12; take m = 8 or 16, or block-pulse (time) coordinates"
+    );
+    assert!(matches!(haar::check_power_of_two(0), Err(Error::NotPowerOfTwo { m: 0, below: 1, above: 1 })));
+}
+
+#[test]
+fn the_matrix_of_block_pulses_is_the_kernel() {
+    let mut random = Random::new(21);
+    let (m, step) = (100, 0.05);
+    for eta in [0.0, 0.4, 1.0, 1.7, 3.0] {
+        let f = operational::block_pulse_matrix(eta, m, step).unwrap();
+        let transposed = toeplitz(&block_pulse_kernel(eta, m, step));
+        let mut worst = 0.0_f64;
+        for i in 0..m {
+            for j in 0..m {
+                worst = worst.max((f[i * m + j] - transposed[j * m + i]).abs());
+            }
+        }
+        assert_eq!(worst, 0.0);
+        // Row vectors of coefficients from the left: the convolution with the kernel.
+        let x = random.signal(m);
+        let integral = series::multiply_naive(&block_pulse_kernel(eta, m, step), &x, m);
+        assert!(distance(&dense::multiply(&x, &f, 1, m, m), &integral) < 1e-14 * norm(&integral).max(1.0));
+    }
+}
+
+#[test]
+fn the_fast_operational_matrix_is_the_dense_one() {
+    let mut worst = 0.0_f64;
+    for m in [1, 2, 4, 32, 64, 256, 512] {
+        for eta in [0.0, 0.15, 0.5, 1.0, 1.85, 2.2, 3.0] {
+            let fast = operational::operational_matrix(eta, m, 1.0 / m as f64).unwrap();
+            let dense = operational::operational_matrix_dense(eta, m, 1.0 / m as f64).unwrap();
+            worst = worst.max(distance(&fast, &dense) / largest(&dense));
+        }
+    }
+    check("fast against dense operational matrix", worst, 1e-12);
+}
+
+#[test]
+fn the_operational_matrix_integrates_haar_coefficients() {
+    // P of order 1 over unit time as the literature prints it, for two wavelets.
+    let printed = [0.5, -0.25, 0.25, 0.0];
+    assert!(distance(&operational::operational_matrix(1.0, 2, 0.5).unwrap(), &printed) < 1e-15);
+    let mut random = Random::new(22);
+    let (m, step, eta) = (256, 0.02, 0.85);
+    let f = random.signal(m);
+    let mut coefficients = f.clone();
+    haar::transform(&mut coefficients).unwrap();
+    let p = operational::operational_matrix(eta, m, step).unwrap();
+    let by_matrix = dense::multiply(&coefficients, &p, 1, m, m);
+    let mut by_series = series::multiply(&block_pulse_kernel(eta, m, step), &f, m);
+    haar::transform(&mut by_series).unwrap();
+    check("P on coefficients against F on means", distance(&by_matrix, &by_series) / largest(&by_series), 1e-13);
+}
+
+#[test]
+fn operational_matrices_refuse_bad_arguments() {
+    for (eta, step) in [(-0.1, 0.1), (3.1, 0.1), (f64::NAN, 0.1), (0.5, 0.0), (0.5, -1.0), (0.5, f64::INFINITY)] {
+        for made in [
+            operational::block_pulse_matrix(eta, 8, step),
+            operational::operational_matrix(eta, 8, step),
+            operational::operational_matrix_dense(eta, 8, step),
+        ] {
+            assert!(matches!(made, Err(Error::OutOfRange { .. })), "eta {eta}, step {step}");
+        }
+    }
+}
+
+#[test]
+fn dense_products_match_sums() {
+    let mut random = Random::new(23);
+    for (a, b, c) in [(1, 1, 1), (3, 5, 2), (40, 7, 30), (17, 64, 65)] {
+        let (left, right) = (random.signal(a * b), random.signal(b * c));
+        let product = dense::multiply(&left, &right, a, b, c);
+        for i in 0..a {
+            for j in 0..c {
+                let sum: f64 = (0..b).map(|k| left[i * b + k] * right[k * c + j]).sum();
+                assert!((product[i * c + j] - sum).abs() < 1e-14 * b as f64);
+            }
+        }
+    }
+}
+
+#[test]
+fn gram_matrices_and_triangular_factors() {
+    let mut random = Random::new(24);
+    for (k, m) in [(1, 5), (4, 100), (6, 6), (5, 3)] {
+        let columns: Vec<Vec<f64>> = (0..k).map(|_| random.signal(m)).collect();
+        let borrowed: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
+        let gram = dense::gram(&borrowed);
+        let r = dense::triangular_factor(&columns);
+        for i in 0..k {
+            for j in 0..k {
+                let sum: f64 = columns[i].iter().zip(&columns[j]).map(|(x, y)| x * y).sum();
+                assert!((gram[i * k + j] - sum).abs() < 1e-13 * m as f64);
+                assert_eq!(gram[i * k + j].to_bits(), gram[j * k + i].to_bits());
+                // RᵀR is the Gram matrix whatever the signs in R.
+                let square: f64 = (0..k).map(|l| r[l * k + i] * r[l * k + j]).sum();
+                assert!((square - sum).abs() < 1e-13 * m as f64);
+                assert!(i <= j || r[i * k + j] == 0.0);
+            }
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(cases(64))]
+
+    #[test]
+    fn the_transform_keeps_products(level in 0u32..11, seed in any::<u64>()) {
+        let m = 1usize << level;
+        let mut random = Random::new(seed);
+        let (mut f, mut g) = (random.signal(m), random.signal(m));
+        let before: f64 = f.iter().zip(&g).map(|(a, b)| a * b).sum();
+        let size = norm(&f) * norm(&g);
+        haar::transform(&mut f).unwrap();
+        haar::transform(&mut g).unwrap();
+        let after: f64 = f.iter().zip(&g).map(|(a, b)| a * b).sum();
+        prop_assert!((after - before).abs() <= 1e-14 * size);
+    }
+}
