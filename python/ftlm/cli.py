@@ -39,7 +39,15 @@ app = typer.Typer(
 
 
 class Method(str, Enum):
-    """Estimators of the coefficients."""
+    """Estimators."""
+
+    output_error = "output-error"
+    multi_innovation = "multi-innovation"
+    least_squares = "least-squares"
+
+
+class Coefficients(str, Enum):
+    """Estimators of the coefficients in a search."""
 
     multi_innovation = "multi-innovation"
     least_squares = "least-squares"
@@ -135,7 +143,8 @@ P = Annotated[int, typer.Option("--p", help="Innovation length.")]
 K0 = Annotated[float, typer.Option("--k0", help="Prior covariance of the coefficients.")]
 RowsOption = Annotated[Rows, typer.Option("--rows", help="Coordinates of the rows of (44).")]
 Keep = Annotated[int, typer.Option("--keep", help="Rows of the ranked table.")]
-MethodOption = Annotated[Method, typer.Option("--method", help="Estimator of the coefficients.")]
+MethodOption = Annotated[Method, typer.Option("--method", help="Estimator.")]
+CoefficientsOption = Annotated[Coefficients, typer.Option("--coefficients", help="Estimator of the coefficients.")]
 
 
 # ------------------------------------------------------------------------------------------------ helpers
@@ -443,7 +452,7 @@ def inspect(
 def identify(
     files: Files,
     structure: StructureOption,
-    method: MethodOption = Method.multi_innovation,
+    method: MethodOption = Method.output_error,
     time: Time = None,
     sampling: Step = None,
     inputs: Inputs = None,
@@ -513,7 +522,7 @@ def identify(
 def search(
     files: Files,
     structure: StructureOption,
-    method: MethodOption = Method.multi_innovation,
+    coefficients: CoefficientsOption = Coefficients.multi_innovation,
     time: Time = None,
     sampling: Step = None,
     inputs: Inputs = None,
@@ -568,8 +577,8 @@ def search(
         own = {n: v for n, v in chosen.orders.items() if n == "alpha" or n in part.order_names}
         with Progress(f"searching orders of {name}", quiet=as_json) as progress:
             found[name] = ftlm.search_orders(
-                runs, part, replace(chosen, orders=own), criterion=criterion.value, coefficients=method.value,
-                norm=norm.value, innovation_length=p, prior_covariance=k0, rows=rows.value, m=m, keep=keep,
+                runs, part, replace(chosen, orders=own), criterion=criterion.value,
+                coefficients=coefficients.value, norm=norm.value, innovation_length=p, prior_covariance=k0, rows=rows.value, m=m, keep=keep,
                 threads=threads, progress=progress,
             )  # fmt: skip
     if as_json:

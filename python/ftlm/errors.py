@@ -21,7 +21,7 @@ class ConvergenceError(FtlmError):
     """An estimator that ended without an answer that can be trusted."""
 
 
-class RigFault(FtlmError):  # noqa: N818 — a fault, as people at a rig say
+class RigFault(FtlmError):  # noqa: N818 — a fault, as people at a rig say  # noqa: N818 — a fault, as people at a rig say
     """A fault of the rig, with its cause in words."""
 
 

@@ -80,6 +80,13 @@ CROSS_ORDER = 0.0
 def order_law(stage: int, input_order: Literal["published", "derived"] = "published") -> dict[str, Order]:
     """Every order of a stage's two equations as a function of the five free ones.
 
+    Parameters
+    ----------
+    stage
+        1 or 2.
+    input_order
+        ``"published"`` or ``"derived"``.
+
     Returns
     -------
     dict
@@ -182,6 +189,8 @@ def flexible_link(
         reference |= PARAMETERS[parameters][j].coefficients(j)
     if sensor_filter == "stock":
         sensor_filter = SensorFilter.low_pass([f"theta{j}2" for j in stages])
+    if not (sensor_filter is None or isinstance(sensor_filter, SensorFilter)):
+        raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or a SensorFilter")
     structure = Structure(
         equations=tuple(equations),
         coupling=coupling,

@@ -9,9 +9,20 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ftlm import _core
-from ftlm.errors import ModelError
+from ftlm.checks import whole_number
+from ftlm.errors import InternalError, ModelError
 from ftlm.models import Model, Structure, numeric
-from ftlm.order_search import Lattice, SearchResult, Settings, named_coefficients, prepare, search_orders
+from ftlm.order_search import (
+    Lattice,
+    SearchResult,
+    Settings,
+    check_lattice,
+    check_threads,
+    named_coefficients,
+    prepare,
+    search_orders,
+)
+from ftlm.output_error import FreeProblem, JointFit, fit_output_error, is_white
 from ftlm.records import initial_tuple, structure_tuple
 from ftlm.validation import Comparison, Metrics, as_runs, compare
 
@@ -24,10 +35,12 @@ if TYPE_CHECKING:
 
 __all__ = ["Identification", "Trace", "identify", "multi_innovation_trace"]
 
-METHODS = ("multi-innovation", "least-squares")
-LATER = ("output-error", "instrumental-variables", "genetic")
+METHODS = ("output-error", "multi-innovation", "least-squares")
+LATER = ("instrumental-variables", "genetic")
 #: A coefficient that the prior moves by more than this share is not the data's alone.
 PULLED = 0.05
+#: Two parameters more correlated than this cannot be told apart.
+INSEPARABLE = 0.995
 #: Two coefficients further apart than this share do not obey the coefficient law.
 LAW_BROKEN = 0.05
 
@@ -51,6 +64,8 @@ class Identification:
         Of the estimator.
     warnings
         What makes the model doubtful, in words.
+    joint
+        The optimum of the joint output error with its covariance; None for the equation-error methods.
     """
 
     model: Model
@@ -59,11 +74,22 @@ class Identification:
     searches: dict[str, SearchResult]
     settings: dict[str, Any]
     warnings: tuple[str, ...] = field(default=())
+    joint: JointFit | None = None
 
     @property
     def orders(self) -> dict[str, float]:
         """Free orders by name."""
         return dict(self.model.orders)
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        """Standard errors of orders and coefficients by name; empty for the equation-error methods, which have none."""
+        return {} if self.joint is None else self.joint.standard_errors
+
+    @property
+    def intervals(self) -> dict[str, tuple[float, float]]:
+        """95 % intervals of orders and coefficients by name; empty for the equation-error methods."""
+        return {} if self.joint is None else self.joint.intervals
 
     @property
     def coefficients(self) -> dict[str, float]:
@@ -93,6 +119,8 @@ class Identification:
             "equations": {e.output: numeric(e) for e in self.model.equations},
             "orders": self.orders,
             "coefficients": self.coefficients,
+            "standard_errors": self.standard_errors,
+            "intervals": {n: list(i) for n, i in self.intervals.items()},
             **self.comparison.to_dict(),
             "searches": {name: s.to_dict() for name, s in self.searches.items()},
             "warnings": list(self.warnings),
@@ -102,11 +130,15 @@ class Identification:
         lines = [f"{self.model.structure.name}: {self.method}, {_settings_in_words(self.settings)}"]
         lines += [f"  {numeric(e)}" for e in self.model.equations]
         reference = self.model.structure.reference
-        if self.orders:
-            lines.append("orders        " + "  ".join(f"{n} = {v:g}" for n, v in self.orders.items()))
-        for name, value in self.coefficients.items():
+        errors, shown = self.standard_errors, {**self.orders, **self.coefficients}
+        if self.joint is not None:
+            shown = {**self.orders, **self.joint.coefficients, **self.coefficients}
+        for name, value in shown.items():
+            spread = f" ± {errors[name]:<10.3g}" if name in errors else ""
             stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
-            lines.append(f"  {name:<12}{value:>14.6g}{stated}")
+            lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
+        if errors:
+            lines.append("  (value ± standard error; 95 % intervals are ± 1.96 of these)")
         lines.append(str(replace(self.comparison, warnings=())))
         for name, search in self.searches.items():
             pruned = ", ".join(f"{count} {reason}" for reason, count in search.pruned.items() if count)
@@ -124,8 +156,11 @@ class Identification:
 
 def _settings_in_words(settings: Mapping[str, Any]) -> str:
     words = f"M = {settings['m']}"
+    if "refinement" in settings:
+        words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} starts"
     if "innovation_length" in settings:
-        words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}, {settings['rows']} rows"
+        words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
+        words += f", {settings['rows']} rows"
     return f"{words}, initial terms: {settings['initial']}"
 
 
@@ -143,7 +178,7 @@ def identify(
     runs: Run | Sequence[Run],
     structure: Structure,
     *,
-    method: Literal["multi-innovation", "least-squares"] = "multi-innovation",
+    method: Literal["output-error", "multi-innovation", "least-squares"] = "output-error",
     criterion: Literal["output-error", "equation-error"] = "output-error",
     lattice: Lattice | None = None,
     norm: Literal["l1", "l2"] = "l1",
@@ -157,8 +192,9 @@ def identify(
 ) -> Identification:
     """Identify a structure from measured runs.
 
-    Free orders are searched on the lattice: each equation on its own, or all under their order law. At the orders
-    found, or given, the coefficients are those of the estimator.
+    By output error, orders and coefficients are continuous and found together, with intervals, from an automatic start.
+    By the equation-error methods, free orders are searched on the lattice: each equation on its own, or all under their
+    order law; at the orders found, or given, the coefficients are those of the estimator.
 
     Parameters
     ----------
@@ -167,9 +203,11 @@ def identify(
     structure
         What to identify; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
     method
-        ``"multi-innovation"``: the paper's (44) in closed form. ``"least-squares"``: its limit for a weak prior.
+        ``"output-error"``: all equations and runs together, maximum likelihood for white noise. ``"multi-innovation"``:
+        the paper's (44) in closed form. ``"least-squares"``: its limit for a weak prior.
     criterion, lattice, norm, keep, threads, progress
-        Of the order search; see :func:`ftlm.search_orders`.
+        Of the order search; see :func:`ftlm.search_orders`. Not used by ``"output-error"``, whose bounds are the
+        structure's own.
     innovation_length, prior_covariance, rows
         p, K0 and the coordinates of paper (42)-(44). p is a weight of the data against the prior, nothing else.
     m
@@ -196,7 +234,12 @@ def identify(
         raise ModelError(f"method = {method!r} is not known; use {' or '.join(map(repr, METHODS))}")
     if not isinstance(structure, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
-    settings = Settings.check(criterion, norm, method, innovation_length, prior_covariance, rows, keep, threads)
+    check_lattice(lattice)
+    _check_lattice_names(lattice, structure)
+    estimator = "least-squares" if method == "output-error" else method
+    settings = Settings.check(criterion, norm, estimator, innovation_length, prior_covariance, rows, keep, threads)
+    if method == "output-error":
+        return _identify_output_error(found, structure, m, threads, progress)
 
     searches: dict[str, SearchResult] = {}
     orders: dict[str, float] = {}
@@ -204,7 +247,6 @@ def identify(
         parts = {"stage": structure} if structure.has_order_law else {
             e.output: structure.equation(e.output) for e in structure.equations if e.order_names
         }  # fmt: skip
-        _check_lattice_names(lattice, structure)
         for name, part in parts.items():
             searches[name] = search_orders(
                 found, part, _lattice_of(lattice, part), criterion=criterion, coefficients=method, norm=norm,
@@ -234,10 +276,74 @@ def identify(
     return Identification(model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)))
 
 
+def _identify_output_error(
+    runs: Sequence[Run],
+    structure: Structure,
+    m: int | None,
+    threads: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> Identification:
+    """Orders and coefficients together by joint output error."""
+    records = prepare(runs, structure, m, power_of_two=False)
+    decided = replace(structure, initial=records[0].initial)
+    joint = fit_output_error(runs, decided, threads=check_threads(threads), progress=progress)
+    problem = FreeProblem.of(decided)
+    model = Model(
+        structure.with_orders(joint.orders).with_coefficients(problem.named(list(joint.coefficients.values()))),
+        orders=joint.orders,
+        units={n: u for n, u in runs[0].units.items() if n in structure.signals},
+        m=records[0].m,
+        about={"method": "output-error", "runs": ", ".join(r.name for r in runs)},
+    )
+    comparison = compare(model, runs, m=records[0].m)
+    initial = records[0].initial if isinstance(records[0].initial, str) else f"t^{list(records[0].initial)}"
+    used = {
+        "method": "output-error", "m": records[0].m, "initial": initial, "refinement": joint.refinement,
+        "starts": len(joint.starts), "noise": joint.noise, "converged": joint.converged,
+    }  # fmt: skip
+    warnings = list(comparison.warnings) + _uncertain(joint, problem)
+    warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings]
+    warnings += discretisation(model, comparison)
+    return Identification(model, "output-error", comparison, {}, used, tuple(dict.fromkeys(warnings)), joint)
+
+
+def _uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
+    """Say what the runs cannot tell."""
+    warnings = []
+    if not joint.converged:
+        warnings.append("the fit ended before it stood still; its figures are provisional")
+    errors = joint.standard_errors
+    for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
+        if errors[name] > high - low:
+            warnings.append(f"order {name} cannot be told from these runs: its standard error exceeds its bounds")
+        elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
+            warnings.append(f"order {name} = {value:g} is on its bound; widen it")
+    for name, value in joint.coefficients.items():
+        if errors[name] > abs(value):
+            warnings.append(
+                f"coefficient {name} = {value:.4g} is not different from 0 in these runs "
+                f"(standard error {errors[name]:.3g})"
+            )
+    correlation = joint.correlation
+    for i, first in enumerate(joint.names):
+        for j, second in enumerate(joint.names[:i]):
+            if abs(correlation[i, j]) > INSEPARABLE:
+                warnings.append(
+                    f"{second} and {first} cannot be told apart in these runs (correlation {correlation[i, j]:.4f})"
+                )
+    coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
+    if coloured:
+        warnings.append(
+            f"residuals of {', '.join(coloured)} are not white: the model leaves something out; "
+            "standard errors allow for it"
+        )
+    return warnings
+
+
 def _check_lattice_names(given: Lattice | None, structure: Structure) -> None:
     for name in given.orders if given is not None else ():
         if name not in structure.order_names and name != "alpha":
-            free = ", ".join(structure.order_names)
+            free = ", ".join(structure.order_names) or "none"
             raise ModelError(f"lattice order {name!r} is no free order; free are {free}")
 
 
@@ -268,35 +374,27 @@ def _estimate(
                 cores, core_structure, inputs, fixed, initial, settings.innovation_length, settings.prior_covariance,
                 settings.rows == "haar", False,
             )  # fmt: skip
-            warnings += _pulled(item.output, raw, cores, core_structure, inputs, fixed, initial, settings)
+            # A prior so weak that the data alone decide.
+            weak, _ = _core.multi_innovation(
+                cores, core_structure, inputs, fixed, initial, settings.innovation_length,
+                min(settings.prior_covariance * 1e12, 1e300), settings.rows == "haar", False,
+            )  # fmt: skip
+            warnings += _pulled(item.output, raw, weak[0], settings)
         coefficients |= named_coefficients(item, raw)
     words = records[0].initial if isinstance(records[0].initial, str) else f"t^{list(records[0].initial)}"
     return coefficients, warnings, records[0].m, str(words)
 
 
-def _pulled(
-    output: str,
-    raw: list[float],
-    cores: list[Any],
-    core_structure: Any,
-    inputs: list[bool],
-    fixed: list[float | None],
-    initial: tuple[bool, list[float]],
-    settings: Settings,
-) -> list[str]:
+def _pulled(output: str, raw: list[float], weak: list[float], settings: Settings) -> list[str]:
     """Say so where the prior, not the data, decides the size of a coefficient."""
-    weak, _ = _core.multi_innovation(
-        cores, core_structure, inputs, fixed, initial, settings.innovation_length,
-        settings.prior_covariance * 1e12, settings.rows == "haar", False,
-    )  # fmt: skip
-    shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak[0], strict=True) if b]
+    shares = [abs(a - b) / abs(b) for a, b in zip(raw, weak, strict=True) if b]
     worst = max(shares, default=0.0)
     if worst <= PULLED:
         return []
     return [
         f"{output}: the prior (K0 = {settings.prior_covariance:g}, coefficients near 0) moves a coefficient by "
-        f"{100 * min(worst, 9.99):.0f} % from what the data alone say; p = {settings.innovation_length} only weighs the "
-        "data against it. Raise prior_covariance or use method='least-squares'"
+        f"{100 * min(worst, 9.99):.0f} % from what the data alone say; p = {settings.innovation_length} only weighs "
+        "the data against it. Raise prior_covariance or use method='least-squares'"
     ]
 
 
@@ -314,12 +412,13 @@ def _broken_law(model: Model) -> list[str]:
                 f"coefficient law: {name} = {values[name]:.4g}, but the other equation gives {wanted:.4g}; "
                 "the equation-error estimators do not impose the law"
             )
-    ratios = {}
+    ratios: dict[str, list[tuple[str, float]]] = {}
     for name, sign, factors in law:
         free = [f for f in factors if f not in values]
         known = [values[f] for f in factors if f in values]
-        if name in values and len(free) == 1 and known and math.prod(known):
-            ratios.setdefault(free[0], []).append((name, sign * values[name] / math.prod(known)))
+        rest = math.prod(known)
+        if name in values and len(free) == 1 and known and rest:
+            ratios.setdefault(free[0], []).append((name, sign * values[name] / rest))
     for ratio, found in ratios.items():
         wrong = [(n, v) for n, v in found if not v > 1]
         if wrong:
@@ -409,13 +508,12 @@ def multi_innovation_trace(
     -----
     O(m k^3) for the recursion and one division of series for each step given.
     """
-    settings = Settings.check(
-        "output-error", "l1", "multi-innovation", innovation_length, prior_covariance, rows, 1, 1
-    )
+    settings = Settings.check("output-error", "l1", "multi-innovation", innovation_length, prior_covariance, rows, 1, 1)
     if len(equation.equations) != 1 or equation.order_names:
         raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
-    if int(every) != every or every < 1:
-        raise ModelError(f"every = {every!r} is no whole number from 1")
+    stride = whole_number(every)
+    if stride is None or stride < 1:
+        raise ModelError(f"every = {every!r} is no whole number from 1; 1 gives every step")
     rest = replace(equation, initial="rest")
     rec = prepare([run], rest, m, power_of_two=settings.needs_haar)[0]
     item = equation.equations[0]
@@ -425,10 +523,10 @@ def multi_innovation_trace(
         [rec.core()], core_structure, inputs, [t.fixed for t in item.terms], (False, []),
         settings.innovation_length, settings.prior_covariance, settings.rows == "haar", True,
     )  # fmt: skip
-    step = np.unique(np.append(np.arange(int(every), trace.shape[0] + 1, int(every)), trace.shape[0]))
+    if trace is None:
+        raise InternalError("the recursion gave no trace; please report it")
+    step = np.unique(np.append(np.arange(stride, trace.shape[0] + 1, stride), trace.shape[0]))
     kept = np.ascontiguousarray(trace[step - 1])
     error = _core.trace_errors(rec.core(), core_structure, inputs, kept)
-    names = {
-        t.coefficient: kept[:, k] / t.factor for k, t in enumerate(item.terms) if isinstance(t.coefficient, str)
-    }
+    names = {t.coefficient: kept[:, k] / t.factor for k, t in enumerate(item.terms) if isinstance(t.coefficient, str)}
     return Trace(step, names, error, settings.innovation_length)

@@ -7,17 +7,20 @@ import difflib
 import math
 import os
 import re
+import stat
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import msgspec
 
+from ftlm.checks import real_number, whole_number
 from ftlm.errors import DataError, ModelError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from ftlm.runs import Run
     from ftlm.validation import Comparison
@@ -39,7 +42,9 @@ MAX_ORDER = 3.0
 MAX_MODEL_BYTES = 1 << 20
 SCHEMA = 1
 NAME = r"[^\W\d]\w*"
-Initial = Literal["auto", "rest", "caputo"] | tuple[float, ...]
+Initial: TypeAlias = Literal["auto", "rest", "caputo"] | tuple[float, ...]
+#: What a person writes for the values of an order, see :func:`parse_values`.
+Values: TypeAlias = float | str | Iterable[float]
 
 
 # ------------------------------------------------------------------------------------------------ orders
@@ -74,9 +79,11 @@ class Order:
         try:
             tree = ast.parse(str(text).strip(), mode="eval").body
             constant, weights = _affine(tree)
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as error:
+            shown = f"{text!r}"
+            shown = shown if len(shown) <= 60 else f"{shown[:60]}…"
             raise ModelError(
-                f"order {text!r} is neither a number nor a sum of named orders; write 0.5, alpha or alpha1-mu2+0.1"
+                f"order {shown} is neither a number nor a sum of named orders; write 0.5, alpha or alpha1-mu2+0.1"
             ) from error
         return cls(constant, tuple(sorted((n, w) for n, w in weights.items() if w)))
 
@@ -104,10 +111,16 @@ class Order:
             raise ModelError(f"order {error.args[0]} has no value; give it in orders=") from None
 
     def __str__(self) -> str:
-        parts = [f"{'-' if w < 0 else '+'}{'' if abs(w) == 1 else f'{abs(w):g}*'}{n}" for n, w in self.weights]
+        parts = [f"{'-' if w < 0 else '+'}{'' if abs(w) == 1 else f'{shortest(abs(w))}*'}{n}" for n, w in self.weights]
         if self.constant or not parts:
-            parts.append(f"{self.constant:+g}")
+            parts.append(f"{'-' if self.constant < 0 else '+'}{shortest(abs(self.constant))}")
         return "".join(parts).removeprefix("+")
+
+
+def shortest(value: float) -> str:
+    """Write a number in six digits if that is what it is, else in as many as give it back."""
+    short = f"{value:g}"
+    return short if float(short) == value else repr(value)
 
 
 def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
@@ -138,8 +151,8 @@ def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
     raise ValueError("not affine")
 
 
-def parse_values(name: str, spec: Any) -> float | tuple[float, ...]:
-    """Values of one order: a number, ``"lo:hi:step"``, (lo, hi, step) or a list of numbers.
+def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
+    """Values of one order: a number, ``"low:high:step"``, a tuple (low, high, step) or a list of numbers.
 
     Returns
     -------
@@ -156,20 +169,25 @@ def parse_values(name: str, spec: Any) -> float | tuple[float, ...]:
         try:
             numbers = [float(p) for p in parts]
         except ValueError:
-            raise ModelError(f"order {name}: {spec!r} is no interval; write LOW:HIGH:STEP such as 0.5:1.5:0.05") from None
+            raise ModelError(
+                f"order {name}: {spec!r} is no interval; write LOW:HIGH:STEP such as 0.5:1.5:0.05"
+            ) from None
         if len(numbers) == 1:
             return _checked(name, numbers[0])
         if len(numbers) != 3:
             raise ModelError(f"order {name}: {spec!r} has {len(numbers)} parts; write LOW:HIGH:STEP")
         return grid(name, *numbers)
     if isinstance(spec, (int, float)):
-        return _checked(name, float(spec))
+        return _checked(name, real_number(f"order {name}", spec))
+    if isinstance(spec, tuple) and len(spec) == 2:
+        raise ModelError(f"order {name}: {spec!r} has no step; write (low, high, step), or a list for two values")
     try:
-        values = [_checked(name, float(v)) for v in spec]
-    except (TypeError, ValueError) as error:
-        if isinstance(error, ModelError):
-            raise
+        numbers = [real_number(f"order {name}", v) for v in spec]
+    except TypeError:
         raise ModelError(f"order {name}: {spec!r} is no list of numbers; write LOW:HIGH:STEP or numbers") from None
+    if isinstance(spec, tuple) and len(spec) == 3:
+        return grid(name, *numbers)
+    values = [_checked(name, v) for v in numbers]
     if not values:
         raise ModelError(f"order {name} has no value; give at least one")
     return tuple(sorted(set(values)))
@@ -193,6 +211,7 @@ def grid(name: str, low: float, high: float, step: float) -> tuple[float, ...]:
     ModelError
         A step that is not positive, an interval that is empty or outside [-3, 3], more than a million values.
     """
+    low, high, step = (real_number(f"order {name}", v) for v in (low, high, step))
     if not (math.isfinite(step) and step > 0):
         raise ModelError(f"order {name}: step {step:g} is not positive; the paper's is 0.05")
     _checked(name, low)
@@ -201,7 +220,9 @@ def grid(name: str, low: float, high: float, step: float) -> tuple[float, ...]:
         raise ModelError(f"order {name}: interval {low:g}:{high:g} is empty; put the lower end first")
     steps = (high - low) / step
     if steps > MAX_AXIS:
-        raise ModelError(f"order {name}: {low:g}:{high:g}:{step:g} has {steps:.3g} values, more than {MAX_AXIS}; raise the step")
+        raise ModelError(
+            f"order {name}: {low:g}:{high:g}:{step:g} has {steps:.3g} values, more than {MAX_AXIS}; raise the step"
+        )
     return tuple(round(low + i * step, 9) + 0.0 for i in range(int(steps + 1e-6) + 1))
 
 
@@ -278,13 +299,27 @@ class Equation:
         names = [t.coefficient for t in self.terms if isinstance(t.coefficient, str)]
         twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
         if twice is not None:
-            raise ModelError(f"coefficient {twice} stands twice in the equation of {self.output}; give each its own name")
+            raise ModelError(
+                f"coefficient {twice} stands twice in the equation of {self.output}; give each its own name"
+            )
         both = set(names) & set(self.order_names)
         if both:
             raise ModelError(f"{min(both)} names an order and a coefficient; rename one")
         if not self.order.names and not 0 < self.order.constant <= MAX_ORDER:
-            raise ModelError(f"order alpha = {self.order.constant:g} of {self.output} is outside (0, 3]; choose another")
+            raise ModelError(
+                f"order alpha = {self.order.constant:g} of {self.output} is outside (0, 3]; choose another"
+            )
         for term in self.terms:
+            if term.factor == 0 or not math.isfinite(term.factor):
+                raise ModelError(
+                    f"factor {term.factor:g} of {term.coefficient} {term.signal} in the equation of {self.output} "
+                    "leaves nothing to estimate; give a finite number other than 0"
+                )
+            if term.fixed is not None and not math.isfinite(term.fixed):
+                raise ModelError(
+                    f"coefficient of {term.signal} in the equation of {self.output} is {term.fixed:g}, which is not "
+                    "finite; give a number"
+                )
             if term.order.names or self.order.names:
                 continue
             own, alpha, order = term.signal == self.output, self.order.constant, term.order.constant
@@ -309,7 +344,7 @@ class Equation:
         return tuple(t.coefficient for t in self.terms if isinstance(t.coefficient, str))
 
     def with_orders(self, values: Mapping[str, float]) -> Equation:
-        """The equation with these free orders replaced by values; others stay free.
+        """Return the equation with these free orders replaced by values; others stay free.
 
         Raises
         ------
@@ -325,9 +360,15 @@ class Equation:
         return Equation(self.output, put(self.order), terms)
 
     def with_coefficients(self, values: Mapping[str, float]) -> Equation:
-        """The equation with these free coefficients replaced by values; others stay free."""
+        """Return the equation with these free coefficients replaced by values; others stay free.
+
+        Raises
+        ------
+        ModelError
+            A value that is no finite number.
+        """
         terms = tuple(
-            replace(t, coefficient=float(values[t.coefficient]), name=t.coefficient)
+            replace(t, coefficient=real_number(t.coefficient, values[t.coefficient]), name=t.coefficient)
             if isinstance(t.coefficient, str) and t.coefficient in values
             else t
             for t in self.terms
@@ -347,10 +388,10 @@ class Equation:
 def equation(
     text: str,
     *,
-    orders: Mapping[str, Any] | None = None,
+    orders: Mapping[str, Values] | None = None,
     fixed: Mapping[str, float] | None = None,
     delay: Mapping[str, float] | None = None,
-    initial: Any = "auto",
+    initial: str | Iterable[float] = "auto",
     sensor_filter: SensorFilter | None = None,
 ) -> Structure:
     """Any linear fractional equation, in words.
@@ -383,6 +424,8 @@ def equation(
     ModelError
         Text that is no such equation (with the place), a name that does not occur, orders out of range.
     """
+    if not isinstance(text, str):
+        raise ModelError(f"the equation is {type(text).__name__}, not text; write it as in 'D^1.5 y = a0 y + b0 u'")
     lines = [line for line in re.split(r"[;\n]", text) if line.strip()]
     if not lines:
         raise ModelError("the equation is empty; write it as in 'D^1.5 y = a0 y + b0 u'")
@@ -390,7 +433,7 @@ def equation(
     fixed = dict(fixed or {})
     _known("fixed coefficient", fixed, [n for e in equations for n in e.coefficient_names])
     for name, value in fixed.items():
-        if not math.isfinite(value):
+        if not math.isfinite(real_number(f"fixed coefficient {name}", value)):
             raise ModelError(f"fixed coefficient {name} = {value} is not finite; give a number")
     equations = [e.with_coefficients(fixed) for e in equations]
     return Structure(
@@ -437,6 +480,12 @@ class _Words:
         self.position += 1
         return token
 
+    def order(self, text: str, at: int) -> Order:
+        try:
+            return Order.parse(text)
+        except ModelError as error:
+            raise ModelError(f"equation {self.text!r}: at character {at + 1}: {error}") from error
+
     def fail(self, wanted: str) -> ModelError:
         _, value, at = self.peek()
         return ModelError(
@@ -459,7 +508,9 @@ def parse_equation(text: str) -> Equation:
         words.position -= 1
         raise words.fail("'='")
     if order is None:
-        raise ModelError(f"equation {text!r}: its left-hand side has no derivative; write it as in 'D^1.5 {output} = …'")
+        raise ModelError(
+            f"equation {text!r}: its left-hand side has no derivative; write it as in 'D^1.5 {output} = …'"
+        )
     terms = []
     while True:
         sign = 1.0
@@ -504,7 +555,7 @@ def _parse_order(words: _Words) -> Order:
                 raise words.fail(f"'{close}'")
             depth += token in "({" and kind == "symbol"
             depth -= token in ")}" and kind == "symbol"
-        return Order.parse(words.text[begin:at])
+        return words.order(words.text[begin:at], begin)
     sign = ""
     if value == "-" and kind == "symbol":
         sign = words.take()[1]
@@ -512,7 +563,7 @@ def _parse_order(words: _Words) -> Order:
     if kind not in ("number", "name"):
         raise words.fail("an order: a number, a name or (…)")
     words.take()
-    return Order.parse(sign + value)
+    return words.order(sign + value, start)
 
 
 def _parse_term(words: _Words, sign: float) -> Term:
@@ -554,6 +605,32 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     numerator: tuple[tuple[float, float], ...]
     denominator: tuple[tuple[float, float], ...]
 
+    def __post_init__(self) -> None:
+        """Refuse a filter that is none.
+
+        Raises
+        ------
+        ModelError
+            A number that is not finite, an order outside [0, 3], a denominator without a term, a numerator of a
+            higher order than the denominator.
+        """
+        for part, terms in (("numerator", self.numerator), ("denominator", self.denominator)):
+            for coefficient, order in terms:
+                if not (math.isfinite(coefficient) and 0 <= order <= MAX_ORDER):
+                    raise ModelError(
+                        f"sensor filter: {coefficient:g} D^{order:g} in its {part} is no term; give a finite "
+                        "coefficient and an order in [0, 3]"
+                    )
+        highest = max((order for coefficient, order in self.denominator if coefficient), default=None)
+        if highest is None:
+            raise ModelError("sensor filter: its denominator has no term; give at least one")
+        improper = next((order for _, order in self.numerator if order > highest), None)
+        if improper is not None:
+            raise ModelError(
+                f"sensor filter: order {improper:g} of its numerator is above {highest:g}, the highest of its "
+                "denominator; a filter that can be built is proper"
+            )
+
     @classmethod
     def low_pass(cls, outputs: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
         """Second-order low-pass of ``frequency`` [Hz]; the default is that of the arm's stock real-time model."""
@@ -561,7 +638,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return cls(tuple(outputs), ((omega**2, 0.0),), ((1.0, 2.0), (2 * damping * omega, 1.0), (omega**2, 0.0)))
 
 
-def check_initial(initial: Any) -> Initial:
+def check_initial(initial: str | Iterable[float]) -> Initial:
     """Refuse initial terms that are neither a known word nor exponents above -1.
 
     Raises
@@ -574,9 +651,11 @@ def check_initial(initial: Any) -> Initial:
             return initial  # type: ignore[return-value]
         raise ModelError(f"initial = {initial!r} is not known; use 'auto', 'rest', 'caputo' or exponents of t")
     try:
-        exponents = tuple(float(e) for e in initial)
-    except (TypeError, ValueError):
-        raise ModelError(f"initial = {initial!r} is not known; use 'auto', 'rest', 'caputo' or exponents of t") from None
+        exponents = tuple(real_number("exponent of an initial term", e) for e in initial)
+    except TypeError:
+        raise ModelError(
+            f"initial = {initial!r} is not known; use 'auto', 'rest', 'caputo' or exponents of t"
+        ) from None
     bad = next((e for e in exponents if not (math.isfinite(e) and -1 < e <= 10)), None)
     if bad is not None:
         raise ModelError(f"exponent {bad:g} of an initial term is outside (-1, 10]; t to this power is of no use")
@@ -636,7 +715,7 @@ class Structure:
         external = [s for s in self.signals if s not in outputs]
         _known("delayed input", self.delay, external)
         for name, delay in self.delay.items():
-            if not (math.isfinite(delay) and delay >= 0):
+            if not 0 <= real_number(f"delay of {name}", delay) < math.inf:
                 raise ModelError(f"delay of {name} = {delay} s is not a non-negative number; give seconds")
         if self.sensor_filter is not None:
             _known("filtered output", self.sensor_filter.outputs, self.signals)
@@ -653,8 +732,10 @@ class Structure:
 
     @property
     def order_names(self) -> tuple[str, ...]:
-        """Free orders."""
-        return tuple(dict.fromkeys(n for e in self.equations for n in e.order_names))
+        """Free orders: those that stand alone in order of appearance, then those seen only through a law."""
+        orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms))]
+        alone = [o.names[0] for o in orders if o.is_single]
+        return tuple(dict.fromkeys([*alone, *(n for o in orders for n in o.names)]))
 
     @property
     def coefficient_names(self) -> tuple[str, ...]:
@@ -683,17 +764,16 @@ class Structure:
         found = next(e for e in self.equations if e.output == output)
         modelled = [s for e in self.equations for s in e.signals if s in self.outputs]
 
-        def freed(term: Term) -> Term:
+        def freed(k: int, term: Term) -> Term:
             if term.order.is_single or not term.order.names:
                 return term
             if term.signal not in modelled:
                 return replace(term, order=Order())
-            name = ORDER_OF_COEFFICIENT.sub(
-                lambda m: {"a": "beta", "b": "gamma", "d": "mu"}[m[1]] + m[2], str(term.coefficient)
-            )
+            paper = ORDER_OF_COEFFICIENT.match(str(term.coefficient))
+            name = {"a": "beta", "b": "gamma", "d": "mu"}[paper[1]] + paper[2] if paper else f"nu_{output}_{k + 1}"
             return replace(term, order=Order(0.0, ((name, 1.0),)))
 
-        single = replace(found, terms=tuple(freed(t) for t in found.terms))
+        single = replace(found, terms=tuple(freed(k, t) for k, t in enumerate(found.terms)))
         return replace(
             self,
             equations=(single,),
@@ -705,7 +785,7 @@ class Structure:
             name=f"{self.name}, {output}",
         )
 
-    def with_orders(self, orders: Mapping[str, Any]) -> Structure:
+    def with_orders(self, orders: Mapping[str, Values]) -> Structure:
         """Fix free orders (a number) or give them a lattice (see :func:`parse_values`).
 
         Raises
@@ -723,9 +803,7 @@ class Structure:
             else:
                 lattices[name] = values
         equations = tuple(e.with_orders(numbers) for e in self.equations)
-        return replace(
-            self, equations=equations, order_values={n: v for n, v in lattices.items() if n not in numbers}
-        )
+        return replace(self, equations=equations, order_values={n: v for n, v in lattices.items() if n not in numbers})
 
     def with_coefficients(self, values: Mapping[str, float]) -> Structure:
         """Fix free coefficients.
@@ -814,6 +892,8 @@ class Model:
     about: Mapping[str, str | float | int | bool | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        if self.m is not None and not 1 <= (whole_number(self.m) or 0) < 1 << 62:
+            raise ModelError(f"m = {self.m!r} is no number of pulses; give a whole number, at least 1")
         for item in self.structure.equations:
             if not item.is_identified:
                 free = [*item.order_names, *item.coefficient_names]
@@ -837,17 +917,24 @@ class Model:
         """Modelled outputs."""
         return self.structure.outputs
 
-    def simulate(self, run: Run, **options: Any) -> Run:
+    def simulate(
+        self,
+        run: Run,
+        *,
+        tolerance: float = 1e-6,
+        initial: Mapping[str, Mapping[float, float]] | None = None,
+        largest_m: int = 1 << 21,
+    ) -> Run:
         """Free run on a run's inputs; see :func:`ftlm.simulate`."""
         from ftlm.simulation import simulate  # noqa: PLC0415 — simulation reads models
 
-        return simulate(self, run, **options)
+        return simulate(self, run, tolerance=tolerance, initial=initial, largest_m=largest_m)
 
-    def compare(self, runs: Run | Sequence[Run], **options: Any) -> Comparison:
+    def compare(self, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
         """Both errors on measured runs; see :func:`ftlm.compare`."""
         from ftlm.validation import compare  # noqa: PLC0415 — validation reads models
 
-        return compare(self, runs, **options)
+        return compare(self, runs, m=m)
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the model as JSON, atomically.
@@ -866,10 +953,7 @@ class Model:
             _EquationFile(
                 e.output,
                 e.order.constant,
-                [
-                    _TermFile(t.signal, t.order.constant, float(t.coefficient), t.factor, t.name)
-                    for t in e.terms
-                ],
+                [_TermFile(t.signal, t.order.constant, float(t.coefficient), t.factor, t.name) for t in e.terms],
             )
             for e in s.equations
         ]
@@ -887,7 +971,7 @@ class Model:
 
 
 def numeric(item: Equation) -> str:
-    """An identified equation with six significant digits."""
+    """Write an identified equation with six significant digits."""
     parts = [f"{t.fixed or 0.0:+.6g} {_derivative(t.order, t.signal)}" for t in item.terms]
     right = " ".join(parts).removeprefix("+").replace(" +", " + ").replace(" -", " - ")
     return f"{_derivative(item.order, item.output)} = {right}"
@@ -903,27 +987,35 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     """
     file = Path(path)
     try:
-        size = file.stat().st_size
-        if size > MAX_MODEL_BYTES:
-            raise DataError(f"{file} has {size} bytes, no model is larger than {MAX_MODEL_BYTES}; give a model file")
+        found = file.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise DataError(f"{file} is no regular file; give a file written by save()")
+        if found.st_size > MAX_MODEL_BYTES:
+            raise DataError(
+                f"{file} has {found.st_size} bytes, no model is larger than {MAX_MODEL_BYTES}; give a model file"
+            )
         read = msgspec.json.decode(file.read_bytes(), type=_ModelFile)
     except OSError as error:
         raise DataError(f"model {file} cannot be read: {error.strerror or error}; check the path") from error
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+    except DataError:
+        raise
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
     if read.schema > SCHEMA or read.schema < 1:
         raise DataError(f"{file} has schema {read.schema}, this version reads up to {SCHEMA}; upgrade ftlm")
-    equations = tuple(
-        Equation(
-            e.output, Order(e.order), tuple(Term(t.signal, Order(t.order), t.coefficient, t.factor, t.name) for t in e.terms)
-        )
-        for e in read.equations
-    )
-    structure = Structure(
-        equations=equations, coupling=read.coupling, delay=read.delay, initial=check_initial(read.initial),
-        sensor_filter=read.sensor_filter, name=read.name,
-    )  # fmt: skip
-    return Model(structure, read.orders, read.units, read.m, read.about)
+    try:
+        structure = Structure(
+            equations=tuple(_equation_of(e) for e in read.equations), coupling=read.coupling, delay=read.delay,
+            initial=check_initial(read.initial), sensor_filter=read.sensor_filter, name=read.name,
+        )  # fmt: skip
+        return Model(structure, read.orders, read.units, read.m, read.about)
+    except ModelError as error:
+        raise DataError(f"{file} holds no usable model: {error}") from error
+
+
+def _equation_of(item: _EquationFile) -> Equation:
+    terms = tuple(Term(t.signal, Order(t.order), t.coefficient, t.factor, t.name) for t in item.terms)
+    return Equation(item.output, Order(item.order), terms)
 
 
 def write_atomically(path: str | os.PathLike[str], data: bytes, *, force: bool) -> Path:
@@ -935,7 +1027,7 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, *, force: bool) 
         The file exists and ``force`` is not set, or the folder cannot be written.
     """
     file = Path(path)
-    if file.exists() and not force:
+    if os.path.lexists(file) and not force:
         raise DataError(f"{file} exists; choose another name, or overwrite it with force=True (--force)")
     try:
         handle, beside = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent or Path())
@@ -951,6 +1043,7 @@ def write_atomically(path: str | os.PathLike[str], data: bytes, *, force: bool) 
         except BaseException:
             Path(beside).unlink(missing_ok=True)
             raise
-    except OSError as error:
-        raise DataError(f"{file} cannot be written: {error.strerror or error}; choose another folder") from error
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else None
+        raise DataError(f"{file} cannot be written: {why or error}; choose another folder") from error
     return file

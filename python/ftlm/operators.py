@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+import math
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from ftlm import _core
+from ftlm.checks import real_number, whole_number
 from ftlm.errors import DataError, ModelError
 
 if TYPE_CHECKING:
@@ -25,18 +27,21 @@ __all__ = [
 ]
 
 
-def as_floats(name: str, values: Any) -> NDArray[np.float64]:
-    """Float64 array of real numbers; never a view that is written to.
+def as_floats(name: str, values: object) -> NDArray[np.float64]:
+    """Return a float64 array of real numbers; never a view that is written to.
 
     Raises
     ------
     DataError
-        Text, objects or complex numbers.
+        Text, objects or complex numbers, rows of different lengths.
     """
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise DataError(f"{name} is no array: {str(error).rstrip('.')}; give rows of equal length") from error
     if array.dtype.kind not in "fiub":
         raise DataError(f"{name} holds {array.dtype} values; give real numbers")
-    return np.ascontiguousarray(array, dtype=np.float64)
+    return np.asarray(array, dtype=np.float64, order="C")
 
 
 def along(
@@ -47,6 +52,8 @@ def along(
     if array.ndim == 0 or not -array.ndim <= axis < array.ndim:
         raise DataError(f"{name} has {array.ndim} dimensions and no axis {axis}; give an array and one of its axes")
     moved = np.moveaxis(array, axis, -1)
+    if moved.size == 0:
+        raise DataError(f"{name} has shape {array.shape} and holds no value; give at least one")
     rows = np.ascontiguousarray(moved.reshape(-1, moved.shape[-1]))
     return np.moveaxis(work(rows).reshape(moved.shape), -1, axis)
 
@@ -92,7 +99,8 @@ def fractional_integral(
     -----
     O(n log n) for n samples.
     """
-    return along("x", x, axis, lambda rows: _core.fractional_integral(rows, float(order), float(step), rule))
+    eta, width = real_number("order", order), real_number("step", step)
+    return along("x", x, axis, lambda rows: _core.fractional_integral(rows, eta, width, rule))
 
 
 def fractional_derivative(
@@ -142,6 +150,7 @@ def fractional_derivative(
     O(n log n) for n samples.
     """
     given = as_floats("initial", [] if initial is None else initial)
+    alpha, width = real_number("order", order), real_number("step", step)
 
     def work(rows: NDArray[np.float64]) -> NDArray[np.float64]:
         if given.ndim <= 1:
@@ -149,13 +158,25 @@ def fractional_derivative(
         else:
             starts = given.reshape(-1, given.shape[-1])
         starts = np.ascontiguousarray(starts)
-        return _core.fractional_derivative(rows, float(order), float(step), definition, starts)
+        return _core.fractional_derivative(rows, alpha, width, definition, starts)
 
     return along("x", x, axis, work)
 
 
 def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     """Haar coefficients, coarse to fine, of pulse means: the orthogonal matrix of paper (29) applied in O(m).
+
+    Parameters
+    ----------
+    x
+        Pulse means along ``axis``, a power of two of them.
+    axis
+        Axis of time.
+
+    Returns
+    -------
+    numpy.ndarray
+        Array of the shape of ``x``.
 
     Raises
     ------
@@ -168,6 +189,18 @@ def haar_transform(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
 def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     """Pulse means from Haar coefficients: the transpose of :func:`haar_transform`.
 
+    Parameters
+    ----------
+    x
+        Haar coefficients along ``axis``, a power of two of them.
+    axis
+        Axis of the coefficients, coarse to fine.
+
+    Returns
+    -------
+    numpy.ndarray
+        Array of the shape of ``x``.
+
     Raises
     ------
     ModelError
@@ -177,19 +210,31 @@ def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
 
 
 def _pulses(m: int) -> int:
-    if isinstance(m, bool) or int(m) != m or m < 1:
+    pulses = whole_number(m)
+    if pulses is None or not 1 <= pulses < 1 << 62:
         raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
-    return int(m)
+    return pulses
 
 
 def _step(m: int, duration: float) -> float:
-    if not (np.isfinite(duration) and duration > 0):
+    length = real_number("duration", duration)
+    if not (math.isfinite(length) and length > 0):
         raise ModelError(f"duration = {duration!r} s is not positive; give the length of the record in seconds")
-    return float(duration) / m
+    return length / m
 
 
 def haar_matrix(m: int) -> NDArray[np.float64]:
-    """Orthogonal Haar matrix, m x m (paper (27), (29)); m a power of two, at most 16 384.
+    """Orthogonal Haar matrix (paper (27), (29)).
+
+    Parameters
+    ----------
+    m
+        Number of wavelets, a power of two, at most 16 384.
+
+    Returns
+    -------
+    numpy.ndarray
+        Matrix of shape (m, m), coarse to fine by row.
 
     Raises
     ------
@@ -200,10 +245,23 @@ def haar_matrix(m: int) -> NDArray[np.float64]:
 
 
 def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.float64]:
-    """Fractional integration matrix of m block pulses over ``duration`` seconds (paper (32)), upper triangular.
+    """Fractional integration matrix of block pulses (paper (32)), upper triangular.
 
-    A row vector of pulse means times this matrix is the row vector of the means of its integral. ``order`` in
-    [0, 3], any m up to 16 384.
+    A row vector of pulse means times this matrix is the row vector of the means of its integral.
+
+    Parameters
+    ----------
+    order
+        Order of the integral, in [0, 3].
+    m
+        Number of pulses, at most 16 384.
+    duration
+        Length of the record [s].
+
+    Returns
+    -------
+    numpy.ndarray
+        Matrix of shape (m, m).
 
     Raises
     ------
@@ -211,13 +269,25 @@ def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
         An order, m or duration out of range.
     """
     m = _pulses(m)
-    return _core.block_pulse_matrix(float(order), m, _step(m, duration))
+    return _core.block_pulse_matrix(real_number("order", order), m, _step(m, duration))
 
 
 def operational_matrix(order: float, m: int, duration: float) -> NDArray[np.float64]:
-    """Fractional integration matrix of m Haar wavelets over ``duration`` seconds (paper (37)).
+    """Fractional integration matrix of Haar wavelets (paper (37)), by the two-sided fast Haar transform, O(m^2).
 
-    By the two-sided fast Haar transform, O(m^2). ``order`` in [0, 3], m a power of two up to 16 384.
+    Parameters
+    ----------
+    order
+        Order of the integral, in [0, 3].
+    m
+        Number of wavelets, a power of two, at most 16 384.
+    duration
+        Length of the record [s].
+
+    Returns
+    -------
+    numpy.ndarray
+        Matrix of shape (m, m).
 
     Raises
     ------
@@ -225,4 +295,4 @@ def operational_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
         An order, m or duration out of range.
     """
     m = _pulses(m)
-    return _core.operational_matrix(float(order), m, _step(m, duration))
+    return _core.operational_matrix(real_number("order", order), m, _step(m, duration))

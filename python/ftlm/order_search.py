@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 import os
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from ftlm import _core
+from ftlm.checks import real_number, whole_number
 from ftlm.errors import ModelError
-from ftlm.models import MAX_ORDER, Equation, Model, Order, Structure, grid, parse_values
+from ftlm.models import MAX_ORDER, Equation, Model, Order, Structure, Values, grid, parse_values
 from ftlm.records import check_m, default_m, initial_tuple, record
 from ftlm.validation import as_runs
 
@@ -41,12 +42,13 @@ class Lattice:
     alpha
         (low, high) of every highest order.
     orders
-        Other orders by name: a number, (low, high), (low, high, step), ``"low:high:step"`` or values.
+        Other orders by name: a number, a tuple (low, high) or (low, high, step), ``"low:high:step"`` or a list of
+        values; ``alpha`` stands for every highest order and takes the place of the interval above.
     """
 
     step: float = STEP
     alpha: tuple[float, float] = ALPHA
-    orders: Mapping[str, Any] = field(default_factory=dict)
+    orders: Mapping[str, Values] = field(default_factory=dict)
 
     def values(self, structure: Structure) -> dict[str, tuple[float, ...]]:
         """Values of each free order of a structure.
@@ -79,16 +81,14 @@ class Lattice:
                 values[name] = grid(name, 0.0, min(top, MAX_ORDER), self.step)
         return {name: values[name] for name in free}
 
-    def _axis(self, name: str, spec: Any) -> tuple[float, ...]:
-        if not isinstance(spec, (str, int, float)) and len(spec) == 2:
+    def _axis(self, name: str, spec: Values) -> tuple[float, ...]:
+        if isinstance(spec, tuple) and len(spec) == 2:
             spec = (*spec, self.step)
-        if not isinstance(spec, (str, int, float)) and len(spec) == 3 and isinstance(spec, tuple):
-            return grid(name, *spec)
         values = parse_values(name, spec)
         return (values,) if isinstance(values, float) else values
 
 
-def lattice(step: float = STEP, alpha: tuple[float, float] = ALPHA, **orders: Any) -> Lattice:
+def lattice(step: float = STEP, alpha: tuple[float, float] = ALPHA, **orders: Values) -> Lattice:
     """Intervals and step of an order search.
 
     Every own-output order takes all values 0 <= nu < alpha on the step (distinct, unordered within a signal), every
@@ -103,12 +103,19 @@ def lattice(step: float = STEP, alpha: tuple[float, float] = ALPHA, **orders: An
     **orders
         Other orders by name, see :class:`Lattice`.
 
+    Returns
+    -------
+    Lattice
+        Its values follow once it meets a structure.
+
     Raises
     ------
     ModelError
         A step that is not positive, an interval that is empty or out of range.
     """
-    low, high = alpha
+    if not (isinstance(alpha, (tuple, list)) and len(alpha) == 2):
+        raise ModelError(f"alpha = {alpha!r} is no interval; write (low, high), such as {ALPHA}")
+    low, high = (real_number("alpha", a) for a in alpha)
     if not 0 < low <= MAX_ORDER:
         raise ModelError(f"alpha interval {low:g}:{high:g} starts outside (0, 3]; choose a positive order")
     grid("alpha", low, high, step)
@@ -243,9 +250,10 @@ def check_threads(threads: int | None) -> int:
     """
     if threads is None:
         return available_threads()
-    if isinstance(threads, bool) or int(threads) != threads or not 1 <= threads <= 1024:
+    found = whole_number(threads)
+    if found is None or not 1 <= found <= 1024:
         raise ModelError(f"threads = {threads!r} is outside [1, 1024]; leave it out to use all cores")
-    return int(threads)
+    return found
 
 
 @dataclass(frozen=True)
@@ -263,7 +271,7 @@ class Settings:
     early_stopping: bool = True
 
     @classmethod
-    def check(
+    def check(  # noqa: PLR0917 — the order in which they are stored
         cls,
         criterion: str,
         norm: str,
@@ -289,17 +297,18 @@ class Settings:
             ("rows", rows, ("haar", "time")),
         ):
             if value not in known:
-                raise ModelError(f"{name} = {value!r} is not known in this version; use {' or '.join(map(repr, known))}")
-        if isinstance(keep, bool) or int(keep) != keep or not 1 <= keep <= 100_000:
+                raise ModelError(
+                    f"{name} = {value!r} is not known in this version; use {' or '.join(map(repr, known))}"
+                )
+        rows_kept, p = whole_number(keep), whole_number(innovation_length)
+        if rows_kept is None or not 1 <= rows_kept <= 100_000:
             raise ModelError(f"keep = {keep!r} is outside [1, 100000]; keep as many rows as you will read")
-        if isinstance(innovation_length, bool) or int(innovation_length) != innovation_length or innovation_length < 1:
+        if p is None or not 1 <= p < 1 << 62:
             raise ModelError(f"innovation length p = {innovation_length!r} is no whole number from 1; the paper's is 7")
-        if not (math.isfinite(prior_covariance) and prior_covariance > 0):
+        k0 = real_number("prior covariance K0", prior_covariance)
+        if not 0 < k0 < math.inf:
             raise ModelError(f"prior covariance K0 = {prior_covariance!r} is not positive; a large one is a weak prior")
-        return cls(
-            criterion, norm, coefficients, int(innovation_length), float(prior_covariance), rows, int(keep),
-            check_threads(threads), early_stopping,
-        )  # fmt: skip
+        return cls(criterion, norm, coefficients, p, k0, rows, rows_kept, check_threads(threads), early_stopping)
 
     @property
     def needs_haar(self) -> bool:
@@ -322,7 +331,7 @@ class Settings:
 
 
 def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_of_two: bool) -> list[Record]:
-    """Records of runs for an estimator on the equation error.
+    """Make the records of runs for an estimator on the equation error.
 
     Raises
     ------
@@ -421,12 +430,38 @@ def search_orders(
         raise ModelError("every order is a number, so there is nothing to search; name one, as in D^alpha y")
     if len(equation.equations) > 1 and not equation.has_order_law:
         raise ModelError(
-            "the equations share no order law, so they are searched one by one: pass .equation('theta12') or use identify"
+            "the equations share no order law, so they are searched one by one: "
+            f"pass .equation({equation.outputs[0]!r}) or use identify"
         )
+    check_lattice(lattice)
     values = (lattice or Lattice()).values(equation)
     records = prepare(found, equation, m, power_of_two=settings.needs_haar)
     search = _search_law if equation.has_order_law else _search_one
-    return search(found, equation, values, records, settings, progress)
+    return search(_Job(found, equation, values, records, settings, progress))
+
+
+def check_lattice(lattice: Lattice | None) -> None:
+    """Refuse a lattice that is none.
+
+    Raises
+    ------
+    ModelError
+        Something else.
+    """
+    if not (lattice is None or isinstance(lattice, Lattice)):
+        raise ModelError(f"lattice is {type(lattice).__name__}, not a Lattice; use ftlm.lattice(…)")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What a search works on."""
+
+    runs: Sequence[Run]
+    structure: Structure
+    values: Mapping[str, tuple[float, ...]]
+    records: list[Record]
+    settings: Settings
+    progress: Callable[[int, int], None] | None
 
 
 def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float]:
@@ -434,28 +469,20 @@ def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float
     return list(values[order.names[0]]) if order.names else [order.constant]
 
 
-def _search_one(
-    runs: Sequence[Run],
-    structure: Structure,
-    values: Mapping[str, tuple[float, ...]],
-    records: list[Record],
-    settings: Settings,
-    progress: Callable[[int, int], None] | None,
-) -> SearchResult:
-    item = structure.equations[0]
-    signals = records[0].signals
+def _search_one(job: _Job) -> SearchResult:
+    item, values, first = job.structure.equations[0], job.values, job.records[0]
+    signals = first.signals
     axes = [
-        (signals.index(t.signal), axis_of(t.order, values), bool(t.order.names) and t.fixed is None)
-        for t in item.terms
+        (signals.index(t.signal), axis_of(t.order, values), bool(t.order.names) and t.fixed is None) for t in item.terms
     ]
     found = _core.search(
-        [r.core() for r in records],
+        [r.core() for r in job.records],
         (signals.index(item.output), axis_of(item.order, values), axes),
-        list(records[0].inputs),
+        list(first.inputs),
         [t.fixed for t in item.terms],
-        initial_tuple(records[0].initial),
-        settings.core(),
-        progress,
+        initial_tuple(first.initial),
+        job.settings.core(),
+        job.progress,
     )
 
     def named(alpha: float, orders: list[float]) -> dict[str, float]:
@@ -466,19 +493,13 @@ def _search_one(
         SearchRow(rank, index, score, named(alpha, orders), named_coefficients(item, c))
         for rank, (index, score, alpha, orders, c, _) in enumerate(found["rows"], 1)
     ]
-    failures = [(named(alpha, orders), reason) for _, alpha, orders, reason in found["failures"]]
-    return _result(runs, structure, values, table, found["counts"], failures, records, settings)
+    failures = [(named(alpha, orders), str(reason)) for _, alpha, orders, reason in found["failures"]]
+    return _result(job, table, dict(cast("Mapping[str, int]", found["counts"])), failures)
 
 
-def _search_law(
-    runs: Sequence[Run],
-    structure: Structure,
-    values: Mapping[str, tuple[float, ...]],
-    records: list[Record],
-    settings: Settings,
-    progress: Callable[[int, int], None] | None,
-) -> SearchResult:
-    names = list(values)
+def _search_law(job: _Job) -> SearchResult:
+    structure, records, settings = job.structure, job.records, job.settings
+    names = list(job.values)
     signals = records[0].signals
 
     def affine(order: Order) -> tuple[float, list[float]]:
@@ -498,43 +519,34 @@ def _search_law(
     scales = [s * points if settings.norm == "l1" else s for s in spread]
     found = _core.search_stage(
         [r.core() for r in records],
-        [list(values[n]) for n in names],
+        [list(job.values[n]) for n in names],
         laws,
         list(records[0].inputs),
         [[t.fixed for t in e.terms] for e in structure.equations],
         scales,
         initial_tuple(records[0].initial),
         settings.core(),
-        progress,
+        job.progress,
     )
-    if not found["rows"]:
-        raise ModelError(f"none of {found['counts']['candidates']} candidates has a finite score; check the data and the orders")
     table = []
     for rank, (index, score, free, parts) in enumerate(found["rows"], 1):
         coefficients: dict[str, float] = {}
         for item, (_, _, _, c, _) in zip(structure.equations, parts, strict=True):
             coefficients |= named_coefficients(item, c)
         table.append(SearchRow(rank, index, score, dict(zip(names, free, strict=True)), coefficients))
-    return _result(runs, structure, values, table, found["counts"], [], records, settings)
+    return _result(job, table, dict(cast("Mapping[str, int]", found["counts"])), [])
 
 
 def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:
     """Free coefficients by name from the core's products of factor and coefficient."""
-    return {
-        t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)
-    }
+    return {t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)}
 
 
 def _result(
-    runs: Sequence[Run],
-    structure: Structure,
-    values: Mapping[str, tuple[float, ...]],
-    table: list[SearchRow],
-    counts: Mapping[str, int],
-    failures: list[tuple[dict[str, float], str]],
-    records: list[Record],
-    settings: Settings,
+    job: _Job, table: list[SearchRow], counts: Mapping[str, int], failures: list[tuple[dict[str, float], str]]
 ) -> SearchResult:
+    runs, structure, values, settings = job.runs, job.structure, job.values, job.settings
+    m = job.records[0].m
     if not table:
         raise ModelError(f"none of {counts['candidates']} candidates has a finite score; check the data and the orders")
     best = table[0]
@@ -542,7 +554,7 @@ def _result(
         structure.with_orders(best.orders).with_coefficients(best.coefficients),
         orders=best.orders,
         units={n: u for n, u in runs[0].units.items() if n in structure.signals},
-        m=records[0].m,
+        m=m,
         about={"runs": ", ".join(r.name for r in runs), "orders from": "order search", **settings.to_dict()},
     )
     edges = {
@@ -551,9 +563,7 @@ def _result(
     # alpha = 2 is where the physics puts it, not an accident of the interval.
     edges = {n: v for n, v in edges.items() if not (v == 2.0 and n in _highest(structure))}
     pruned = {k: int(v) for k, v in counts.items() if k not in ("candidates", "kept")}
-    return SearchResult(
-        table, model, int(counts["candidates"]), pruned, failures, records[0].m, settings.to_dict(), edges
-    )
+    return SearchResult(table, model, int(counts["candidates"]), pruned, failures, m, settings.to_dict(), edges)
 
 
 def _highest(structure: Structure) -> set[str]:

@@ -40,10 +40,17 @@ START_M = 1024
 START_STEP = 0.2
 #: Prefilters of the start's lattice in units of the frequency below which 90 % of an output's power lies; None: none.
 PREFILTERS = (1.0, 2.0, 4.0, 8.0, None)
-#: Rows of each prefilter's table, and how many of them become starts: those that differ by APART in some order.
+#: Steps of the lattices on which a row is followed downhill, and how often it may move on each.
+ZOOM_STEPS = (0.1, 0.05)
+ZOOM_ROUNDS = 8
+#: Rows of each prefilter's table, and how many of them become starts: the first ones, then those that differ by
+#: APART in some order.
 ROWS_PER_FILTER = 400
-STARTS_PER_FILTER = 5
+FIRST_ROWS = 1
+STARTS_PER_FILTER = 4
 APART = 0.35
+#: Residual that costs 1 in a coarse fit, as a share of an output's size.
+COARSE_SHARE = 0.01
 #: Coarse fits that continue on all samples.
 FINALISTS = 3
 #: Two costs closer than this share are the same optimum.
@@ -321,6 +328,20 @@ def start_axes(problem: FreeProblem) -> dict[str, list[float]]:
     return axes
 
 
+def natural_axes(problem: FreeProblem) -> dict[str, list[float]] | None:
+    """A small lattice beside the whole orders of a flexible link's physics, or None for any other structure."""
+    if not problem.structure.reference:
+        return None
+    usual = {"alpha": [2.0], "gamma": [0.9, 1.0], "beta": [0.0, 0.15], "mu": [0.8, 1.0]}
+    axes = {}
+    for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
+        values = [v for v in usual.get(name.rstrip("0123456789"), []) if low <= v <= high]
+        if not values:
+            return None
+        axes[name] = values
+    return axes
+
+
 def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, threads: int) -> list[Attempt]:
     """Starts from order lattices on prefiltered records, where least squares suffers less from noise.
 
@@ -331,20 +352,56 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, thre
     m = min(START_M, min(run.length for run in runs) - 1)
     frequency = float(np.median([power_frequency(run, o) for run in runs for o in structure.outputs]))
     axes = start_axes(problem)
+    natural = natural_axes(problem)
     attempts: list[Attempt] = []
     for multiple in PREFILTERS:
         records = [prefiltered(record(run, structure, m), multiple and multiple * frequency) for run in runs]
         origin = "no prefilter" if multiple is None else f"prefilter {multiple * frequency:.3g} rad/s"
-        picked: list[list[float]] = []
-        for orders, estimated in lattice_rows(problem, structure, records, axes, threads):
-            values = [orders[n] for n in problem.orders]
-            if any(max((abs(a - b) for a, b in zip(values, p, strict=True)), default=0.0) < APART for p in picked):
-                continue
-            picked.append(values)
-            attempts.append(Attempt(values, problem.free_from(estimated), origin, {}))
-            if len(picked) == STARTS_PER_FILTER:
-                break
+        lattices = [(axes, APART)]
+        if natural is not None:
+            lattices.append((natural, 0.0))
+        for points, apart in lattices:
+            picked: list[list[float]] = []
+            for rank, (orders, estimated) in enumerate(lattice_rows(problem, structure, records, points, threads)):
+                values = [orders[n] for n in problem.orders]
+                far = all(max(abs(a - b) for a, b in zip(values, p, strict=True)) >= apart for p in picked)
+                if picked and rank >= FIRST_ROWS and not far:
+                    continue
+                picked.append(values)
+                zoomed, close = (orders, estimated)
+                if rank == 0:
+                    zoomed, close = zoom(problem, structure, records, orders, estimated, threads)
+                values = [zoomed[n] for n in problem.orders]
+                if any(np.allclose(values, a.orders, atol=1e-9) and a.origin == origin for a in attempts):
+                    continue
+                attempts.append(Attempt(values, problem.free_from(close), origin, {}))
+                if len(picked) >= STARTS_PER_FILTER:
+                    break
     return attempts
+
+
+def zoom(
+    problem: FreeProblem,
+    structure: Structure,
+    records: list[Record],
+    orders: dict[str, float],
+    estimated: dict[str, float],
+    threads: int,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Follow a row downhill on ever finer lattices around it."""
+    bounds = dict(zip(problem.orders, problem.bounds, strict=True))
+    for step in ZOOM_STEPS:
+        for _ in range(ZOOM_ROUNDS):
+            axes = {}
+            for name, value in orders.items():
+                low, high = bounds[name]
+                around = (value - step, value, value + step)
+                axes[name] = sorted({round(min(max(v, low), high), 9) for v in around})
+            rows = lattice_rows(problem, structure, records, axes, threads, keep=1)
+            if not rows or rows[0][0] == orders:
+                break
+            orders, estimated = rows[0]
+    return orders, estimated
 
 
 def prefiltered(rec: Record, frequency: float | None) -> Record:
@@ -366,13 +423,15 @@ def lattice_rows(
     records: list[Record],
     axes: Mapping[str, list[float]],
     threads: int,
+    *,
+    keep: int = ROWS_PER_FILTER,
 ) -> list[tuple[dict[str, float], dict[str, float]]]:
     """Best rows of the coarse lattice: orders by name and freely estimated coefficients by name."""
     signals = records[0].signals
     cores = [r.core() for r in records]
     inputs = list(records[0].inputs)
     initial = initial_tuple(records[0].initial)
-    settings = ("output-error", "l1", 0, 1.0, False, ROWS_PER_FILTER, threads, True)
+    settings = ("output-error", "l1", 0, 1.0, False, keep, threads, True)
 
     def coefficients(item: Any, raw: Sequence[float]) -> dict[str, float]:
         terms = zip(item.terms, raw, strict=True)
@@ -477,9 +536,12 @@ def fit_output_error(
         return [experiment(r, problem, initial, weights, every=every, decimation=thinned) for r in runs]
 
     weights = [1.0 / noise[o] for o in structure.outputs]
+    # Starts are compared with every output weighing alike: noise decides where the optimum is, not how to get near it.
+    sizes = [math.sqrt(float(np.mean([np.var(run[o]) for run in runs]))) for o in structure.outputs]
+    alike = [1.0 / (COARSE_SHARE * size) for size in sizes]
     starts: list[tuple[float, str]] = []
     if start is None:
-        coarse = experiments(weights, thinned=decimation)
+        coarse = experiments(alike, thinned=decimation)
         attempts = start_attempts(runs, problem, initial, threads)
         reached = []
         for done, attempt in enumerate(attempts):
@@ -504,10 +566,12 @@ def fit_output_error(
         raise ConvergenceError(
             f"no start of {', '.join(structure.outputs)} has a finite free run; check the signs of the data and the bounds"
         )
-    full = experiments(weights)
+    near = experiments(alike)
     best = min(
-        (lowest(problem, full, signals, initial, a, evaluations=120) for a in finalists), key=lambda a: a.level
+        (lowest(problem, near, signals, initial, a, evaluations=120) for a in finalists), key=lambda a: a.level
     )
+    full = experiments(weights)
+    best = descend(problem, full, signals, initial, best, evaluations=120)
     every = 1
     for _ in range(4):
         # Weights follow the residuals, pooled over runs.

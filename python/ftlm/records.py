@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ftlm import _core
+from ftlm.checks import whole_number
 from ftlm.errors import DataError, ModelError
 
 if TYPE_CHECKING:
@@ -31,6 +32,8 @@ COULOMB = "coulomb_"
 REST_SIGMAS = 5.0
 #: Samples over which rest is judged.
 REST_SAMPLES = 8
+#: Powers of time set beside the first samples; the first is motion at the start, all others are responses from rest.
+REST_POWERS = (1.0, 0.5, 1.5, 2.0, 3.0)
 
 
 @dataclass(frozen=True)
@@ -90,9 +93,10 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
     ModelError
         Naming the run, what it carries and what to choose.
     """
-    if isinstance(m, bool) or int(m) != m or m < 1:
+    pulses = whole_number(m)
+    if pulses is None or pulses < 1:
         raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
-    m = int(m)
+    m = pulses
     for run in runs:
         carried = run.length - 1
         if m > carried:
@@ -109,13 +113,23 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:
-    """Whether all outputs start at zero within their noise, judged over the first samples."""
+    """Whether all outputs start at zero and do not move yet, judged over the first samples within their noise.
+
+    Inputs act from the first sample on, so an output at rest may leave zero at once; but it leaves on a power of time
+    other than the first, on which only motion at the start does.
+    """
     for name in (s for s in structure.signals if s in run.outputs):
         y = run[name]
         noise = float(np.median(np.abs(np.diff(y, 2)))) / 0.6745 / np.sqrt(6.0) if len(y) > 2 else 0.0
+        visible = REST_SIGMAS * noise + 1e-3 * float(np.std(y))
         head = y[:REST_SAMPLES]
-        if np.max(np.abs(head)) > REST_SIGMAS * noise + 1e-3 * float(np.std(y)):
+        if np.abs(head[0]) > visible:
             return False
+        if np.max(np.abs(head)) > visible:
+            powers = np.arange(len(head), dtype=float)[:, None] ** REST_POWERS
+            misses = head[:, None] - powers * (head @ powers / np.sum(powers**2, axis=0))
+            if np.argmin(np.sum(misses**2, axis=0)) == 0:
+                return False
     return True
 
 

@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ftlm import _core
-from ftlm.errors import ConvergenceError, ModelError
+from ftlm.checks import real_number
+from ftlm.errors import ConvergenceError, DataError, ModelError
+from ftlm.models import Model, check_initial
 from ftlm.records import MAX_M, equation_tuple, initial_tuple, record, sensor_series
 from ftlm.runs import Run
 
@@ -16,7 +18,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ftlm.models import Model
     from ftlm.records import Record
 
     Floats = NDArray[np.float64]
@@ -64,8 +65,8 @@ def respond(model: Model, run: Run, m: int) -> tuple[Record, dict[str, Floats], 
 
     if coupled:
         sensor = None
-        if structure.sensor_filter is not None:
-            series = sensor_series(structure, m, rec.step)
+        series = sensor_series(structure, m, rec.step)
+        if series is not None and structure.sensor_filter is not None:
             sensor = (series, [o in structure.sensor_filter.outputs for o in model.outputs])
         keep(model.outputs, _core.respond_with_initial(rec.core(), equations, inputs, terms, sensor))
     else:
@@ -115,7 +116,15 @@ def simulate(
     ConvergenceError
         An unstable model (with the first index that is not finite), or a response that still moves at ``largest_m``.
     """
-    if not tolerance > 0:
+    if not isinstance(model, Model):
+        raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")
+    if not isinstance(run, Run):
+        raise DataError(f"run is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
+    for name, terms in (initial or {}).items():
+        if name not in model.outputs:
+            raise ModelError(f"initial terms of {name!r}, which is no output of the model: {', '.join(model.outputs)}")
+        check_initial(terms)
+    if not real_number("tolerance", tolerance) > 0:
         raise ModelError(f"tolerance = {tolerance} is not positive; the default is 1e-6")
     own = run.length - 1
     largest_m = min(largest_m, MAX_M)
@@ -142,10 +151,16 @@ def simulate(
         step=run.step,
         inputs={n: run[n] for n in run.inputs},
         outputs={n: best[i] for i, n in enumerate(model.outputs)},
-        units={n: u for n, u in {**model.units, **run.units}.items() if u and (n in run.inputs or n in model.outputs)},
+        units={n: u for n, u in _units(model, run).items() if u},
         intersample=run.intersample,
         name=f"{run.name}, simulated",
     )
+
+
+def _units(model: Model, run: Run) -> dict[str, str]:
+    """Units of inputs and simulated outputs; where the run or the model does not say, the other may."""
+    inputs = {n: run.units[n] or model.units.get(n, "") for n in run.inputs}
+    return inputs | {n: model.units.get(n, "") or run.units.get(n, "") for n in model.outputs}
 
 
 def _samples(model: Model, run: Run, m: int, initial: Mapping[str, Mapping[float, float]] | None) -> Floats:
@@ -155,6 +170,13 @@ def _samples(model: Model, run: Run, m: int, initial: Mapping[str, Mapping[float
     given = {s: run[s] for s in run.signals}
     # A signal that is simulated need not be there; the core never reads it.
     missing = [o for o in model.outputs if o not in given]
+    read = {s: e.output for e in model.equations for s in e.signals if s != e.output}
+    lacking = next((o for o in missing if o in read), None)
+    if lacking is not None and not coupled:
+        raise DataError(
+            f"run {run.name!r} has no signal {lacking!r}, which the equation of {read[lacking]} reads as measured; "
+            "give it, or use coupling='simulated'"
+        )
     if missing:
         run = Run.from_arrays(
             step=run.step,
@@ -169,8 +191,8 @@ def _samples(model: Model, run: Run, m: int, initial: Mapping[str, Mapping[float
     inputs = list(rec.inputs)
     if coupled:
         means = _core.respond(rec.core(), equations, inputs, terms)
-        if structure.sensor_filter is not None:
-            series = sensor_series(structure, m, rec.step)
+        series = sensor_series(structure, m, rec.step)
+        if series is not None and structure.sensor_filter is not None:
             for i, name in enumerate(model.outputs):
                 if name in structure.sensor_filter.outputs and np.all(np.isfinite(means[i])):
                     means[i] = _core.series_multiply(series, means[i], m)

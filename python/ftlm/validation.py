@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ftlm import _core
-from ftlm.errors import DataError
+from ftlm.errors import DataError, ModelError
+from ftlm.models import Model
+from ftlm.operators import as_floats
 from ftlm.records import check_m, default_m, equation_tuple, initial_tuple, record
 from ftlm.runs import Run, check_compatible
 from ftlm.simulation import respond
@@ -16,9 +18,9 @@ from ftlm.simulation import respond
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
-    from ftlm.models import Model, Structure
+    from ftlm.models import Structure
 
     Floats = NDArray[np.float64]
 
@@ -59,7 +61,7 @@ class Metrics:
         return {name: value if np.isfinite(value) else None for name, value in items.items()}
 
 
-def metrics(measured: Floats, predicted: Floats) -> Metrics:
+def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
     """Error (45), RMSE (46), NR (47) and fit of a prediction.
 
     Parameters
@@ -67,16 +69,22 @@ def metrics(measured: Floats, predicted: Floats) -> Metrics:
     measured, predicted
         Arrays of shape (M,) in the same unit.
 
+    Returns
+    -------
+    Metrics
+        Not finite where the prediction is not; NR and fit of a constant measurement mean nothing.
+
     Raises
     ------
     DataError
-        Different lengths, or measured values that are not finite.
+        Not one-dimensional, empty or of different lengths; measured values that are not finite real numbers.
     """
-    y = np.ascontiguousarray(measured, dtype=np.float64)
-    e = np.ascontiguousarray(y - np.asarray(predicted, dtype=np.float64)) if np.shape(predicted) == y.shape else None
-    if e is None:
-        raise DataError(f"predicted has shape {np.shape(predicted)}, measured {y.shape}; give equal lengths")
-    return Metrics(*_core.metrics(y, e))
+    y, prediction = as_floats("measured", measured), as_floats("predicted", predicted)
+    if y.ndim != 1 or y.size == 0 or prediction.shape != y.shape:
+        raise DataError(
+            f"measured has shape {y.shape}, predicted {prediction.shape}; give two vectors of one length, at least 1"
+        )
+    return Metrics(*_core.metrics(y, y - prediction))
 
 
 def _pooled(measured: list[Floats], residuals: list[Floats]) -> Metrics:
@@ -161,7 +169,10 @@ def as_runs(runs: Run | Sequence[Run]) -> list[Run]:
     DataError
         No run, something that is no run, or runs whose names or units differ.
     """
-    found = [runs] if isinstance(runs, Run) else list(runs)
+    try:
+        found = [runs] if isinstance(runs, Run) else list(runs)
+    except TypeError:
+        raise DataError(f"runs is {type(runs).__name__}; give a Run or a list of them") from None
     if not found:
         raise DataError("no run is given; give at least one")
     for i, run in enumerate(found):
@@ -195,6 +206,8 @@ def compare(model: Model, runs: Run | Sequence[Run], *, m: int | None = None) ->
     ModelError
         An m that the runs do not carry.
     """
+    if not isinstance(model, Model):
+        raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")
     found = as_runs(runs)
     carried = min(run.length for run in found) - 1
     chosen = min(model.m or default_m(found, power_of_two=False), carried) if m is None else m

@@ -201,7 +201,8 @@ impl FreeModel {
                 let eta = structure.order - term.order;
                 let least = if term.signal == structure.output { LEAST_INTEGRATION } else { 0.0 };
                 if eta < least {
-                    // Reported like a step too far, so that the search shortens it.
+                    // Reported like a step too far, so that the search shortens it. An order a little below 0 is let
+                    // pass: under an order law the truth may lie on that edge, and estimates scatter to both sides.
                     return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
                 }
                 let c = self.equations[i].terms[k].2.at(coefficients);

@@ -52,7 +52,8 @@ pub fn equations(arguments: Vec<EquationArg>, signals: usize, inputs: &[bool]) -
     arguments
         .into_iter()
         .map(|(s, coefficients)| {
-            let structure = structure(s, signals, inputs)?;
+            // A model that was estimated under an order law may have an order a little below 0; it is simulated as it is.
+            let structure = structure(s, signals, &vec![true; inputs.len()])?;
             if coefficients.len() != structure.terms.len() {
                 let (expected, found) = (structure.terms.len(), coefficients.len());
                 return Err(Error::Length { name: "coefficients".into(), expected, found }.into());

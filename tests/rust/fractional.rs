@@ -241,7 +241,7 @@ fn caputo_and_riemann_liouville_derivatives_converge() {
             // The errors of the differences (second order) and of the formula have signs of their own and nearly cancel
             // on some grids: the mean order over three doublings is judged, and more than expected is no fault.
             let mean = orders(&found).iter().sum::<f64>() / 3.0;
-            check_between(&format!("order of {name}"), mean, expected - 0.15, 3.0);
+            check_between(&format!("order of {name}"), mean, expected - 0.25, 3.0);
             let size = exact.values.iter().fold(1.0, |a, v| f64::max(a, v.1.abs()));
             check(&format!("error of {name}"), found[3] / size, 2e-3);
         }

@@ -6,9 +6,14 @@
 mod common;
 
 mod equation;
+mod estimators;
 mod fractional;
 mod haar;
 mod kernels;
 mod means;
 mod metrics;
+mod plants;
+mod search;
 mod series;
+mod simulate;
+mod stage;

@@ -1,0 +1,101 @@
+"""Fixtures that several test files share: reference files, the synthetic plants with their records, seeded noise."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ftlm
+
+ROOT = Path(__file__).resolve().parents[2]
+REFERENCE = ROOT / "tests" / "reference"
+
+
+@pytest.fixture(scope="session")
+def root():
+    """Folder of the repository."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def reference():
+    """Reader of the generated reference files."""
+    return lambda name: json.loads((REFERENCE / f"{name}.json").read_text(encoding="utf-8"))
+
+
+@pytest.fixture(scope="session")
+def plants(reference):
+    """Plants A and A2 as the reference file describes them."""
+    return reference("plants")["plants"]
+
+
+@pytest.fixture(scope="session")
+def plant(plants):
+    """Maker of a plant's true model: ``plant("A", coupling="measured")``."""
+
+    def make(name, **options):
+        described = plants[name]
+        coefficients = {t["name"]: t["coefficient"] for e in described["equations"] for t in e["terms"]}
+        return ftlm.link_model(
+            stage=described["stage"], orders=described["free_orders"], coefficients=coefficients, **options
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def drive(plants):
+    """Maker of a plant's input as a run whose outputs are still zero: 5 000 held samples unless told otherwise."""
+
+    def make(name, samples=None):
+        described = plants[name]["input"]
+        step, n = described["sample_step"], samples or described["samples"]
+        period = round(described["period"] / step)
+        current = described["amplitude"] * np.where(np.arange(n) % period < period // 2, 1.0, -1.0)
+        stage, zero = plants[name]["stage"], np.zeros(n)
+        outputs = {f"theta{stage}1": zero, f"theta{stage}2": zero}
+        units = {described["signal"]: "A", f"theta{stage}1": "rad", f"theta{stage}2": "rad"}
+        return ftlm.Run.from_arrays(
+            step=step, inputs={described["signal"]: current}, outputs=outputs, units=units, name=f"plant {name}"
+        )
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def clean_a(plant, drive):
+    """Plant A's 5 000 point samples without noise, converged to 1e-8."""
+    return plant("A").simulate(drive("A"), tolerance=1e-8)
+
+
+@pytest.fixture(scope="session")
+def with_noise():
+    """Adder of seeded white noise to every output: ``with_noise(run, sigma, seed)``."""
+
+    def add(run, sigma, seed):
+        rng = np.random.default_rng(seed)
+        return ftlm.Run.from_arrays(
+            step=run.step,
+            inputs={name: run[name] for name in run.inputs},
+            outputs={name: run[name] + sigma * rng.standard_normal(run.length) for name in run.outputs},
+            units={name: unit for name, unit in run.units.items() if unit},
+            name=f"{run.name}, noise {sigma:g}, seed {seed}",
+        )
+
+    return add
+
+
+@pytest.fixture(scope="session")
+def small_model():
+    """One stable equation of two own terms and one input."""
+    return ftlm.Model(ftlm.equation("D^1.6 y = -3 D^0.6 y - 8 y + 5 u"), units={"y": "rad", "u": "A"}, m=256)
+
+
+@pytest.fixture(scope="session")
+def small_run(small_model):
+    """513 noise-free samples of the small model under a square input of uneven length."""
+    n = 513
+    u = np.where(np.arange(n) % 160 < 90, 1.0, -0.6)
+    empty = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": np.zeros(n)}, name="small")
+    return small_model.simulate(empty, tolerance=1e-9)
