@@ -1,1 +1,161 @@
-fn main() {}
+//! Times of the kernels: series algebra, Haar transforms, operational matrices, and candidates of an order search.
+
+use std::hint::black_box;
+use std::time::Duration;
+
+use criterion::{criterion_group, criterion_main, BatchSize, BenchmarkId, Criterion, Throughput};
+use ftlm::equation::{Equation, Initial, Structure, Term};
+use ftlm::fractional::{block_pulse_kernel, kernel_with_derivative};
+use ftlm::regressors::Record;
+use ftlm::search::lattice::{Lattice, TermAxis};
+use ftlm::search::run::{search, Control, Criterion as Criterium, Estimator, Norm, Options};
+use ftlm::series::{self, Buffers, Kernel};
+use ftlm::{haar, operational, simulate};
+
+/// 2048 pulses is a record of the paper; the longer ones show the growth.
+const LENGTHS: [usize; 3] = [1 << 11, 1 << 14, 1 << 17];
+
+/// Numbers in [−1, 1) without a pattern, the same in every run.
+fn noise(m: usize, mut state: u64) -> Vec<f64> {
+    (0..m)
+        .map(|_| {
+            // Knuth's MMIX generator; its upper bits are good enough for test data.
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1u64 << 52) as f64 - 1.0
+        })
+        .collect()
+}
+
+/// Divisor of a damped oscillation, D^1.8 y + 5 D^0.9 y + 100 y, over a record of ten seconds.
+fn divisor(m: usize) -> Vec<f64> {
+    let step = 10.0 / m as f64;
+    let mut d = vec![0.0; m];
+    d[0] = 1.0;
+    for (c, eta) in [(5.0, 0.9), (100.0, 1.8)] {
+        d.iter_mut().zip(block_pulse_kernel(eta, m, step)).for_each(|(d, v)| *d += c * v);
+    }
+    d
+}
+
+fn series_algebra(c: &mut Criterion) {
+    let mut group = c.benchmark_group("series");
+    for m in LENGTHS {
+        group.throughput(Throughput::Elements(m as u64));
+        group.bench_with_input(BenchmarkId::new("kernel", m), &m, |b, &m| {
+            b.iter(|| block_pulse_kernel(black_box(0.85), m, 1e-3));
+        });
+        group.bench_with_input(BenchmarkId::new("kernel with derivative", m), &m, |b, &m| {
+            b.iter(|| kernel_with_derivative(black_box(0.85), m, 1e-3));
+        });
+        let signal = noise(m, 1);
+        let kernel = Kernel::new(&block_pulse_kernel(0.85, m, 1e-3));
+        let (mut out, mut buffers) = (vec![0.0; m], Buffers::default());
+        group.bench_with_input(BenchmarkId::new("apply", m), &m, |b, _| {
+            b.iter(|| kernel.apply(black_box(&signal), &mut out, &mut buffers));
+        });
+        let d = divisor(m);
+        group.bench_with_input(BenchmarkId::new("divide", m), &m, |b, _| {
+            b.iter(|| series::divide(black_box(&signal), &d));
+        });
+    }
+    // The oracle, where it can be waited for.
+    let (signal, d) = (noise(1 << 11, 2), divisor(1 << 11));
+    group.throughput(Throughput::Elements(1 << 11));
+    group.bench_function(BenchmarkId::new("divide naively", 1 << 11), |b| {
+        b.iter(|| series::divide_naive(black_box(&signal), &d));
+    });
+    group.finish();
+}
+
+fn haar_transform(c: &mut Criterion) {
+    let mut group = c.benchmark_group("haar");
+    for m in LENGTHS {
+        let signal = noise(m, 3);
+        group.throughput(Throughput::Elements(m as u64));
+        group.bench_with_input(BenchmarkId::new("transform", m), &m, |b, _| {
+            b.iter_batched_ref(|| signal.clone(), |x| haar::transform(x), BatchSize::LargeInput);
+        });
+    }
+    group.finish();
+}
+
+fn operational_matrices(c: &mut Criterion) {
+    let mut group = c.benchmark_group("operational matrix of 2048");
+    group.sample_size(10);
+    group.bench_function("fast", |b| b.iter(|| operational::operational_matrix(black_box(0.85), 2048, 1e-3)));
+    group.bench_function("dense", |b| b.iter(|| operational::operational_matrix_dense(black_box(0.85), 2048, 1e-3)));
+    group.finish();
+}
+
+/// P1: a deflection equation with two free orders of its own, one of the hub angle, and the current, on 2048 pulses of
+/// a synthetic stage with noise of 1e−4 rad.
+fn first_problem() -> (Record, Lattice) {
+    let m = 2048;
+    let step = 10.0 / m as f64;
+    let signals = |output: usize, terms: &[(usize, f64, f64)]| Equation {
+        structure: Structure {
+            output,
+            order: 2.0,
+            terms: terms.iter().map(|&(signal, order, _)| Term { signal, order }).collect(),
+        },
+        coefficients: terms.iter().map(|t| t.2).collect(),
+    };
+    let stage = [
+        signals(0, &[(1, 0.0, 628.89), (0, 0.95, -62.956), (1, 0.75, 6.63), (2, 0.0, 140.47)]),
+        signals(1, &[(1, 0.1, -863.247), (0, 1.05, 62.956), (1, 0.85, -9.1007), (2, 0.0, -140.47)]),
+    ];
+    let current: Vec<f64> = (0..m).map(|k| if (k as f64 + 0.5) * step % 2.0 < 1.0 { 0.3 } else { -0.3 }).collect();
+    let make = |signals| Record::new(step, signals, None);
+    let Ok(driven) = make(vec![vec![0.0; m], vec![0.0; m], current.clone()]) else { unreachable!() };
+    let Ok(mut angles) = simulate::respond(&stage, &driven, &[]) else { unreachable!() };
+    for (angle, seed) in angles.iter_mut().zip(4..) {
+        // Uniform noise of this deviation.
+        angle.iter_mut().zip(noise(m, seed)).for_each(|(y, e)| *y += 1e-4 * 3.0_f64.sqrt() * e);
+    }
+    angles.push(current);
+    let Ok(record) = make(angles) else { unreachable!() };
+    let all: Vec<f64> = (0..=40).map(|i| 0.05 * f64::from(i)).collect();
+    let axis =
+        |signal: usize, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: signal == 1 };
+    let axes = [axis(1, &all), axis(1, &all), axis(0, &all), axis(2, &[0.0])];
+    let alphas: Vec<f64> = (21..=40).map(|i| 0.05 * f64::from(i)).collect();
+    let Ok(lattice) = Lattice::new(1, &alphas, &axes, |s| s == 2) else { unreachable!() };
+    (record, lattice)
+}
+
+fn order_search(c: &mut Criterion) {
+    let (record, lattice) = first_problem();
+    let mut group = c.benchmark_group("order search P1");
+    group.sample_size(10).measurement_time(Duration::from_secs(8)).warm_up_time(Duration::from_millis(500));
+    group.throughput(Throughput::Elements(lattice.count()));
+    let records = [record];
+    for (name, criterion) in [("output error", Criterium::OutputError), ("equation error", Criterium::EquationError)] {
+        let options = Options {
+            criterion,
+            norm: Norm::L1,
+            estimator: Estimator::LeastSquares,
+            initial: Initial::Rest,
+            keep: 20,
+            threads: 1,
+            early_stopping: true,
+        };
+        group.bench_function(name, |b| {
+            b.iter(|| search(&records, &lattice, &[None; 4], &options, &Control::default()));
+        });
+    }
+    group.finish();
+}
+
+fn quick() -> Criterion {
+    Criterion::default()
+        .sample_size(20)
+        .warm_up_time(Duration::from_millis(300))
+        .measurement_time(Duration::from_secs(1))
+}
+
+criterion_group! {
+    name = kernels;
+    config = quick();
+    targets = series_algebra, haar_transform, operational_matrices, order_search
+}
+criterion_main!(kernels);

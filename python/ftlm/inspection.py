@@ -7,18 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ftlm.records import REST_SAMPLES, REST_SIGMAS
+from ftlm.records import is_rest, noise_of
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from ftlm.runs import Run
 
 __all__ = ["Inspection", "SignalFigures", "inspect_run"]
-
-#: Median absolute deviation of a normal variable in units of its standard deviation.
-MAD = 0.6744897501960817
-
 
 @dataclass(frozen=True)
 class SignalFigures:
@@ -118,11 +112,6 @@ def inspect_run(run: Run) -> Inspection:
     return Inspection(run.name, run.length, run.step, run.duration, signals, list(dict.fromkeys(warnings)))
 
 
-def noise_of(samples: NDArray[np.float64]) -> float:
-    """Standard deviation of white noise on a smooth signal, from the median of its second differences."""
-    return float(np.median(np.abs(np.diff(samples, 2)))) / MAD / float(np.sqrt(6.0)) if samples.size > 2 else 0.0
-
-
 def _figures(run: Run, name: str) -> SignalFigures:
     x = run[name]
     low, high, noise = float(x.min()), float(x.max()), noise_of(x)
@@ -142,5 +131,5 @@ def _figures(run: Run, name: str) -> SignalFigures:
         quantum=float(changes.min()) if changes.size else 0.0,
         at_extremes=float(np.mean((x == low) | (x == high))),
         constant=low == high,
-        at_rest=bool(np.max(np.abs(x[:REST_SAMPLES])) <= REST_SIGMAS * noise + 1e-3 * deviation),
+        at_rest=is_rest(x),
     )

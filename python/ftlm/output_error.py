@@ -16,7 +16,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.models import MAX_ORDER, Order, Structure
-from ftlm.records import initial_tuple, record, sensor_series
+from ftlm.records import initial_tuple, noise_of, record, sensor_series
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -606,8 +606,6 @@ def fit_output_error(
 
 def first_noise(runs: Sequence[Run], structure: Structure) -> dict[str, float]:
     """A first guess of the noise of each output, from second differences, but not below a share of its size."""
-    from ftlm.inspection import noise_of  # noqa: PLC0415 — inspection reads records
-
     out = {}
     for name in structure.outputs:
         size = float(np.sqrt(np.mean([np.var(run[name]) for run in runs])))

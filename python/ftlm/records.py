@@ -30,8 +30,10 @@ MAX_M = 1 << 24
 COULOMB = "coulomb_"
 #: A first value beyond this many noise standard deviations is not rest.
 REST_SIGMAS = 5.0
-#: Samples over which rest is judged.
-REST_SAMPLES = 8
+#: ... nor one beyond this share of the signal's deviation, where there is no noise.
+REST_SHARE = 1e-3
+#: Median absolute deviation of a normal variable in units of its standard deviation.
+MAD = 0.6744897501960817
 #: Powers of time set beside the first samples; the first is motion at the start, all others are responses from rest.
 REST_POWERS = (1.0, 0.5, 1.5, 2.0, 3.0)
 
@@ -112,25 +114,23 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
     return m
 
 
-def starts_at_rest(run: Run, structure: Structure) -> bool:
-    """Whether all outputs start at zero and do not move yet, judged over the first samples within their noise.
+def is_rest(samples: Floats) -> bool:
+    """Whether a signal starts at zero within its noise.
 
-    Inputs act from the first sample on, so an output at rest may leave zero at once; but it leaves on a power of time
-    other than the first, on which only motion at the start does.
+    Only the first sample is judged: a machine at rest may answer within a few samples.
     """
-    for name in (s for s in structure.signals if s in run.outputs):
-        y = run[name]
-        noise = float(np.median(np.abs(np.diff(y, 2)))) / 0.6745 / np.sqrt(6.0) if len(y) > 2 else 0.0
-        visible = REST_SIGMAS * noise + 1e-3 * float(np.std(y))
-        head = y[:REST_SAMPLES]
-        if np.abs(head[0]) > visible:
-            return False
-        if np.max(np.abs(head)) > visible:
-            powers = np.arange(len(head), dtype=float)[:, None] ** REST_POWERS
-            misses = head[:, None] - powers * (head @ powers / np.sum(powers**2, axis=0))
-            if np.argmin(np.sum(misses**2, axis=0)) == 0:
-                return False
-    return True
+    noise = noise_of(samples)
+    return bool(abs(samples[0]) <= REST_SIGMAS * noise + REST_SHARE * float(np.std(samples)))
+
+
+def noise_of(samples: Floats) -> float:
+    """Standard deviation of white noise on a smooth signal, from the median of its second differences."""
+    return float(np.median(np.abs(np.diff(samples, 2)))) / MAD / float(np.sqrt(6.0)) if samples.size > 2 else 0.0
+
+
+def starts_at_rest(run: Run, structure: Structure) -> bool:
+    """Whether all outputs of a structure start at zero within their noise."""
+    return all(is_rest(run[name]) for name in structure.signals if name in run.outputs)
 
 
 def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> Record:

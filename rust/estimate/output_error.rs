@@ -133,6 +133,9 @@ pub struct Fit {
     pub status: Status,
 }
 
+/// Coefficient of a term, kernel of its integral, and the kernel's derivative with respect to the order.
+type Operator = (f64, Vec<f64>, Vec<f64>);
+
 struct Evaluation {
     cost: f64,
     residuals: Vec<f64>,
@@ -193,7 +196,7 @@ impl FreeModel {
         };
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
-        let mut kernels: Vec<Vec<(f64, Vec<f64>, Vec<f64>)>> = Vec::with_capacity(n);
+        let mut kernels: Vec<Vec<Operator>> = Vec::with_capacity(n);
         for (i, structure) in structures.iter().enumerate() {
             matrix[i][i][0] += 1.0;
             let mut row = Vec::with_capacity(structure.terms.len());

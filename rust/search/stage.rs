@@ -344,6 +344,8 @@ fn unresolved(
                     for (e, &(id, entry)) in found.iter().enumerate().filter(|(_, (_, entry))| !entry.exact) {
                         // Without a full table any tuple may enter: follow this one a few times further than before.
                         let limit = if worst.is_finite() { worst - (bound - entry.value) } else { raise * entry.value };
+                        // Where rounding leaves no room between bound and worst, only its end tells more.
+                        let limit = if limit > entry.value { limit } else { f64::INFINITY };
                         let old = wanted[e].entry(id).or_insert(limit);
                         *old = old.max(limit);
                     }

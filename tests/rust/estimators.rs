@@ -264,10 +264,12 @@ fn the_recursion_ends_at_the_closed_form() {
     let one = [obeying(&model, 512, 0.01, &[], 0.02, 57)];
     let two = [obeying(&model, 256, 0.01, &[], 0.02, 58), obeying(&model, 128, 0.02, &[], 0.02, 59)];
     let fixed = [None, None, Some(4.0), None];
-    let cases: [(&[Record], &[Option<f64>], Initial); 3] =
-        [(&one, &FREE, Initial::Rest), (&two, &FREE, Initial::Powers(vec![0.0, 1.0])), (&two, &fixed, Initial::Rest)];
     let mut worst = 0.0_f64;
-    for (records, fixed, initial) in cases {
+    for (records, fixed, initial) in [
+        (&one[..], &FREE, Initial::Rest),
+        (&two[..], &FREE, Initial::Powers(vec![0.0, 1.0])),
+        (&two[..], &fixed, Initial::Rest),
+    ] {
         for rows in [Rows::Haar, Rows::Time] {
             for length in [1, 3, 5, 7] {
                 for prior_covariance in [1.0, 100.0] {

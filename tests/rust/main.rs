@@ -12,6 +12,7 @@ mod haar;
 mod kernels;
 mod means;
 mod metrics;
+mod output_error;
 mod plants;
 mod search;
 mod series;

@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 
 use ftlm::equation::{Equation, Initial, Structure};
 use ftlm::error::{Error, Kind};
-use ftlm::estimate::least_squares;
+use ftlm::estimate::least_squares::{self, Estimate};
 use ftlm::estimate::multi_innovation::{closed_form, Innovation, Rows};
 use ftlm::regressors::Record;
 use ftlm::search::lattice::{Lattice, TermAxis, MAX_CANDIDATES};
@@ -251,7 +251,7 @@ fn random_problem(seed: u64) -> Problem {
 }
 
 /// What a candidate comes to by the plain way: a QR fit on all records, then a run or the residuals of each.
-fn naive(problem: &Problem, structure: &Structure) -> Result<(f64, Vec<f64>, Vec<Vec<f64>>), Failure> {
+fn naive(problem: &Problem, structure: &Structure) -> Result<(f64, Estimate), Failure> {
     let Problem { records, fixed, options, .. } = problem;
     let estimate = match &options.estimator {
         Estimator::LeastSquares => least_squares::fit(records, structure, fixed, &options.initial),
@@ -282,7 +282,7 @@ fn naive(problem: &Problem, structure: &Structure) -> Result<(f64, Vec<f64>, Vec
         return Err(Failure::Diverged);
     }
     let score = if options.norm == Norm::L1 { sum } else { (sum / samples as f64).sqrt() };
-    Ok((score, estimate.coefficients, estimate.initial))
+    Ok((score, estimate))
 }
 
 #[test]
@@ -340,11 +340,12 @@ fn every_candidate_matches_its_naive_evaluation() {
                         Failure::Diverged => diverged += 1,
                     }
                 }
-                Ok((score, coefficients, initial)) => {
+                Ok((score, estimate)) => {
                     let row = row.unwrap();
                     worst = worst.max((row.score / score - 1.0).abs());
-                    worst_coefficient = worst_coefficient.max(relative_distance(&row.coefficients, &coefficients));
-                    assert_eq!(row.initial.len(), initial.len());
+                    worst_coefficient =
+                        worst_coefficient.max(relative_distance(&row.coefficients, &estimate.coefficients));
+                    assert_eq!(row.initial.len(), estimate.initial.len());
                     compared += 1;
                 }
             }

@@ -178,9 +178,9 @@ fn refitted_initial_terms_leave_no_error() {
     for m in [300, 1000] {
         let record = closed(&model, &driven(m, 0.01, 76), &initial);
         let found = respond_with_initial(&model, &record, &Initial::Caputo, None).unwrap();
-        for i in 0..2 {
+        for (i, equation) in model.iter().enumerate() {
             check("refitted response", relative_distance(&found.outputs[i], record.signal(i)), 1e-8);
-            assert_eq!(found.exponents[i], model[i].structure.initial_exponents(&Initial::Caputo));
+            assert_eq!(found.exponents[i], equation.structure.initial_exponents(&Initial::Caputo));
             assert_eq!(found.initial[i].len(), found.exponents[i].len());
         }
         // At rest the same record is far from explained.

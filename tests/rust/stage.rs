@@ -278,7 +278,7 @@ fn early_stopping_and_threads_change_nothing() {
         stopped += one.counts.stopped;
     }
     println!("{stopped} tuples left early");
-    assert!(stopped > 1000);
+    assert!(stopped > 500);
 }
 
 #[test]
@@ -309,14 +309,14 @@ fn equations_of_very_different_weight_are_joined() {
 fn singular_and_diverged_tuples_are_counted() {
     let lattice = LawLattice::new(&axes(), &two_link(), &INPUTS).unwrap();
     let tuples = (0..lattice.product()).filter(|&i| lattice.structures(i).is_some()).count() as u64;
-    let base = data(300, 0.01, 72);
+    let base = data(2000, 0.01, 72);
     // A current that never flows.
-    let silent = with_signal(&base, 2, vec![0.0; 300]);
+    let silent = with_signal(&base, 2, vec![0.0; 2000]);
     let found = search(&[silent], &lattice, &free(), &[1.0; 2], &options(), &Control::default()).unwrap();
     assert_eq!((found.counts.singular, found.counts.candidates, found.rows.len()), (tuples, tuples, 0));
-    // A known coefficient with which every run explodes.
+    // Known coefficients with which every run explodes.
     let mut fixed = free();
-    fixed[1][0] = Some(2e4);
+    (fixed[1][0], fixed[1][2]) = (Some(2e3), Some(0.0));
     let found = search(&[base], &lattice, &fixed, &[1.0; 2], &options(), &Control::default()).unwrap();
     assert_eq!((found.counts.diverged, found.counts.candidates, found.rows.len()), (tuples, tuples, 0));
 }

@@ -1,0 +1,303 @@
+//! Joint output error: its Jacobian against differences, recovery of known models, statistics of its estimates.
+
+use ftlm::equation::{AffineOrder, Initial};
+use ftlm::error::Error;
+use ftlm::estimate::output_error::{
+    fit, Coordinate, Experiment, Fit, FreeEquation, FreeModel, Monomial, Settings, Status,
+};
+use ftlm::means::point_samples;
+use ftlm::regressors::Record;
+use ftlm::{series, simulate};
+
+use crate::common::{
+    check, check_between, dense_solve, deviation, equation, norm, record, relative_distance, with_signal, Random,
+};
+
+/// Free orders γ₁, β₂, μ₂ of the two-link law with both α at 2, then the coefficients a, b, d, g, r.
+const ORDERS: [f64; 3] = [0.95, 0.1, 0.85];
+const COEFFICIENTS: [f64; 5] = [60.0, -6.0, 1.5, 14.0, 1.4];
+
+fn law(constant: f64, weights: [f64; 3]) -> AffineOrder {
+    AffineOrder { constant, weights: weights.to_vec() }
+}
+
+fn monomial(factor: f64, coefficients: &[usize]) -> Monomial {
+    Monomial { factor, powers: coefficients.iter().map(|&i| (i, 1)).collect() }
+}
+
+fn two_link(coupled: bool, initial: Initial) -> FreeModel {
+    let (a, b, d, g, r) = (0, 1, 2, 3, 4);
+    let hub = vec![
+        (1, law(0.0, [-1.0, 1.0, 1.0]), monomial(1.0, &[a])),
+        (0, law(0.0, [1.0, 0.0, 0.0]), monomial(1.0, &[b])),
+        (1, law(0.0, [-1.0, 0.0, 2.0]), monomial(1.0, &[d])),
+        (2, law(0.0, [0.0; 3]), monomial(1.0, &[g])),
+    ];
+    let deflection = vec![
+        (1, law(0.0, [0.0, 1.0, 0.0]), monomial(-1.0, &[a, r])),
+        (0, law(0.0, [2.0, 0.0, -1.0]), monomial(-1.0, &[b])),
+        (1, law(0.0, [0.0, 0.0, 1.0]), monomial(-1.0, &[d, r])),
+        (2, law(0.0, [0.0; 3]), monomial(-1.0, &[g])),
+    ];
+    let order = law(2.0, [0.0; 3]);
+    FreeModel {
+        equations: vec![
+            FreeEquation { output: 0, order: order.clone(), terms: hub },
+            FreeEquation { output: 1, order, terms: deflection },
+        ],
+        order_bounds: vec![(0.5, 1.2), (0.0, 0.6), (0.5, 1.2)],
+        coordinates: vec![
+            Coordinate::Logarithm,
+            Coordinate::Logarithm,
+            Coordinate::Plain,
+            Coordinate::Logarithm,
+            Coordinate::ExcessLogarithm,
+        ],
+        coupled,
+        initial,
+    }
+}
+
+/// The same model with its numbers, as an equation of `simulate` has them.
+fn truth() -> [ftlm::equation::Equation; 2] {
+    let [a, b, d, g, r] = COEFFICIENTS;
+    [
+        equation(0, 2.0, &[(1, 0.0, a), (0, 0.95, b), (1, 0.75, d), (2, 0.0, g)]),
+        equation(1, 2.0, &[(1, 0.1, -a * r), (0, 1.05, -b), (1, 0.85, -d * r), (2, 0.0, -g)]),
+    ]
+}
+
+/// A run of the truth, `every` pulses a sample, with white noise of this fraction of each output's deviation.
+fn run(intervals: usize, every: usize, initial: &[Vec<(f64, f64)>], noise: f64, seed: u64) -> Experiment {
+    let mut random = Random::new(seed);
+    let m = intervals * every;
+    let step = 0.02 / every as f64;
+    let mut record = record(step, vec![vec![0.0; m], vec![0.0; m], random.steps(m, 40 * every)]);
+    let outputs = simulate::respond(&truth(), &record, initial).unwrap();
+    let mut samples = Vec::new();
+    let mut weights = Vec::new();
+    for (i, means) in outputs.into_iter().enumerate() {
+        let clean: Vec<f64> = point_samples(&means).into_iter().step_by(every).collect();
+        let sigma = noise * deviation(&clean);
+        weights.push(if noise > 0.0 { 1.0 / sigma } else { 1.0 / deviation(&clean) });
+        samples.push(clean.iter().map(|y| y + sigma * random.normal()).collect());
+        record = with_signal(&record, i, means);
+    }
+    Experiment { record, every, samples, filter: None, weights }
+}
+
+/// Residuals, cost and Jacobian at given parameters, no step taken.
+fn at(model: &FreeModel, experiments: &[Experiment], orders: &[f64], coefficients: &[f64]) -> Fit {
+    let settings = Settings { evaluations: 1, ..Settings::default() };
+    let found = fit(model, experiments, orders, coefficients, settings).unwrap();
+    assert_eq!((found.evaluations, found.status), (1, Status::Exhausted));
+    found
+}
+
+const START: ([f64; 3], [f64; 5]) = ([0.9, 0.2, 0.8], [45.0, -8.0, 1.0, 18.0, 1.7]);
+
+/// The experiments on which the derivatives are checked: coupled or not, refined, filtered, at rest or not.
+fn variants() -> Vec<(&'static str, FreeModel, Vec<Experiment>)> {
+    let rest = || vec![run(150, 1, &[], 0.02, 400), run(90, 3, &[], 0.02, 401)];
+    let moving = || vec![run(150, 2, &[vec![(0.0, 0.3)], vec![(0.0, -0.1), (1.0, 0.2)]], 0.02, 402)];
+    let mut filtered = rest();
+    for experiment in &mut filtered {
+        let series = (0..experiment.record.m()).map(|k| 0.4 * 0.6_f64.powi(i32::try_from(k).unwrap())).collect();
+        experiment.filter = Some((series, vec![false, true]));
+    }
+    vec![
+        ("coupled", two_link(true, Initial::Rest), rest()),
+        ("measured coupling", two_link(false, Initial::Rest), rest()),
+        ("filtered", two_link(true, Initial::Rest), filtered),
+        ("powers", two_link(true, Initial::Powers(vec![0.0, 1.0])), moving()),
+        ("Caputo", two_link(true, Initial::Caputo), moving()),
+        ("Caputo, measured coupling", two_link(false, Initial::Caputo), moving()),
+    ]
+}
+
+#[test]
+fn the_jacobian_is_the_slope_of_the_residuals() {
+    for (name, model, experiments) in variants() {
+        let (mut orders, coefficients) = START;
+        if model.initial == Initial::Caputo {
+            // γ₂ = 2γ₁ − μ₂ = 1 would put the exponent 2 − γ₂ on that of t, where terms merge and no slope exists.
+            orders = [0.8, 0.2, 0.85];
+        }
+        let here = at(&model, &experiments, &orders, &coefficients);
+        let rows: usize = experiments.iter().map(|e| 2 * (e.record.m() / e.every - 1)).sum();
+        assert_eq!((here.residuals.len(), here.jacobian.len()), (rows, 8));
+        assert!((here.cost / (0.5 * here.residuals.iter().map(|e| e * e).sum::<f64>()) - 1.0).abs() < 1e-12);
+        let projected = model.initial != Initial::Rest;
+        let mut worst = 0.0_f64;
+        for parameter in 0..8 {
+            let shifted = |by: f64| {
+                let (mut o, mut c) = (orders, coefficients);
+                if parameter < 3 {
+                    o[parameter] += by;
+                } else {
+                    c[parameter - 3] += by * coefficients[parameter - 3].abs();
+                }
+                at(&model, &experiments, &o, &c)
+            };
+            let d = 1e-4;
+            let (up, down) = (shifted(d), shifted(-d));
+            let unit = if parameter < 3 { 1.0 } else { coefficients[parameter - 3].abs() };
+            let column: Vec<f64> = here.jacobian[parameter].iter().map(|v| v * unit).collect();
+            if projected {
+                // Where initial terms are projected out the residuals turn with the parameters too (which Kaufman's
+                // form leaves out), but not their cost: its slope is exact.
+                let slope = (up.cost - down.cost) / (2.0 * d);
+                let exact: f64 = column.iter().zip(&here.residuals).map(|(j, e)| j * e).sum();
+                worst = worst.max((slope - exact).abs() / (norm(&column) * norm(&here.residuals)));
+            } else {
+                let slope: Vec<f64> =
+                    up.residuals.iter().zip(&down.residuals).map(|(u, l)| (u - l) / (2.0 * d)).collect();
+                worst = worst.max(relative_distance(&slope, &column));
+            }
+        }
+        check(&format!("Jacobian against differences, {name}"), worst, 1e-5);
+    }
+}
+
+#[test]
+fn known_models_are_recovered() {
+    for (name, model, experiments) in [
+        ("one run", two_link(true, Initial::Rest), vec![run(300, 1, &[], 0.0, 410)]),
+        (
+            "two runs, refined",
+            two_link(true, Initial::Rest),
+            vec![run(200, 2, &[], 0.0, 411), run(120, 3, &[], 0.0, 412)],
+        ),
+        ("measured coupling", two_link(false, Initial::Rest), vec![run(300, 1, &[], 0.0, 413)]),
+        (
+            "not from rest",
+            two_link(true, Initial::Powers(vec![0.0, 1.0])),
+            vec![run(300, 1, &[vec![(0.0, 0.3)], vec![(0.0, -0.1), (1.0, 0.2)]], 0.0, 414), run(200, 1, &[], 0.0, 415)],
+        ),
+    ] {
+        let found = fit(&model, &experiments, &START.0, &START.1, Settings::default()).unwrap();
+        assert_eq!(found.status, Status::Converged, "{name}");
+        check(&format!("orders, {name}"), relative_distance(&found.orders, &ORDERS), 1e-7);
+        check(&format!("coefficients, {name}"), relative_distance(&found.coefficients, &COEFFICIENTS), 1e-6);
+        check(&format!("residuals, {name}"), norm(&found.residuals), 1e-6);
+        println!("{name}: {} evaluations", found.evaluations);
+        assert_eq!((found.initial.len(), found.exponents.len()), (experiments.len(), 2));
+        if name == "not from rest" {
+            assert!((found.initial[0][0][0] - 0.3).abs() < 1e-6 && (found.initial[0][1][1] - 0.2).abs() < 1e-6);
+            assert!(found.initial[1].iter().flatten().all(|x| x.abs() < 1e-6));
+        }
+    }
+}
+
+#[test]
+fn estimates_from_noise_are_as_near_as_their_deviations_say() {
+    let model = two_link(true, Initial::Rest);
+    let (mut sum, mut count) = (0.0, 0);
+    for seed in 420..428 {
+        let experiments = [run(400, 1, &[], 0.02, seed)];
+        let found = fit(&model, &experiments, &START.0, &START.1, Settings::default()).unwrap();
+        assert_eq!(found.status, Status::Converged);
+        let rows = found.residuals.len() as f64;
+        check_between("chi-squared per sample", 2.0 * found.cost / rows, 0.85, 1.15);
+        // The optimum: residuals orthogonal to every derivative.
+        for column in &found.jacobian {
+            let product: f64 = column.iter().zip(&found.residuals).map(|(j, e)| j * e).sum();
+            assert!(product.abs() < 1e-3 * norm(column) * norm(&found.residuals));
+        }
+        let normal: Vec<f64> = found
+            .jacobian
+            .iter()
+            .flat_map(|a| found.jacobian.iter().map(move |b| a.iter().zip(b).map(|(x, y)| x * y).sum()))
+            .collect();
+        for (i, (value, exact)) in
+            found.orders.iter().chain(&found.coefficients).zip(ORDERS.iter().chain(&COEFFICIENTS)).enumerate()
+        {
+            let mut unit = [0.0; 8];
+            unit[i] = 1.0;
+            let variance = dense_solve(&normal, &unit)[i];
+            let z = (value - exact) / variance.sqrt();
+            assert!(z.abs() < 4.0, "seed {seed}, parameter {i}: z = {z}");
+            sum += z * z;
+            count += 1;
+        }
+    }
+    check_between("mean square of z", sum / f64::from(count), 0.6, 1.5);
+}
+
+#[test]
+fn bounds_hold_and_the_best_inside_them_is_found() {
+    let mut model = two_link(true, Initial::Rest);
+    // The true 0.1 of β₂ is out of reach.
+    model.order_bounds[1] = (0.2, 0.5);
+    let experiments = [run(300, 1, &[], 0.01, 430)];
+    let found = fit(&model, &experiments, &[2.0, -1.0, 0.8], &START.1, Settings::default()).unwrap();
+    assert_eq!(found.orders[1], 0.2);
+    assert!(found.orders.iter().zip(&model.order_bounds).all(|(o, b)| (b.0..=b.1).contains(o)));
+    // An order without room is fixed.
+    model.order_bounds = ORDERS.iter().map(|&o| (o, o)).collect();
+    let found = fit(&model, &experiments, &ORDERS, &START.1, Settings::default()).unwrap();
+    assert_eq!(found.orders, ORDERS);
+    assert!(relative_distance(&found.coefficients, &COEFFICIENTS) < 0.05);
+}
+
+#[test]
+fn what_cannot_be_started_is_refused() {
+    let model = two_link(true, Initial::Rest);
+    let experiments = [run(100, 2, &[], 0.01, 431)];
+    let start = |orders: &[f64], coefficients: &[f64]| {
+        fit(&model, &experiments, orders, coefficients, Settings::default()).map(|_| ())
+    };
+    assert!(matches!(start(&ORDERS[..2], &COEFFICIENTS), Err(Error::Length { .. })));
+    assert!(matches!(start(&ORDERS, &COEFFICIENTS[..4]), Err(Error::Length { .. })));
+    for (i, bad) in [(0, 0.0), (1, f64::NAN), (2, f64::INFINITY), (4, 1.0), (4, 0.5)] {
+        let mut coefficients = COEFFICIENTS;
+        coefficients[i] = bad;
+        match start(&ORDERS, &coefficients) {
+            Err(Error::OutOfRange { name, .. }) => assert_eq!(name, format!("start of coefficient {i}")),
+            other => panic!("{other:?}"),
+        }
+    }
+    let mut short = experiments[0].clone();
+    short.samples[1].pop();
+    assert!(matches!(fit(&model, &[short], &ORDERS, &COEFFICIENTS, Settings::default()), Err(Error::Length { .. })));
+    let mut few = experiments[0].clone();
+    few.weights.pop();
+    assert!(matches!(fit(&model, &[few], &ORDERS, &COEFFICIENTS, Settings::default()), Err(Error::Length { .. })));
+    // A start that explodes.
+    let long = [run(3000, 1, &[], 0.01, 432)];
+    let wild = [-4e4, -6.0, 1.5, 14.0, 1.4];
+    assert!(matches!(fit(&model, &long, &ORDERS, &wild, Settings::default()), Err(Error::Diverged { .. })));
+}
+
+#[test]
+fn few_evaluations_are_said_to_be_too_few() {
+    let model = two_link(true, Initial::Rest);
+    let experiments = [run(200, 1, &[], 0.01, 433)];
+    let mut last = f64::INFINITY;
+    for evaluations in [1, 3, 6] {
+        let settings = Settings { evaluations, ..Settings::default() };
+        let found = fit(&model, &experiments, &START.0, &START.1, settings).unwrap();
+        assert_eq!((found.status, found.evaluations), (Status::Exhausted, evaluations));
+        assert!(found.cost <= last);
+        last = found.cost;
+    }
+}
+
+#[test]
+fn a_filter_on_the_outputs_is_part_of_the_model() {
+    let low_pass = |m: usize| -> Vec<f64> { (0..m).map(|k| 0.3 * 0.7_f64.powi(i32::try_from(k).unwrap())).collect() };
+    let mut experiment = run(300, 1, &[], 0.0, 434);
+    let m = experiment.record.m();
+    let logged: Record = {
+        let filtered = series::multiply(&low_pass(m), experiment.record.signal(1), m);
+        experiment.samples[1] = point_samples(&filtered);
+        with_signal(&experiment.record, 1, filtered)
+    };
+    experiment.record = logged;
+    let model = two_link(true, Initial::Rest);
+    let without = fit(&model, std::slice::from_ref(&experiment), &START.0, &START.1, Settings::default()).unwrap();
+    experiment.filter = Some((low_pass(m), vec![false, true]));
+    let with = fit(&model, &[experiment], &START.0, &START.1, Settings::default()).unwrap();
+    check("coefficients through the filter", relative_distance(&with.coefficients, &COEFFICIENTS), 1e-6);
+    assert!(without.cost > 1e6 * with.cost);
+}
