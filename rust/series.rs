@@ -87,6 +87,38 @@ impl Kernel {
     }
 }
 
+/// A sum of products of series, formed in the frequency domain: one inverse transform however many products.
+pub struct SumOfProducts {
+    plan: Plan,
+    spectrum: Vec<Bin>,
+}
+
+impl SumOfProducts {
+    /// An empty sum of products of series of m terms.
+    #[must_use]
+    pub fn new(m: usize) -> Self {
+        let plan = fft::plan(fft::fast_length(2 * m));
+        let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
+        Self { plan, spectrum }
+    }
+
+    /// Adds weight·a·b; both cached for the same m as the sum.
+    pub fn add(&mut self, weight: f64, a: &Kernel, b: &Kernel) {
+        for ((sum, x), y) in self.spectrum.iter_mut().zip(&a.spectrum).zip(&b.spectrum) {
+            *sum += x * y * weight;
+        }
+    }
+
+    /// The first `out.len()` terms of the sum, which is left empty.
+    pub fn take(&mut self, out: &mut [f64], buffers: &mut Buffers) {
+        buffers.time.resize(self.plan.len(), 0.0);
+        let time = &mut buffers.time[..self.plan.len()];
+        self.plan.inverse(&mut self.spectrum, time, &mut buffers.workspace);
+        out.copy_from_slice(&time[..out.len()]);
+        self.spectrum.fill(Bin::new(0.0, 0.0));
+    }
+}
+
 /// Quotient `numerator / divisor` mod z^m by plain forward substitution: the oracle of [`divide`]. O(m²).
 ///
 /// # Errors
@@ -144,16 +176,49 @@ pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<V
     let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(first)).collect();
     let inverse = crate::small::inverse(&leading, n)?;
     let mut division = Division::new(n, m);
-    let mut start = 0;
-    while start < m {
-        let end = (start + BLOCK).min(m);
-        for (i, b) in rhs.iter().enumerate() {
-            division.add(i, start, &b[start..end]);
-        }
-        division.advance(&inverse, |i, j, len| &matrix[i][j].as_ref()[..len]);
-        start = end;
-    }
+    division.run(matrix, &inverse, rhs);
     Ok(division.into_quotients())
+}
+
+/// A system of series that is solved for many right-hand sides: the spectra of its matrix are made once.
+pub struct Solver<'a> {
+    matrix: &'a [Vec<Vec<f64>>],
+    inverse: Vec<f64>,
+    division: Division,
+}
+
+impl<'a> Solver<'a> {
+    /// Takes an n × n matrix of series of m terms.
+    ///
+    /// # Errors
+    /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
+    pub fn new(matrix: &'a [Vec<Vec<f64>>]) -> Result<Self> {
+        let n = matrix.len();
+        let m = matrix.first().and_then(|row| row.first()).map_or(0, Vec::len);
+        for row in matrix {
+            check_length("row of the matrix of series", n, row.len())?;
+            for series in row {
+                check_length("series", m, series.len())?;
+            }
+        }
+        let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(|s| s[0])).collect();
+        Ok(Self { matrix, inverse: crate::small::inverse(&leading, n)?, division: Division::new(n, m) })
+    }
+
+    /// Solves for one right-hand side of n series of m terms.
+    ///
+    /// # Errors
+    /// [`Error::Length`].
+    pub fn solve(&mut self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
+        check_length("right-hand sides", self.matrix.len(), rhs.len())?;
+        for b in rhs {
+            check_length("right-hand side", self.division.terms(), b.len())?;
+        }
+        let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
+        self.division.restart();
+        self.division.run(self.matrix, &self.inverse, &borrowed);
+        Ok(self.division.rest.clone())
+    }
 }
 
 /// An n × n division under way: blocks of the quotients come out in order.
@@ -194,9 +259,24 @@ impl Division {
 
     /// Forgets everything but the memory.
     pub fn reset(&mut self) {
-        self.solved = 0;
         self.levels.iter_mut().for_each(|level| *level = None);
+        self.restart();
+    }
+
+    /// Forgets the right-hand side but not the spectra: the same divisor follows.
+    pub fn restart(&mut self) {
+        self.solved = 0;
         self.rest.iter_mut().for_each(|r| r.fill(0.0));
+    }
+
+    /// Solves for whole right-hand sides.
+    fn run<S: AsRef<[f64]>>(&mut self, matrix: &[Vec<S>], inverse: &[f64], rhs: &[&[f64]]) {
+        for (i, b) in rhs.iter().enumerate() {
+            self.add(i, 0, b);
+        }
+        while self.solved < self.m {
+            self.advance(inverse, |i, j, len| &matrix[i][j].as_ref()[..len]);
+        }
     }
 
     /// Number of terms solved so far.

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ftlm.identification import Trace
+    from ftlm.models import Equation
 
     Floats = NDArray[np.float64]
 
@@ -154,6 +155,14 @@ class Demo:
     traces: dict[str, dict[int, Trace]]
     files: list[Path]
 
+    @property
+    def truth(self) -> dict[int, dict[str, float]]:
+        """Orders and free coefficients of the simulated arm, by stage."""
+        return {
+            stage: {**orders, **{(f"r{stage}" if n == "r" else n): v for n, v in free.items()}}
+            for stage, (orders, free) in PLANTS.items()
+        }
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
@@ -184,24 +193,29 @@ class Demo:
 def integer_rows(stage: int, square: Run, sine: Run) -> list[StageRow]:
     """The maker's integer-order model, stepped by explicit Euler at the run's step, as the paper's first rows."""
     model = link_model(stage=1 if stage == 1 else 2)
-    on_square, on_sine = compare(replace_coupling(model), square), None
+    on_square = compare(replace_coupling(model), square)
     responses = {run.name: explicit_euler(model, run) for run in (square, sine)}
     rows = []
     for item in model.equations:
         name = item.output
         figures = {run.name: metrics(run[name], responses[run.name][name]) for run in (square, sine)}
-        orders = {t.name: t.order.constant for t in item.terms if t.name is not None}
-        index = item.terms[0].name[1:] if item.terms[0].name else ""
-        named = {f"alpha{index}": item.order.constant}
-        named |= {f"{g}{index}": orders[f"{c}{index}"] for g, c in (("beta", "a"), ("gamma", "b"), ("mu", "d"))}
-        coefficients = {t.name: float(t.coefficient) for t in item.terms if t.name is not None}
         rows.append(
             StageRow(
-                "integer-order, stated", name, named, coefficients,
+                "integer order", name, *numbers_of(item),
                 on_square.equation_error[name], figures["square"], figures["sine"],
             )
         )  # fmt: skip
     return rows
+
+
+def numbers_of(item: Equation) -> tuple[dict[str, float], dict[str, float]]:
+    """Orders and coefficients of an identified equation of the arm, by the paper's names."""
+    coefficients = {t.name: float(t.coefficient) for t in item.terms if t.name is not None}
+    index = next(iter(coefficients))[1:]
+    greek = {"a": "beta", "b": "gamma", "d": "mu"}
+    orders = {f"alpha{index}": item.order.constant}
+    orders |= {greek[t.name[0]] + index: t.order.constant for t in item.terms if t.name and t.name[0] in greek}
+    return orders, coefficients
 
 
 def replace_coupling(model: Model) -> Model:
@@ -220,7 +234,7 @@ def run_demo(
     say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Demo:
-    """Simulate, identify every equation with p = 1, 3, 5, 7 and by least squares, compare, save.
+    """Simulate, identify every equation with p = 1, 3, 5, 7, by least squares and by output error, compare, save.
 
     Parameters
     ----------
@@ -251,7 +265,7 @@ def run_demo(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{folder} cannot be made: {error.strerror or error}; choose another folder") from error
-    wanted = ["square.csv", "sine.csv", *(f"stage{s}-{n}.json" for s in (1, 2) for n in ("paper", "least-squares"))]
+    wanted = ["square.csv", "sine.csv", *(f"stage{s}-{n}.json" for s in (1, 2) for n in ("paper", "output-error"))]
     there = [n for n in (*wanted, "demo.html") if (folder / n).exists()]
     if there and not force:
         raise DataError(f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or --force")
@@ -295,7 +309,19 @@ def run_demo(
                     traces.setdefault(name, {})[p] = multi_innovation_trace(
                         on, at, innovation_length=p, every=TRACE_EVERY
                     )
-        for label, stem in ((f"p = {INNOVATION_LENGTHS[-1]}", "paper"), ("least squares", "least-squares")):
+        say(f"stage {stage}: all orders and coefficients together by output error, from the current alone")
+        label = "output error"
+        result = identify(on, flexible_link(stage=1 if stage == 1 else 2), threads=threads, progress=progress)
+        results[stage][label] = result
+        validation = result.model.compare(off)
+        rows[stage] += [
+            StageRow(
+                label, e.output, *numbers_of(e),
+                result.equation_error[e.output], result.output_error[e.output], validation.output_error[e.output],
+            )
+            for e in result.model.equations
+        ]  # fmt: skip
+        for label, stem in ((f"p = {INNOVATION_LENGTHS[-1]}", "paper"), ("output error", "output-error")):
             path = folder / f"stage{stage}-{stem}.json"
             results[stage][label].model.save(path, force=force)
             files.append(path)

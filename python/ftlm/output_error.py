@@ -53,6 +53,8 @@ APART = 0.35
 COARSE_SHARE = 0.01
 #: Coarse fits that continue on all samples.
 FINALISTS = 3
+#: ... unless their coarse cost exceeds the best one's by this factor.
+CONTENDER = 3.0
 #: Two costs closer than this share are the same optimum.
 SAME_COST = 1e-3
 #: Refinement ends when halving the step moves no estimate by this share of its standard error.
@@ -554,7 +556,8 @@ def fit_output_error(
                 continue
         reached.sort(key=lambda a: a.level)
         starts = [(a.level, a.origin) for a in reached]
-        finalists = distinct(reached)[:FINALISTS]
+        kept = distinct(reached)[:FINALISTS]
+        finalists = [a for a in kept if a.level <= CONTENDER * kept[0].level]
         if progress is not None:
             progress(len(attempts), len(attempts))
     else:
@@ -567,9 +570,8 @@ def fit_output_error(
             f"no start of {', '.join(structure.outputs)} has a finite free run; check the signs of the data and the bounds"
         )
     near = experiments(alike)
-    best = min(
-        (lowest(problem, near, signals, initial, a, evaluations=120) for a in finalists), key=lambda a: a.level
-    )
+    best = min((descend(problem, near, signals, initial, a, evaluations=60) for a in finalists), key=lambda a: a.level)
+    best = lowest(problem, near, signals, initial, best, evaluations=120)
     full = experiments(weights)
     best = descend(problem, full, signals, initial, best, evaluations=120)
     every = 1

@@ -34,8 +34,6 @@ REST_SIGMAS = 5.0
 REST_SHARE = 1e-3
 #: Median absolute deviation of a normal variable in units of its standard deviation.
 MAD = 0.6744897501960817
-#: Powers of time set beside the first samples; the first is motion at the start, all others are responses from rest.
-REST_POWERS = (1.0, 0.5, 1.5, 2.0, 3.0)
 
 
 @dataclass(frozen=True)
@@ -124,7 +122,7 @@ def is_rest(samples: Floats) -> bool:
 
 
 def noise_of(samples: Floats) -> float:
-    """Standard deviation of white noise on a smooth signal, from the median of its second differences."""
+    """Estimate the deviation of white noise on a smooth signal, from the median of its second differences."""
     return float(np.median(np.abs(np.diff(samples, 2)))) / MAD / float(np.sqrt(6.0)) if samples.size > 2 else 0.0
 
 

@@ -216,7 +216,7 @@ def _samples(model: Model, run: Run, m: int, initial: Mapping[str, Mapping[float
 
 
 def _first(model: Model, run: Run, initial: Mapping[str, Mapping[float, float]] | None) -> Floats:
-    """Outputs at the first instant, before a held input acts: what initial terms and direct feed-through make them."""
+    """Return the outputs at the first instant, before a held input acts: initial terms and direct feed-through."""
     structure, names = model.structure, model.outputs
     coupled, sensor = structure.coupling == "simulated", structure.sensor_filter
     gain = 1.0
@@ -236,7 +236,7 @@ def _first(model: Model, run: Run, initial: Mapping[str, Mapping[float, float]] 
             elif run.intersample.get(signal) != "zoh" and not structure.delay.get(signal):
                 through = sensor is not None and not coupled and signal not in sensor.outputs
                 known[i] += factor * float(run[signal][0]) * (gain if through else 1.0)
-    first = np.linalg.lstsq(system, known, rcond=None)[0]
+    first: Floats = np.asarray(np.linalg.lstsq(system, known, rcond=None)[0], dtype=np.float64)
     for i, name in enumerate(names):
         if coupled and sensor is not None and name in sensor.outputs:
             first[i] *= gain

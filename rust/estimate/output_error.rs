@@ -11,7 +11,7 @@ use crate::equation::{AffineOrder, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::fractional::kernel_with_derivative;
 use crate::regressors::Record;
-use crate::series;
+use crate::series::{self, Buffers, Kernel, Solver, SumOfProducts};
 use crate::small::back_substitute;
 
 /// Own-output orders closer to α than this make the equation say that the output equals itself.
@@ -134,7 +134,7 @@ pub struct Fit {
 }
 
 /// Coefficient of a term, kernel of its integral, and the kernel's derivative with respect to the order.
-type Operator = (f64, Vec<f64>, Vec<f64>);
+type Operator = (f64, Kernel, Kernel);
 
 struct Evaluation {
     cost: f64,
@@ -196,7 +196,11 @@ impl FreeModel {
         };
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
+        let mut buffers = Buffers::default();
+        let drivers: Vec<Kernel> = (0..record.len()).map(|s| Kernel::new(record.signal(s))).collect();
         let mut kernels: Vec<Vec<Operator>> = Vec::with_capacity(n);
+        let mut sum = SumOfProducts::new(m);
+        let mut effect = vec![0.0; m];
         for (i, structure) in structures.iter().enumerate() {
             matrix[i][i][0] += 1.0;
             let mut row = Vec::with_capacity(structure.terms.len());
@@ -210,21 +214,17 @@ impl FreeModel {
                 }
                 let c = self.equations[i].terms[k].2.at(coefficients);
                 let (kernel, slope) = kernel_with_derivative(eta, m, record.step());
+                let spectrum = Kernel::new(&kernel);
                 match unknown(i, term.signal) {
                     Some(j) => matrix[i][j].iter_mut().zip(&kernel).for_each(|(a, v)| *a -= c * v),
-                    None => {
-                        let driven = series::multiply(&kernel, record.signal(term.signal), m);
-                        rhs[i].iter_mut().zip(driven).for_each(|(b, v)| *b += c * v);
-                    }
+                    None => sum.add(c, &spectrum, &drivers[term.signal]),
                 }
-                row.push((c, kernel, slope));
+                row.push((c, spectrum, Kernel::new(&slope)));
             }
+            sum.take(&mut rhs[i], &mut buffers);
             kernels.push(row);
         }
-        let solve = |right: &[Vec<f64>]| {
-            let borrowed: Vec<&[f64]> = right.iter().map(Vec::as_slice).collect();
-            series::solve(&matrix, &borrowed)
-        };
+        let mut solver = Solver::new(&matrix)?;
         // Weighted samples of a response, all outputs after one another.
         let sampled = |response: &[Vec<f64>]| -> Vec<f64> {
             let mut samples = Vec::with_capacity(n * experiment.compared());
@@ -245,7 +245,7 @@ impl FreeModel {
             }
             samples
         };
-        let mut response = solve(&rhs)?;
+        let mut response = solver.solve(&rhs)?;
         let mut residuals: Vec<f64> = experiment
             .samples
             .iter()
@@ -264,7 +264,7 @@ impl FreeModel {
             for &exponent in list {
                 let mut right = vec![vec![0.0; m]; n];
                 right[i] = record.initial_term(exponent);
-                let column = solve(&right)?;
+                let column = solver.solve(&right)?;
                 terms.push((i, exponent, sampled(&column), column));
             }
         }
@@ -286,10 +286,12 @@ impl FreeModel {
             orthonormal(&mut basis, column);
         }
 
+        let responses: Vec<Kernel> = response.iter().map(|means| Kernel::new(means)).collect();
         for parameter in 0..orders.len() + coefficients.len() {
             let mut right = vec![vec![0.0; m]; n];
             let mut touched = false;
             for (i, equation) in self.equations.iter().enumerate() {
+                let mut moves = false;
                 for (k, (signal, order, monomial)) in equation.terms.iter().enumerate() {
                     let (c, kernel, slope) = &kernels[i][k];
                     let (weight, operator) = if parameter < orders.len() {
@@ -302,11 +304,14 @@ impl FreeModel {
                     if weight == 0.0 {
                         continue;
                     }
+                    moves = true;
+                    let driver = unknown(i, *signal).map_or(&drivers[*signal], |j| &responses[j]);
+                    sum.add(weight, operator, driver);
+                }
+                if moves {
                     touched = true;
-                    let driver: &[f64] =
-                        unknown(i, *signal).map_or_else(|| record.signal(*signal), |j| response[j].as_slice());
-                    let effect = series::multiply(operator, driver, m);
-                    right[i].iter_mut().zip(effect).for_each(|(b, v)| *b += weight * v);
+                    sum.take(&mut effect, &mut buffers);
+                    right[i].copy_from_slice(&effect);
                 }
                 if parameter < orders.len() {
                     let moved = initial_slope(self, i, parameter, orders, &initial[i], record)?;
@@ -316,7 +321,7 @@ impl FreeModel {
                     }
                 }
             }
-            let mut column = if touched { sampled(&solve(&right)?) } else { vec![0.0; residuals.len()] };
+            let mut column = if touched { sampled(&solver.solve(&right)?) } else { vec![0.0; residuals.len()] };
             for direction in &basis {
                 let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
                 column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);

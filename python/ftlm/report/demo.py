@@ -21,8 +21,9 @@ __all__ = ["demo_page", "demo_text"]
 
 NOTE = (
     "Equation error: measured signals on the right-hand side. Free run: output error, the other output measured; for the "
-    "integer-order model explicit Euler at 2 ms from the current alone, as published. p weighs the data against the "
-    "prior K0 = 1 and coefficients near zero; least squares has no prior."
+    "integer-order model explicit Euler at 2 ms from the current alone, as published, and for output error the coupled "
+    "response to the current alone. p weighs the data against the prior K0 = 1 and coefficients near zero; least squares "
+    "has no prior."
 )
 
 
@@ -36,7 +37,7 @@ def paper_rows(found: Demo, stage: int) -> list[PaperRow]:
     rows = found.rows[stage]
     outputs = dict.fromkeys(r.output for r in rows)
     return [
-        PaperRow(r.label, o, _letters(r.orders), _letters(r.coefficients), r.equation_error, r.output_error)
+        PaperRow(r.label, o, {n: round(v, 4) + 0.0 for n, v in _letters(r.orders).items()}, _letters(r.coefficients), r.equation_error, r.output_error)
         for o in outputs
         for r in rows
         if r.output == o
@@ -73,6 +74,13 @@ def demo_text(found: Demo) -> str:
             lines.append(f"{label:<24}{cells}")
     lines += ["", NOTE, ""]
     for stage, results in found.results.items():
+        best = results["output error"]
+        estimates = {**best.orders, **(best.joint.coefficients if best.joint is not None else {})}
+        lines.append(f"Stage {stage}, output error: estimate ± standard error (truth of the simulated arm)")
+        for n, v in estimates.items():
+            lines.append(f"  {n:<8}{v:>12.6g} ± {best.standard_errors[n]:<9.2g} ({found.truth[stage][n]:.6g})")
+    lines.append("")
+    for stage, results in found.results.items():
         for label, result in results.items():
             lines += [f"warning (stage {stage}, {label}): {w}" for w in result.warnings]
     return "\n".join(lines)
@@ -102,11 +110,11 @@ def demo_page(found: Demo, path: str | os.PathLike[str], *, force: bool = False)
     """
     sections = []
     for stage, results in found.results.items():
-        best = results["least squares"]
+        best = results["output error"]
         units = dict(best.model.units)
         warnings = [f"{label}: {w}" for label, result in results.items() for w in result.warnings]
-        figures = comparison_charts(best.comparison, units=units, label="least squares, square run")
-        figures += comparison_charts(best.model.compare(found.sine), units=units, label="least squares, sine run")
+        figures = comparison_charts(best.comparison, units=units, label="output error, square run")
+        figures += comparison_charts(best.model.compare(found.sine), units=units, label="output error, sine run")
         paper = results[max((n for n in results if n.startswith("p = ")), key=lambda n: int(n[4:]))]
         figures += comparison_charts(paper.comparison, units=units, label="multi-innovation, p = 7, square run")
         for output, traces in found.traces.items():
@@ -116,7 +124,18 @@ def demo_page(found: Demo, path: str | os.PathLike[str], *, force: bool = False)
         sections.append(
             Section(
                 f"Stage {stage}",
-                paragraphs=[f"Least squares: {numeric(e)}" for e in best.model.equations] + [NOTE],
+                paragraphs=[
+                    "Joint output error, order law and coefficient law imposed:",
+                    *(numeric(e) for e in best.model.equations),
+                    "True values of this simulated arm: "
+                    + ", ".join(f"{n} = {v:.6g}" for n, v in found.truth[stage].items()) + ".",
+                    "Estimates with standard errors: "
+                    + ", ".join(
+                        f"{n} = {v:.6g} ± {best.standard_errors[n]:.2g}"
+                        for n, v in {**best.orders, **(best.joint.coefficients if best.joint else {})}.items()
+                    ) + ".",
+                    NOTE,
+                ],
                 warnings=warnings,
                 tables=[
                     paper_table(paper_rows(found, stage), title=f"Stage {stage}, square current"),

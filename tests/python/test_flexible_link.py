@@ -1,0 +1,276 @@
+"""The paper's structure: order law, coefficient law, parameter sets and every option of the two-link arm."""
+
+import numpy as np
+import pytest
+
+import ftlm
+
+FREE = {1: ("alpha1", "beta2", "alpha2", "gamma1", "mu2"), 2: ("alpha3", "beta4", "alpha4", "gamma3", "mu4")}
+
+
+def orders_of(structure):
+    return {
+        e.output: (str(e.order), [(t.signal, str(t.order), t.coefficient) for t in e.terms])
+        for e in structure.equations
+    }
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The laws
+
+
+@pytest.mark.parametrize("name", ["A", "A2"])
+def test_plants_follow_from_their_free_orders_and_coefficients(plants, name):
+    described = plants[name]
+    stage = described["stage"]
+    law = ftlm.order_law(stage)
+    found = {key: order.at(described["free_orders"]) for key, order in law.items()}
+    for key, value in {**described["free_orders"], **described["derived_orders"], "input": 0.0}.items():
+        assert found[key] == value, key
+    derived = ftlm.order_law(stage, "derived")["input"]
+    assert derived.at(described["free_orders"]) == described["derived_input_order"]
+
+    structure = ftlm.flexible_link(stage=stage)
+    at = structure.with_orders(described["free_orders"])
+    for item, expected in zip(at.equations, described["equations"], strict=True):
+        assert item.output == expected["output"]
+        assert item.order.constant == expected["alpha"]
+        for term, wanted in zip(item.terms, expected["terms"], strict=True):
+            assert (term.signal, term.coefficient) == (wanted["signal"], wanted["name"])
+            assert term.order.constant == wanted["order"], wanted["name"]
+    # The coefficient law gives the deflection's coefficients from the hub's and r.
+    printed = described["law_coefficients"]
+    hub = 2 * stage - 1
+    values = {f"{letter}{hub}": printed[letter] for letter in "abdg"} | {f"r{stage}": printed["r"]}
+    expected = {t["name"]: t["coefficient"] for e in described["equations"] for t in e["terms"]}
+    for dependent, sign, factors in structure.coefficient_law:
+        assert sign * np.prod([values[f] for f in factors]) == pytest.approx(expected[dependent], rel=1e-14)
+    assert {name for name, _, _ in structure.coefficient_law} == {f"{letter}{hub + 1}" for letter in "abdg"}
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_integer_orders_obey_the_law(stage):
+    h, d = 2 * stage - 1, 2 * stage
+    free = {f"alpha{h}": 2.0, f"alpha{d}": 2.0, f"gamma{h}": 1.0, f"beta{d}": 0.0, f"mu{d}": 1.0}
+    for input_order in ("published", "derived"):
+        found = {name: order.at(free) for name, order in ftlm.order_law(stage, input_order).items()}
+        assert found == free | {f"beta{h}": 0.0, f"mu{h}": 1.0, f"gamma{d}": 1.0, "input": 0.0}
+
+
+def test_inertia_ratio_and_coefficients_of_parameters():
+    link = ftlm.LinkParameters(
+        stiffness=6.0, hub_inertia=2.0, link_inertia=4.0, hub_friction=1.0, link_friction=0.5, torque_constant=3.0
+    )
+    assert link.inertia_ratio == 1.5
+    assert link.coefficients(2) == {
+        "a3": 3.0, "b3": -0.5, "d3": 0.25, "g3": 1.5, "a4": -4.5, "b4": 0.5, "d4": -0.375, "g4": -1.5,
+    }  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The structure
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_published_structure(stage):
+    h, d = 2 * stage - 1, 2 * stage
+    hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
+    structure = ftlm.flexible_link(stage=stage)
+    assert structure.coupling == "simulated"
+    assert structure.has_order_law
+    assert set(structure.order_names) == set(FREE[stage])
+    assert structure.signals == (hub, deflection, current)
+    assert structure.coefficient_names == tuple(f"{c}{n}" for n in (h, d) for c in "abdg")
+    assert structure.sensor_filter is None
+    assert structure.name == f"flexible link, stage {stage}"
+    terms = {t.coefficient: t for e in structure.equations for t in e.terms}
+    assert [terms[f"{c}{h}"].signal for c in "abdg"] == [deflection, hub, deflection, current]
+    assert [terms[f"{c}{d}"].signal for c in "abdg"] == [deflection, hub, deflection, current]
+    assert str(terms[f"g{d}"].order) == "0"
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_derived_structure_fixes_alpha_of_the_deflection(stage):
+    h, d = 2 * stage - 1, 2 * stage
+    structure = ftlm.flexible_link(stage=stage, input_order="derived")
+    assert set(structure.order_names) == set(FREE[stage]) - {f"alpha{d}"}
+    assert structure.equations[1].order == ftlm.Order(2.0)
+    current = structure.equations[1].terms[3]
+    assert current.order == ftlm.Order.parse(f"2 - mu{d} + gamma{h} - alpha{h}")
+
+
+def test_without_laws_every_order_is_its_own():
+    structure = ftlm.flexible_link(laws=())
+    assert not structure.has_order_law
+    assert structure.coefficient_law == ()
+    assert orders_of(structure) == {
+        "theta11": (
+            "alpha1",
+            [("theta12", "beta1", "a1"), ("theta11", "gamma1", "b1"), ("theta12", "mu1", "d1"), ("I1", "0", "g1")],
+        ),
+        "theta12": (
+            "alpha2",
+            [("theta12", "beta2", "a2"), ("theta11", "gamma2", "b2"), ("theta12", "mu2", "d2"), ("I1", "0", "g2")],
+        ),
+    }
+
+
+def test_laws_are_chosen_one_by_one():
+    orders_only = ftlm.flexible_link(laws=("orders",))
+    assert orders_only.has_order_law
+    assert orders_only.coefficient_law == ()
+    coefficients_only = ftlm.flexible_link(laws=("coefficients",))
+    assert not coefficients_only.has_order_law
+    assert len(coefficients_only.coefficient_law) == 4
+
+
+@pytest.mark.parametrize("laws", [("orders",), ()])
+def test_one_equation_alone_has_its_own_orders(laws):
+    structure = ftlm.flexible_link(laws=laws)
+    hub, deflection = structure.equation("theta11"), structure.equation("theta12")
+    assert hub.order_names == ("alpha1", "beta1", "gamma1", "mu1")
+    assert deflection.order_names == ("alpha2", "beta2", "gamma2", "mu2")
+    for single in (hub, deflection):
+        assert single.coupling == "measured"
+        assert not single.has_order_law
+        assert single.coefficient_law == ()
+        assert str(single.equations[0].terms[3].order) == "0"  # of the current, unless it is named
+    assert hub.name == "flexible link, stage 1, theta11"
+    with pytest.raises(ftlm.ModelError, match="output 'theta21' does not occur in the equation"):
+        structure.equation("theta21")
+
+
+def test_one_derived_equation_alone_takes_the_current_as_it_is():
+    single = ftlm.flexible_link(input_order="derived").equation("theta12")
+    assert single.order_names == ("beta2", "gamma2", "mu2")
+    assert single.equations[0].terms[3].order == ftlm.Order()
+
+
+def test_cross_stage_terms():
+    structure = ftlm.flexible_link(stage=1, coupling="measured", cross_stage=True)
+    assert structure.signals == ("theta11", "theta12", "I1", "theta21", "theta22", "I2")
+    for item, n in zip(structure.equations, (1, 2), strict=True):
+        extra = [(t.signal, t.coefficient, t.order.constant) for t in item.terms[4:]]
+        assert extra == [("theta21", f"p{n}", 0.0), ("theta22", f"q{n}", 0.0), ("I2", f"s{n}", 0.0)]
+    assert ftlm.flexible_link(stage=2, coupling="measured", cross_stage=True).signals[3:] == (
+        "theta11",
+        "theta12",
+        "I1",
+    )
+
+
+def test_friction_terms():
+    structure = ftlm.flexible_link(stage=2, coupling="measured", friction=True)
+    assert [e.terms[-1] for e in structure.equations] == [
+        ftlm.Term("coulomb_theta21", ftlm.Order(), "c3"),
+        ftlm.Term("coulomb_theta21", ftlm.Order(), "c4"),
+    ]
+    with pytest.raises(ftlm.ModelError, match="friction=True makes the coupled free run non-linear"):
+        ftlm.flexible_link(friction=True)
+
+
+def test_both_stages():
+    structure = ftlm.flexible_link(stage="both")
+    assert structure.outputs == ("theta11", "theta12", "theta21", "theta22")
+    assert set(structure.order_names) == {*FREE[1], *FREE[2]}
+    assert len(structure.coefficient_law) == 8
+    assert len(structure.reference) == 16
+    assert structure.name == "flexible link, both stages"
+    first, second = ftlm.flexible_link(stage=1), ftlm.flexible_link(stage=2)
+    assert structure.equations == first.equations + second.equations
+    coupled = ftlm.flexible_link(stage="both", cross_stage=True)
+    assert {t.signal for t in coupled.equations[0].terms} >= {"theta21", "theta22", "I2"}
+    derived = ftlm.flexible_link(stage="both", input_order="derived")
+    assert {e.order.constant for e in (derived.equations[1], derived.equations[3])} == {2.0}
+
+
+@pytest.mark.parametrize(("stage", "outputs"), [(1, ("theta12",)), (2, ("theta22",)), ("both", ("theta12", "theta22"))])
+def test_stock_sensor_filter(stage, outputs):
+    sensor = ftlm.flexible_link(stage=stage, sensor_filter="stock").sensor_filter
+    assert sensor == ftlm.SensorFilter.low_pass(outputs)
+    own = ftlm.SensorFilter.low_pass(["theta12"], frequency=5.0, damping=0.7)
+    assert ftlm.flexible_link(sensor_filter=own).sensor_filter is own
+
+
+def test_sensor_filter_follows_its_output_into_one_equation():
+    structure = ftlm.flexible_link(stage="both", sensor_filter="stock")
+    assert structure.equation("theta11").sensor_filter.outputs == ("theta12",)
+    assert structure.equation("theta22").sensor_filter.outputs == ("theta22",)
+    uncoupled = ftlm.equation("D y = a y; D z = b z", sensor_filter=ftlm.SensorFilter.low_pass(["z"]))
+    assert uncoupled.equation("y").sensor_filter is None
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"stage": 3}, "stage = 3 is not known; use 1, 2 or 'both'"),
+        ({"stage": "1"}, "stage = '1' is not known"),
+        ({"input_order": "other"}, "input_order = 'other' is not known; use 'published' or 'derived'"),
+        ({"coupling": "loose"}, "coupling = 'loose' is not known; use 'measured' or 'simulated'"),
+        ({"laws": ("order",)}, "law 'order' is not known; use 'orders', 'coefficients', both or ()"),
+        ({"laws": "orders"}, "law 'o' is not known"),
+        ({"parameters": "table-4"}, "parameters = 'table-4' is not known; use 'effective' or 'table-3'"),
+        ({"sensor_filter": "low-pass"}, "sensor_filter = 'low-pass' is not known; use 'stock' or a SensorFilter"),
+        ({"sensor_filter": ftlm.SensorFilter.low_pass(["theta22"])}, "filtered output 'theta22' does not occur"),
+    ],
+)
+def test_options_that_are_not_known_are_refused(options, message):
+    with pytest.raises(ftlm.ModelError) as refused:
+        ftlm.flexible_link(**options)
+    assert message in str(refused.value)
+    with pytest.raises(ftlm.ModelError, match="stage = 3 is not known"):
+        ftlm.order_law(3)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Models with everything known
+
+
+def test_manual_model_is_the_integer_rows_of_the_paper():
+    model = ftlm.link_model(stage=1)
+    assert model.orders == {"alpha1": 2.0, "beta2": 0.0, "alpha2": 2.0, "gamma1": 1.0, "mu2": 1.0}
+    assert model.coefficients == ftlm.PARAMETERS["effective"][1].coefficients(1)
+    assert model.units == {"theta11": "rad", "theta12": "rad", "I1": "A"}
+    assert str(model).splitlines()[0] == (
+        "D^2 theta11 = 628.889 theta12 - 62.9562 D^1 theta11 + 0 D^1 theta12 + 140.471 I1"
+    )
+    assert model.about == {"origin": "parameters effective"}
+
+
+def test_models_of_other_parameters_orders_and_coefficients():
+    link = ftlm.LinkParameters(6.0, 2.0, 4.0, 1.0, 0.5, 3.0)
+    model = ftlm.link_model(stage=2, parameters={2: link}, orders={"gamma3": 0.9}, coefficients={"g3": 7.0})
+    assert model.coefficients == link.coefficients(2) | {"g3": 7.0}
+    assert model.orders["gamma3"] == 0.9
+    assert model.orders["mu4"] == 1.0
+    assert ftlm.link_model(stage="both", parameters="table-3").coefficients["d3"] == pytest.approx(0.856 / 0.003)
+    with pytest.raises(ftlm.ModelError, match="order 'gama3' does not occur in the equation; did you mean gamma3"):
+        ftlm.link_model(stage=2, orders={"gama3": 0.9})
+    with pytest.raises(ftlm.ModelError, match="coefficient 'a1' does not occur in the equation"):
+        ftlm.link_model(stage=2, coefficients={"a1": 1.0})
+
+
+def test_derived_manual_model_is_the_published_one():
+    # With whole orders the current is not differentiated.
+    published, derived = (ftlm.link_model(stage=1, input_order=kind) for kind in ("published", "derived"))
+    assert [e.terms for e in derived.equations] == [e.terms for e in published.equations]
+
+
+def test_both_stages_simulate_as_each_alone(plant, drive):
+    first, second = plant("A"), plant("A2")
+    runs = drive("A", samples=301), drive("A2", samples=301)
+    both = ftlm.Model(
+        ftlm.flexible_link(stage="both")
+        .with_orders(first.orders | second.orders)
+        .with_coefficients(first.coefficients | second.coefficients)
+    )
+    together = ftlm.Run.from_arrays(
+        step=0.002,
+        inputs={"I1": runs[0]["I1"], "I2": runs[1]["I2"]},
+        outputs={name: np.zeros(301) for name in both.outputs},
+    )
+    found = both.simulate(together, tolerance=1e-6)
+    for model, run in zip((first, second), runs, strict=True):
+        alone = model.simulate(run, tolerance=1e-6)
+        for name in model.outputs:
+            np.testing.assert_allclose(found[name], alone[name], atol=2e-6 * np.abs(alone[name]).max())
