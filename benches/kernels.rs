@@ -3,7 +3,7 @@
 use std::hint::black_box;
 use std::time::Duration;
 
-use criterion::{criterion_group, criterion_main, BatchSize, BenchmarkId, Criterion, Throughput};
+use criterion::{criterion_group, criterion_main, BatchSize, BenchmarkId, Criterion, SamplingMode, Throughput};
 use ftlm::equation::{Equation, Initial, Structure, Term};
 use ftlm::fractional::{block_pulse_kernel, kernel_with_derivative};
 use ftlm::regressors::Record;
@@ -126,10 +126,13 @@ fn first_problem() -> (Record, Lattice) {
 fn order_search(c: &mut Criterion) {
     let (record, lattice) = first_problem();
     let mut group = c.benchmark_group("order search P1");
-    group.sample_size(10).measurement_time(Duration::from_secs(8)).warm_up_time(Duration::from_millis(500));
-    group.throughput(Throughput::Elements(lattice.count()));
+    group.sample_size(10).warm_up_time(Duration::from_millis(100)).throughput(Throughput::Elements(lattice.count()));
     let records = [record];
-    for (name, criterion) in [("output error", Criterium::OutputError), ("equation error", Criterium::EquationError)] {
+    for (name, criterion, seconds) in
+        [("output error", Criterium::OutputError, 20), ("equation error", Criterium::EquationError, 2)]
+    {
+        // Ten searches, whatever they take.
+        group.measurement_time(Duration::from_secs(seconds)).sampling_mode(SamplingMode::Flat);
         let options = Options {
             criterion,
             norm: Norm::L1,
@@ -149,8 +152,8 @@ fn order_search(c: &mut Criterion) {
 fn quick() -> Criterion {
     Criterion::default()
         .sample_size(20)
-        .warm_up_time(Duration::from_millis(300))
-        .measurement_time(Duration::from_secs(1))
+        .warm_up_time(Duration::from_millis(150))
+        .measurement_time(Duration::from_millis(600))
 }
 
 criterion_group! {

@@ -13,10 +13,10 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
-import literal
 import numpy as np
 
 import ftlm
+import literal
 from ftlm.demo import demo_plant
 from ftlm.order_search import available_threads
 from ftlm.records import record
@@ -110,9 +110,7 @@ def main() -> None:
     for row in picked:
         orders = (row.orders["alpha2"], row.orders["beta2"], row.orders["gamma2"], row.orders["mu2"], 0.0)
         start = time.perf_counter()
-        theirs = literal.evaluate_candidate(
-            y, [None, hub, None, current], orders, 7, 1.0, m=M, duration=rec.step * M
-        )
+        theirs = literal.evaluate_candidate(y, [None, hub, None, current], orders, 7, 1.0, m=M, duration=rec.step * M)
         spent += time.perf_counter() - start
         worst = max(worst, abs(theirs.error - row.score) / row.score)
         wanted = np.array([row.coefficients[n] for n in ("a2", "b2", "d2", "g2")])

@@ -201,7 +201,8 @@ impl<'a> Solver<'a> {
                 check_length("series", m, series.len())?;
             }
         }
-        let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(|s| s[0])).collect();
+        let first = |s: &Vec<f64>| s.first().copied().unwrap_or(0.0);
+        let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(first)).collect();
         Ok(Self { matrix, inverse: crate::small::inverse(&leading, n)?, division: Division::new(n, m) })
     }
 

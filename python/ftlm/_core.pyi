@@ -153,7 +153,6 @@ def multi_innovation(
     haar: bool,
     recursion: bool,
 ) -> tuple[_Estimate, _Matrix | None]: ...
-
 def output_error(
     runs: Sequence[_Experiment],
     laws: Sequence[_FreeEquation],

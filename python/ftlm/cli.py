@@ -8,7 +8,7 @@ import os
 import platform
 import sys
 from dataclasses import replace
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -38,7 +38,7 @@ app = typer.Typer(
 )
 
 
-class Method(str, Enum):
+class Method(StrEnum):
     """Estimators."""
 
     output_error = "output-error"
@@ -46,60 +46,60 @@ class Method(str, Enum):
     least_squares = "least-squares"
 
 
-class Coefficients(str, Enum):
+class Coefficients(StrEnum):
     """Estimators of the coefficients in a search."""
 
     multi_innovation = "multi-innovation"
     least_squares = "least-squares"
 
 
-class Criterion(str, Enum):
+class Criterion(StrEnum):
     """Errors that rank the candidates."""
 
     output_error = "output-error"
     equation_error = "equation-error"
 
 
-class Norm(str, Enum):
+class Norm(StrEnum):
     """Sums of an error."""
 
     l1 = "l1"
     l2 = "l2"
 
 
-class Coupling(str, Enum):
+class Coupling(StrEnum):
     """What drives an equation."""
 
     measured = "measured"
     simulated = "simulated"
 
 
-class InputOrder(str, Enum):
+class InputOrder(StrEnum):
     """Orders of the current in the deflection's equation."""
 
     published = "published"
     derived = "derived"
 
 
-class Laws(str, Enum):
+class Laws(StrEnum):
     """Which laws tie a flexible link's orders."""
 
     none = "none"
     orders = "orders"
 
 
-class Rows(str, Enum):
+class Rows(StrEnum):
     """Coordinates of the rows of the recursion."""
 
     haar = "haar"
     time = "time"
 
 
-
-
 # ------------------------------------------------------------------------------------------------ options
 
-Files = Annotated[list[str], typer.Argument(metavar="FILE...", help="csv or .mat files; several files are several runs.")]
+Files = Annotated[
+    list[str], typer.Argument(metavar="FILE...", help="csv or .mat files; several files are several runs.")
+]
 Time = Annotated[str | None, typer.Option("--time", help="Column of time.")]
 Step = Annotated[float | None, typer.Option("--sampling", help="Sampling step [s] of files without a time column.")]
 Inputs = Annotated[list[str] | None, typer.Option("-u", "--input", metavar="NAME=COLUMN", help="An input.")]
@@ -571,15 +571,16 @@ def search(
     known = {"alpha", *wanted.order_names}
     for name in chosen.orders:
         if name not in known:
-            raise ModelError(f"--lattice {name!r} is no free order; free are {', '.join(wanted.order_names) or 'none'}")
+            free = ", ".join(wanted.order_names) or "none"
+            raise ModelError(f"--lattice {name!r} is no free order; free are {free}")
     found = {}
     for name, part in parts.items():
         own = {n: v for n, v in chosen.orders.items() if n == "alpha" or n in part.order_names}
         with Progress(f"searching orders of {name}", quiet=as_json) as progress:
             found[name] = ftlm.search_orders(
                 runs, part, replace(chosen, orders=own), criterion=criterion.value,
-                coefficients=coefficients.value, norm=norm.value, innovation_length=p, prior_covariance=k0, rows=rows.value, m=m, keep=keep,
-                threads=threads, progress=progress,
+                coefficients=coefficients.value, norm=norm.value, innovation_length=p, prior_covariance=k0,
+                rows=rows.value, m=m, keep=keep, threads=threads, progress=progress,
             )  # fmt: skip
     if as_json:
         data = {n: r.to_dict() for n, r in found.items()}

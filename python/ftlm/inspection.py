@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Inspection", "SignalFigures", "inspect_run"]
 
+
 @dataclass(frozen=True)
 class SignalFigures:
     """Figures of one signal, in its SI unit.
@@ -79,13 +80,16 @@ class Inspection:
         return asdict(self)
 
     def __str__(self) -> str:
+        width = max(len(s.name) for s in self.signals) + 2
+        heads = ("first", "low", "high", "mean", "sd", "noise", "quantum")
         lines = [
-            f"run {self.run}: {self.rows} rows, step {self.step:g} s, {self.duration:g} s; carries up to {self.rows - 1} block pulses",
-            f"{'signal':<12}{'role':<8}{'unit':<8}{'first':>11}{'low':>11}{'high':>11}{'mean':>11}{'sd':>11}{'noise':>11}{'quantum':>11}",
+            f"run {self.run}: {self.rows} rows, step {self.step:g} s, {self.duration:g} s; "
+            f"carries up to {self.rows - 1} block pulses",
+            f"{'signal':<{width}}{'role':<8}{'unit':<8}" + "".join(f"{h:>11}" for h in heads),
         ]
         for s in self.signals:
             figures = (s.first, s.low, s.high, s.mean, s.deviation, s.noise, s.quantum)
-            lines.append(f"{s.name:<12}{s.role:<8}{s.unit or '1':<8}" + "".join(f"{v:>11.4g}" for v in figures))
+            lines.append(f"{s.name:<{width}}{s.role:<8}{s.unit or '1':<8}" + "".join(f"{v:>11.4g}" for v in figures))
         return "\n".join(lines + [f"warning: {w}" for w in self.warnings])
 
 

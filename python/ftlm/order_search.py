@@ -271,7 +271,7 @@ class Settings:
     early_stopping: bool = True
 
     @classmethod
-    def check(  # noqa: PLR0917 — the order in which they are stored
+    def check(
         cls,
         criterion: str,
         norm: str,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ftlm import _core
-from ftlm.errors import ConvergenceError, FtlmError, ModelError
+from ftlm.errors import ConvergenceError, FtlmError
 from ftlm.models import MAX_ORDER, Order, Structure
 from ftlm.records import initial_tuple, noise_of, record, sensor_series
 
@@ -57,6 +57,8 @@ FINALISTS = 3
 CONTENDER = 3.0
 #: Two costs closer than this share are the same optimum.
 SAME_COST = 1e-3
+#: Weights are settled when no output's residuals differ from their weight by more than this share.
+SETTLED = 0.01
 #: Refinement ends when halving the step moves no estimate by this share of its standard error.
 REFINED = 0.1
 #: Finest grid: pulses a sample interval.
@@ -130,7 +132,8 @@ class JointFit:
     def correlation(self) -> Floats:
         """Correlation matrix of the parameters."""
         spread = np.sqrt(np.diag(self.covariance))
-        return self.covariance / np.outer(spread, spread)
+        scaled: Floats = self.covariance / np.outer(spread, spread)
+        return scaled
 
 
 # ------------------------------------------------------------------------------------------------ what is free
@@ -166,7 +169,9 @@ class FreeProblem:
 
     def coordinates(self, start: Sequence[float], *, plain: bool) -> list[str]:
         """Logarithms where the start allows them."""
-        ratios = {f for _, factors in self.products.values() for f in factors if f not in self.structure.coefficient_names}
+        ratios = {
+            f for _, factors in self.products.values() for f in factors if f not in self.structure.coefficient_names
+        }
         out = []
         for name, value in zip(self.coefficients, start, strict=True):
             if plain or value == 0:
@@ -200,11 +205,11 @@ class FreeProblem:
 
     def named(self, values: Sequence[float]) -> dict[str, float]:
         """Every coefficient of the structure by name from the free ones."""
-        free = dict(zip(self.coefficients, values, strict=True))
-        out = {}
+        free = dict(zip(self.coefficients, map(float, values), strict=True))
+        out: dict[str, float] = {}
         for name in self.structure.coefficient_names:
             sign, factors = self.products.get(name, (1.0, (name,)))
-            out[name] = sign * math.prod(free[f] for f in factors)
+            out[name] = sign * float(np.prod([free[f] for f in factors]))
         return out
 
     def free_from(self, estimated: Mapping[str, float]) -> list[float]:
@@ -217,8 +222,9 @@ class FreeProblem:
             said = []
             for dependent, (sign, factors) in self.products.items():
                 others = [estimated[f] for f in factors if f != name and f in estimated]
-                if name in factors and math.prod(others):
-                    said.append(sign * estimated[dependent] / math.prod(others))
+                product = float(np.prod(others))
+                if name in factors and product:
+                    said.append(sign * estimated[dependent] / product)
             usable = [s for s in said if math.isfinite(s) and 1.05 < s < 20]
             out.append(float(np.median(usable)) if usable else 1.5)
         return out
@@ -260,7 +266,7 @@ class Attempt:
     orders: list[float]
     coefficients: list[float]
     origin: str
-    found: dict[str, Any]
+    found: Any
 
     @property
     def level(self) -> float:
@@ -321,11 +327,11 @@ def start_axes(problem: FreeProblem) -> dict[str, list[float]]:
     highest = {n for e in problem.structure.equations if e.order.is_single for n in e.order.names}
     # A link is second order or a little less; any other equation may be anything.
     usual = (1.2, 2.0) if problem.structure.reference else (0.2, MAX_ORDER)
-    for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
-        if name in highest and (low, high) == ALPHA_BOUNDS:
-            low, high = usual
-        high = min(high, 2.0) if name not in highest else high
-        count = max(int(round((high - low) / START_STEP)), 0)
+    for name, bounds in zip(problem.orders, problem.bounds, strict=True):
+        low, high = usual if name in highest and bounds == ALPHA_BOUNDS else bounds
+        if name not in highest:
+            high = min(high, 2.0)
+        count = max(round((high - low) / START_STEP), 0)
         axes[name] = [round(v, 9) for v in np.linspace(low, high, count + 1)] if high > low else [low]
     return axes
 
@@ -452,11 +458,11 @@ def lattice_rows(
         ]
         scales = [sum(float(np.std(r.of(e.output))) * r.m for r in records) for e in structure.equations]
         fixed = [[t.fixed for t in e.terms] for e in structure.equations]
-        found = _core.search_stage(
+        joined = _core.search_stage(
             cores, [axes[n] for n in names], laws, inputs, fixed, scales, initial, settings, None
         )
         rows = []
-        for _, _, free, parts in found["rows"]:
+        for _, _, free, parts in joined["rows"]:
             estimated: dict[str, float] = {}
             for item, part in zip(structure.equations, parts, strict=True):
                 estimated |= coefficients(item, part[3])
@@ -464,12 +470,11 @@ def lattice_rows(
         return rows
     tables = []
     for item in structure.equations:
+
         def axis(order: Order) -> list[float]:
             return list(axes[order.names[0]]) if order.names else [order.constant]
 
-        terms = [
-            (signals.index(t.signal), axis(t.order), bool(t.order.names) and t.fixed is None) for t in item.terms
-        ]
+        terms = [(signals.index(t.signal), axis(t.order), bool(t.order.names) and t.fixed is None) for t in item.terms]
         lattice = (signals.index(item.output), axis(item.order), terms)
         found = _core.search(cores, lattice, inputs, [t.fixed for t in item.terms], initial, settings, None)
         table = []
@@ -479,13 +484,14 @@ def lattice_rows(
         tables.append(table)
     rows = []
     for rank in range(max(len(t) for t in tables)):
-        orders, estimated = {}, {}
+        merged: tuple[dict[str, float], dict[str, float]] = ({}, {})
         for table in tables:
-            row = table[min(rank, len(table) - 1)] if table else ({}, {})
-            orders |= row[0]
-            estimated |= row[1]
-        if len(estimated) == len(structure.coefficient_names):
-            rows.append((orders, estimated))
+            if table:
+                row = table[min(rank, len(table) - 1)]
+                merged[0].update(row[0])
+                merged[1].update(row[1])
+        if len(merged[1]) == len(structure.coefficient_names):
+            rows.append(merged)
     return rows
 
 
@@ -567,30 +573,38 @@ def fit_output_error(
         ]
     if not finalists:
         raise ConvergenceError(
-            f"no start of {', '.join(structure.outputs)} has a finite free run; check the signs of the data and the bounds"
+            f"no start of {', '.join(structure.outputs)} has a finite free run; "
+            "check the signs of the data and the bounds"
         )
     near = experiments(alike)
     best = min((descend(problem, near, signals, initial, a, evaluations=60) for a in finalists), key=lambda a: a.level)
     best = lowest(problem, near, signals, initial, best, evaluations=120)
-    full = experiments(weights)
-    best = descend(problem, full, signals, initial, best, evaluations=120)
+    best = descend(problem, experiments(weights), signals, initial, best, evaluations=120)
+
+    def weighed(attempt: Attempt, weights: list[float], every: int) -> tuple[Attempt, list[float]]:
+        """Descend on a grid until the weights are those of the residuals, pooled over runs."""
+        for _ in range(4):
+            full = experiments(weights, every)
+            attempt = descend(problem, full, signals, initial, attempt, evaluations=120, plain=True)
+            levels = residual_levels(attempt, full, structure)
+            if all(abs(v - 1.0) < SETTLED for v in levels.values()):
+                break
+            weights = [w / max(levels[o], 1e-300) for w, o in zip(weights, structure.outputs, strict=True)]
+        return attempt, weights
+
     every = 1
-    for _ in range(4):
-        # Weights follow the residuals, pooled over runs.
-        levels = residual_levels(best, full, structure)
-        weights = [w / max(levels[o], 1e-300) for w, o in zip(weights, structure.outputs, strict=True)]
-        full = experiments(weights, every)
-        best = descend(problem, full, signals, initial, best, evaluations=120, plain=True)
-        if all(abs(v - 1.0) < 0.01 for v in levels.values()):
-            break
+    best, weights = weighed(best, weights, every)
     while refine and every < FINEST:
-        finer = experiments(weights, 2 * every)
-        better = descend(problem, finer, signals, initial, best, evaluations=120, plain=True)
-        errors = np.sqrt(np.diag(covariance(better, finer, structure)))
+        # On a finer grid residuals may shrink to their noise, so weights follow anew.
+        better, weights = weighed(best, weights, 2 * every)
+        full = experiments(weights, 2 * every)
+        errors = np.sqrt(np.diag(covariance(better, full, structure)))
         moved = np.abs(np.array(better.orders + better.coefficients) - np.array(best.orders + best.coefficients))
-        best, full, every = better, finer, 2 * every
+        best, every = better, 2 * every
         if np.all(moved <= REFINED * errors):
             break
+    full = experiments(weights, every)
+    levels = residual_levels(best, full, structure)
     residuals = split_residuals(best, full, structure)
     return JointFit(
         orders=dict(zip(problem.orders, best.orders, strict=True)),
@@ -677,7 +691,8 @@ def covariance(attempt: Attempt, experiments: list[Any], structure: Structure) -
                     cross = scores[:, lag:] @ scores[:, :-lag].T
                     meat += (1.0 - lag / lags) * (cross + cross.T)
         middle = bread @ meat @ bread
-    return middle / np.outer(spread, spread)
+    result: Floats = middle / np.outer(spread, spread)
+    return result
 
 
 def is_white(series: Floats, lags: int = 25) -> bool:

@@ -151,11 +151,14 @@ class Comparison:
         }
 
     def __str__(self) -> str:
-        lines = [f"{'output':<10}{'':<16}{'error':>12}{'RMSE':>12}{'NR':>10}{'fit %':>10}"]
+        width = max(len(name) for name in self.output_error) + 2
+        lines = [f"{'output':<{max(width, 8)}}{'':<16}{'error':>12}{'RMSE':>12}{'NR':>10}{'fit %':>10}"]
         for name in self.output_error:
             both = (("equation error", self.equation_error[name]), ("output error", self.output_error[name]))
             for label, f in both:
-                lines.append(f"{name:<10}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>10.4g}")
+                lines.append(
+                    f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>10.4g}"
+                )
         lines.append(f"over {self.m} block pulses a run")
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
@@ -262,8 +265,9 @@ def near_identity(
         useless = not output.nr <= USELESS
         if close and worse:
             listed = ", ".join(f"{order:g}" for order in close)
+            listed = f"orders {listed} are" if len(close) > 1 else f"order {listed} is"
             warnings.append(
-                f"{name}: orders {listed} are close to alpha = {alpha:g}, so the equation nearly says that {name} "
+                f"{name}: {listed} close to alpha = {alpha:g}, so the equation nearly says that {name} "
                 f"equals itself; its free run has NR {output.nr:.3g} against {equation.nr:.3g} for the equation error. "
                 "Do not use these orders"
             )

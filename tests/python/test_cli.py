@@ -38,7 +38,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         run = truth.simulate(blank)
         run.to_csv(where / f"{name}.csv")
         table = np.column_stack([t, run["u"], 1000 * run["y"]])
-        np.savetxt(where / f"{name}-foreign.csv", table, delimiter=",", header="seconds,volts,mm", comments="", fmt="%.17g")
+        np.savetxt(
+            where / f"{name}-foreign.csv", table, delimiter=",", header="seconds,volts,mm", comments="", fmt="%.17g"
+        )
     (where / "columns.toml").write_text(
         'time = "seconds"\n[inputs]\nu = "volts"\n[outputs]\ny = "mm"\n[units]\ny = "mm"\n', encoding="utf-8"
     )
@@ -46,7 +48,16 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 EQUATION = "D^alpha y = a1 D^nu y + a0 y + b0 u"
-SEARCH = ("--structure", EQUATION, "--method", "least-squares", "--lattice", "alpha=1.3:1.7:0.1", "--lattice", "nu=0.3:0.7:0.1")
+SEARCH = (
+    "--structure",
+    EQUATION,
+    "--method",
+    "least-squares",
+    "--lattice",
+    "alpha=1.3:1.7:0.1",
+    "--lattice",
+    "nu=0.3:0.7:0.1",
+)
 
 
 def test_two_commands_from_a_file_to_a_validated_model(folder: Path) -> None:
@@ -63,9 +74,7 @@ def test_two_commands_from_a_file_to_a_validated_model(folder: Path) -> None:
 
 def test_foreign_csv_by_options_and_by_columns_file_give_the_same_numbers(folder: Path) -> None:
     common = ("identify", "square-foreign.csv", *SEARCH, "--json")
-    by_options = ftlm_command(
-        *common, "--time", "seconds", "-u", "u=volts", "-y", "y=mm", "--unit", "y=mm", cwd=folder
-    )
+    by_options = ftlm_command(*common, "--time", "seconds", "-u", "u=volts", "-y", "y=mm", "--unit", "y=mm", cwd=folder)
     by_file = ftlm_command(*common, "--columns", "columns.toml", cwd=folder)
     own = ftlm_command("identify", "square.csv", *SEARCH, "--json", cwd=folder)
     found = [json.loads(r.stdout) for r in (by_options, by_file, own)]
@@ -177,7 +186,18 @@ def test_nothing_is_overwritten_without_force(folder: Path) -> None:
 
 
 def test_validation_below_what_was_asked_exits_with_four(folder: Path) -> None:
-    ftlm_command("identify", "square.csv", "--structure", "D^1.5 y = a0 y + b0 u", "--method", "least-squares", "-o", "poor.json", "--force", cwd=folder)
+    ftlm_command(
+        "identify",
+        "square.csv",
+        "--structure",
+        "D^1.5 y = a0 y + b0 u",
+        "--method",
+        "least-squares",
+        "-o",
+        "poor.json",
+        "--force",
+        cwd=folder,
+    )
     found = ftlm_command("compare", "poor.json", "sine.csv", "--min-fit", "99.9", cwd=folder)
     assert found.returncode == 4
     assert "99.9" in found.stderr
@@ -185,7 +205,9 @@ def test_validation_below_what_was_asked_exits_with_four(folder: Path) -> None:
 
 def test_a_closed_pipe_is_no_error(folder: Path) -> None:
     command = f"{sys.executable} -m ftlm inspect square.csv | head -c 1"
-    ran = subprocess.run(["bash", "-o", "pipefail", "-c", command], cwd=folder, capture_output=True, text=True, check=False)
+    ran = subprocess.run(
+        ["bash", "-o", "pipefail", "-c", command], cwd=folder, capture_output=True, text=True, check=False
+    )
     assert "Traceback" not in ran.stderr
 
 
@@ -193,7 +215,8 @@ def test_ctrl_c_ends_a_search_with_130_and_shows_progress_before(folder: Path) -
     # A pseudo-terminal, so that the progress bar is there too.
     master, slave = pty.openpty()
     process = subprocess.Popen(
-        [sys.executable, "-m", "ftlm", "search", "square.csv", "--structure", "D^alpha y = a2 D^nu y + a1 D^mu y + a0 D^xi y + b0 u",
+        [sys.executable, "-m", "ftlm", "search", "square.csv",
+         "--structure", "D^alpha y = a2 D^nu y + a1 D^mu y + a0 D^xi y + b0 u",
          "--coefficients", "least-squares", "--step", "0.02", "--lattice", "alpha=1.0:2.0:0.02"],
         cwd=folder, stdout=subprocess.DEVNULL, stderr=slave, env={**os.environ, "TERM": "xterm"},
     )  # fmt: skip
@@ -222,8 +245,8 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
     mats = sorted(str(p) for p in run.glob("*.mat"))
     assert len(mats) == 6
     for cross in ((), ("--cross-stage",)):
-        options = ("--slice", "1.1:19.5", "--structure", "flexible-link:1", "--coupling", "measured", "--method", "least-squares",
-                   "--step", "0.1", *cross, "--json", "--force")  # fmt: skip
+        options = ("--slice", "1.1:19.5", "--structure", "flexible-link:1", "--coupling", "measured",
+                   "--method", "least-squares", "--step", "0.1", *cross, "--json", "--force")  # fmt: skip
         found = [
             ftlm_command("identify", *files, "--columns", columns, *options, "-o", out, cwd=tmp_path)
             for files, columns, out in (([str(run / "psf.csv")], "csv.toml", "a.json"), (mats, "mat.toml", "b.json"))

@@ -22,7 +22,11 @@ def test_the_python_blocks_run_one_after_the_other(tmp_path: Path) -> None:
     found = blocks("python")
     assert len(found) >= 2
     ran = subprocess.run(
-        [sys.executable, "-W", "error", "-c", "\n".join(found)], cwd=tmp_path, capture_output=True, text=True, check=False
+        [sys.executable, "-W", "error", "-c", "\n".join(found)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert ran.returncode == 0, ran.stderr
     assert "order search (y)" in ran.stdout

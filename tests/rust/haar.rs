@@ -97,7 +97,7 @@ fn the_fast_operational_matrix_is_the_dense_one() {
             worst = worst.max(distance(&fast, &dense) / largest(&dense));
         }
     }
-    check("fast against dense operational matrix", worst, 1e-12);
+    check("fast against dense operational matrix", worst, 1e-13);
 }
 
 #[test]

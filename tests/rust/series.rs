@@ -4,7 +4,7 @@
 use ftlm::error::Error;
 use ftlm::fft;
 use ftlm::fractional::{block_pulse_kernel, power_means};
-use ftlm::series::{self, Buffers, Division, Kernel, BLOCK};
+use ftlm::series::{self, Buffers, Division, Kernel, Solver, SumOfProducts, BLOCK};
 use proptest::prelude::*;
 
 use crate::common::{
@@ -265,6 +265,55 @@ fn uncoupled_systems_are_divisions() {
         for i in 0..2 {
             let alone = series::divide(&rhs[i], &d[i]).unwrap();
             assert!(block_distance(&both[i], &alone) < 1e-13);
+        }
+    }
+}
+
+#[test]
+fn a_solver_gives_what_solving_anew_gives() {
+    let mut random = Random::new(12);
+    for m in [1, 64, 65, 300, 2049] {
+        let matrix = vec![
+            vec![divisor(&[(-3.0, 1.5)], m, 0.02), block_pulse_kernel(0.8, m, 0.02)],
+            vec![block_pulse_kernel(1.1, m, 0.02), divisor(&[(-2.0, 0.7)], m, 0.02)],
+        ];
+        let mut solver = Solver::new(&matrix).unwrap();
+        for _ in 0..3 {
+            let rhs = vec![random.signal(m), random.signal(m)];
+            let (found, anew) = (solver.solve(&rhs).unwrap(), series::solve(&matrix, &[&rhs[0], &rhs[1]]).unwrap());
+            for (a, b) in found.iter().zip(&anew) {
+                assert_eq!(bits(a), bits(b));
+            }
+        }
+        assert!(matches!(solver.solve(&[vec![0.0; m]]), Err(Error::Length { .. })));
+        assert!(matches!(solver.solve(&[vec![0.0; m], vec![0.0; m + 1]]), Err(Error::Length { .. })));
+    }
+    let refused = |matrix: &[Vec<Vec<f64>>]| Solver::new(matrix).err().unwrap();
+    assert_eq!(refused(&[vec![vec![0.0, 1.0]]]), Error::LeadingZero { leading: 0.0 });
+    assert_eq!(refused(&[vec![vec![]]]), Error::LeadingZero { leading: 0.0 });
+    assert!(matches!(refused(&[vec![vec![1.0], vec![1.0]]]), Error::Length { .. }));
+    assert!(matches!(refused(&[vec![vec![1.0], vec![1.0]], vec![vec![1.0], vec![]]]), Error::Length { .. }));
+}
+
+#[test]
+fn a_sum_of_products_is_the_sum_of_the_products() {
+    let mut random = Random::new(13);
+    let mut buffers = Buffers::default();
+    // Long and short in turn: the buffers are shared.
+    for m in [1, 700, 64, 2048] {
+        let mut sum = SumOfProducts::new(m);
+        for terms in [3, 1, 0] {
+            let (mut oracle, mut size) = (vec![0.0; m], 0.0);
+            for _ in 0..terms {
+                let (a, b, weight) = (random.signal(m), random.signal(m), random.uniform(-3.0, 3.0));
+                sum.add(weight, &Kernel::new(&a), &Kernel::new(&b));
+                oracle.iter_mut().zip(series::multiply_naive(&a, &b, m)).for_each(|(o, v)| *o += weight * v);
+                size += weight.abs() * norm(&a) * norm(&b);
+            }
+            // Taken, it is empty for the next sum.
+            let mut found = vec![f64::NAN; m];
+            sum.take(&mut found, &mut buffers);
+            assert!(distance(&found, &oracle) <= 2e-15 * size);
         }
     }
 }

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 __all__ = ["demo_page", "demo_text"]
 
 NOTE = (
-    "Equation error: measured signals on the right-hand side. Free run: output error, the other output measured; for the "
-    "integer-order model explicit Euler at 2 ms from the current alone, as published, and for output error the coupled "
-    "response to the current alone. p weighs the data against the prior K0 = 1 and coefficients near zero; least squares "
-    "has no prior."
+    "Equation error: measured signals on the right-hand side. Free run: output error, the other output measured; for "
+    "the integer-order model explicit Euler at 2 ms from the current alone, as published, and for output error the "
+    "coupled response to the current alone. p weighs the data against the prior K0 = 1 and coefficients near zero; "
+    "least squares has no prior."
 )
 
 
@@ -37,7 +37,14 @@ def paper_rows(found: Demo, stage: int) -> list[PaperRow]:
     rows = found.rows[stage]
     outputs = dict.fromkeys(r.output for r in rows)
     return [
-        PaperRow(r.label, o, {n: round(v, 4) + 0.0 for n, v in _letters(r.orders).items()}, _letters(r.coefficients), r.equation_error, r.output_error)
+        PaperRow(
+            r.label,
+            o,
+            {n: round(v, 4) + 0.0 for n, v in _letters(r.orders).items()},
+            _letters(r.coefficients),
+            r.equation_error,
+            r.output_error,
+        )
         for o in outputs
         for r in rows
         if r.output == o
@@ -51,7 +58,14 @@ def validation_table(found: Demo) -> Table:
         for stage in found.rows
         for r in sorted(found.rows[stage], key=lambda r: r.output)
     ]
-    columns = ("output", "model", "fit % on the square", "fit % on the sine", "error (45) on the sine", "NR on the sine")
+    columns = (
+        "output",
+        "model",
+        "fit % on the square",
+        "fit % on the sine",
+        "error (45) on the sine",
+        "NR on the sine",
+    )
     return Table("Validation on the other input", columns, rows, note="Free runs; error in rad.")
 
 
@@ -128,12 +142,14 @@ def demo_page(found: Demo, path: str | os.PathLike[str], *, force: bool = False)
                     "Joint output error, order law and coefficient law imposed:",
                     *(numeric(e) for e in best.model.equations),
                     "True values of this simulated arm: "
-                    + ", ".join(f"{n} = {v:.6g}" for n, v in found.truth[stage].items()) + ".",
+                    + ", ".join(f"{n} = {v:.6g}" for n, v in found.truth[stage].items())
+                    + ".",
                     "Estimates with standard errors: "
                     + ", ".join(
                         f"{n} = {v:.6g} ± {best.standard_errors[n]:.2g}"
                         for n, v in {**best.orders, **(best.joint.coefficients if best.joint else {})}.items()
-                    ) + ".",
+                    )
+                    + ".",
                     NOTE,
                 ],
                 warnings=warnings,

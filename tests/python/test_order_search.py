@@ -1,0 +1,694 @@
+"""Order searches against enumeration in NumPy; the same table for any number of threads, counted to the last candidate."""
+
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from math import gamma
+
+import numpy as np
+import pytest
+
+import ftlm
+import oracles
+from ftlm.order_search import Settings, available_threads, check_threads
+
+EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
+GRID = {"alpha": [1.4, 1.6, 1.8], "beta": [0.0, 0.3, 0.6, 0.9], "mu": [0.0, 0.3, 0.6, 0.9], "nu": [0.0, 0.2]}
+M = 64
+
+
+@pytest.fixture(scope="module")
+def run(small_run, with_noise):
+    return with_noise(small_run, 0.003, 1)
+
+
+@pytest.fixture(scope="module")
+def second(small_model, with_noise):
+    """Another run of the same machine, of another length and step, under another input."""
+    n = 301
+    u = np.sin(np.arange(n) ** 1.3 / 20)
+    empty = ftlm.Run.from_arrays(step=0.03, inputs={"u": u}, outputs={"y": np.zeros(n)}, units={"u": "A", "y": "rad"})
+    return with_noise(small_model.simulate(empty, tolerance=1e-6), 0.003, 2)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# An oracle: every candidate to its end, by dense matrices
+
+
+def candidates(grid):
+    """Orders in the lattice's order: alpha ascending, then the own pair, then the input's; larger own order first."""
+    for alpha in grid["alpha"]:
+        own = sorted({*grid["beta"]}, reverse=True)
+        pairs = [(b, m) for b in own for m in own if b > m and b < alpha]
+        for (beta, mu), nu in itertools.product(pairs, sorted(grid["nu"], reverse=True)):
+            yield {"alpha": alpha, "beta": beta, "mu": mu, "nu": nu}
+
+
+class Record:
+    def __init__(self, run, m=M):
+        self.duration = run.duration
+        self.y, self.u = (oracles.pulse_means(run[n], m, how) for n, how in (("y", "foh"), ("u", "zoh")))
+        self.m = m
+
+    def regressors(self, o):
+        return oracles.regressors(
+            [self.y, self.y, self.u], [o["beta"], o["mu"], o["nu"]], o["alpha"], self.duration, haar=False
+        )
+
+    def powers(self, exponents):
+        edges = np.arange(self.m + 1) * self.duration / self.m
+        means = [np.diff(edges ** (e + 1)) / (e + 1) / (self.duration / self.m) for e in exponents]
+        return np.stack(means, axis=1) if means else np.zeros((self.m, 0))
+
+
+def evaluate(records, o, criterion, norm, coefficients, rows, exponents=(), p=7, k0=1.0):
+    """Score and coefficients of one candidate."""
+    blocks, targets, weights = [], [], []
+    for i, r in enumerate(records):
+        others = [np.zeros((r.m, len(exponents))) for _ in records]
+        others[i] = r.powers(exponents)
+        q = np.hstack([r.regressors(o), *others])
+        phi = oracles.haar_matrix(r.m) if rows == "haar" else np.eye(r.m)
+        blocks.append(phi @ q)
+        targets.append(phi @ r.y)
+        weights.append([min(p, r.m - k) for k in range(r.m)])
+    q, y, w = np.vstack(blocks), np.concatenate(targets), np.concatenate(weights)
+    if coefficients == "least-squares":
+        x = oracles.least_squares(q, y)
+    else:
+        x = np.linalg.solve(q.T @ (w[:, None] * q) + np.eye(q.shape[1]) / k0, q.T @ (w * y))
+    raw, points = 0.0, 0
+    for i, r in enumerate(records):
+        initial = r.powers(exponents) @ x[3 + i * len(exponents) : 3 + (i + 1) * len(exponents)]
+        if criterion == "equation-error":
+            e = r.y - r.regressors(o) @ x[:3] - initial
+        else:
+            own = [(x[0], o["beta"]), (x[1], o["mu"])]
+            free = oracles.free_run(own, [(x[2], o["nu"], r.u)], o["alpha"], r.m, r.duration, initial=initial)
+            e = r.y - free
+        raw += np.sum(np.abs(e)) if norm == "l1" else np.sum(e**2)
+        points += r.m
+    return (raw if norm == "l1" else np.sqrt(raw / points)), x[:3]
+
+
+def enumerate_all(records, **options):
+    rows = []
+    for index, o in enumerate(candidates(GRID)):
+        score, x = evaluate(records, o, **options)
+        rows.append((score, index, o, x))
+    return sorted(rows, key=lambda row: row[:2])
+
+
+def assert_is_table(found, expected, *, rtol=1e-7):
+    assert found.candidates == len(expected)
+    for row, (score, index, orders, x) in zip(found.table, expected, strict=False):
+        assert (row.index, row.orders) == (index, orders)
+        assert row.score == pytest.approx(score, rel=rtol)
+        assert [row.coefficients[n] for n in "acb"] == pytest.approx(list(x), rel=1e-4)
+    assert [row.rank for row in found.table] == list(range(1, len(found.table) + 1))
+
+
+def search(runs, **options):
+    return ftlm.search_orders(runs, ftlm.equation(EQUATION, initial="rest"), ftlm.Lattice(orders=GRID), m=M, **options)
+
+
+@pytest.mark.parametrize("criterion", ["output-error", "equation-error"])
+@pytest.mark.parametrize("norm", ["l1", "l2"])
+@pytest.mark.parametrize(
+    ("coefficients", "rows"), [("least-squares", "time"), ("multi-innovation", "haar"), ("multi-innovation", "time")]
+)
+def test_table_is_that_of_enumeration(run, criterion, norm, coefficients, rows):
+    options = {"criterion": criterion, "norm": norm, "coefficients": coefficients, "rows": rows}
+    found = search(run, keep=10, **options)
+    assert len(found.table) == 10
+    assert_is_table(found, enumerate_all([Record(run)], **options))
+
+
+@pytest.mark.parametrize(("p", "k0"), [(1, 0.01), (3, 100.0), (200, 1e6)])
+def test_innovation_length_and_prior_are_those_asked_for(run, p, k0):
+    options = {"criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation", "rows": "haar"}
+    found = search(run, innovation_length=p, prior_covariance=k0, **options)
+    assert_is_table(found, enumerate_all([Record(run)], p=p, k0=k0, **options))
+    assert found.settings["innovation_length"] == p
+    assert found.settings["prior_covariance"] == k0
+
+
+@pytest.mark.parametrize("norm", ["l1", "l2"])
+@pytest.mark.parametrize("coefficients", ["least-squares", "multi-innovation"])
+def test_several_runs_are_one_fit(run, second, norm, coefficients):
+    options = {"criterion": "output-error", "norm": norm, "coefficients": coefficients, "rows": "haar"}
+    found = search([run, second], **options)
+    assert_is_table(found, enumerate_all([Record(run), Record(second)], **options))
+    assert found.model.about["runs"] == f"{run.name}, {second.name}"
+    assert found.table != search(run, **options).table
+
+
+def test_initial_terms_belong_to_each_run(run, second):
+    moved = [r.slice(2.0, None) for r in (run, second)]
+    options = {"criterion": "output-error", "norm": "l2", "coefficients": "least-squares"}
+    structure = ftlm.equation(EQUATION, initial=(0.0, 1.0))
+    found = ftlm.search_orders(moved, structure, ftlm.Lattice(orders=GRID), m=M, **options)
+    expected = enumerate_all([Record(r) for r in moved], rows="time", exponents=(0.0, 1.0), **options)
+    assert_is_table(found, expected, rtol=1e-6)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The same for everybody
+
+
+def exactly(found):
+    return [(r.rank, r.index, r.score, r.orders, r.coefficients) for r in found.table]
+
+
+@pytest.mark.parametrize("criterion", ["output-error", "equation-error"])
+@pytest.mark.parametrize("coefficients", ["least-squares", "multi-innovation"])
+def test_threads_and_early_stopping_change_no_bit_of_the_table(run, second, criterion, coefficients):
+    structure = ftlm.equation(EQUATION)
+    lattice = ftlm.lattice(step=0.1, alpha=(1.3, 1.9), nu=(0, 0.3))
+    options = {"criterion": criterion, "coefficients": coefficients, "m": 128, "keep": 7}
+    brute = ftlm.search_orders([run, second], structure, lattice, threads=1, early_stopping=False, **options)
+    assert brute.candidates == sum(n * (n - 1) // 2 * 4 for n in range(13, 20))
+    assert brute.pruned["stopped early"] == 0
+    counts = set()
+    for threads, stopping in itertools.product((1, 2, 3, 8), (True, False)):
+        found = ftlm.search_orders(
+            [run, second], structure, lattice, threads=threads, early_stopping=stopping, **options
+        )
+        assert exactly(found) == exactly(brute), (threads, stopping)
+        assert sum(found.pruned.values()) + len(found.table) == found.candidates
+        if stopping:
+            counts.add(tuple(found.pruned.items()))
+            assert found.pruned["stopped early"] > 0
+        else:
+            assert found.pruned == brute.pruned
+    assert len(counts) == 1  # what became of the candidates does not depend on threads either
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 8])
+@pytest.mark.parametrize("stopping", [True, False])
+def test_threads_and_early_stopping_change_no_bit_of_a_stage(drive, plant, with_noise, threads, stopping):
+    found = stage_search(drive, plant, with_noise, threads=threads, early_stopping=stopping)
+    alone = stage_search(drive, plant, with_noise, threads=1, early_stopping=False)
+    assert exactly(found) == exactly(alone)
+    assert sum(found.pruned.values()) + len(found.table) == found.candidates == alone.candidates
+
+
+def test_keeping_more_rows_only_makes_the_table_longer(run):
+    few, many, all_rows = (search(run, keep=keep, coefficients="least-squares") for keep in (1, 10, 1000))
+    assert exactly(many)[:1] == exactly(few)
+    assert exactly(all_rows)[:10] == exactly(many)
+    assert len(all_rows.table) == all_rows.candidates == 36
+    assert sum(all_rows.pruned.values()) == 0
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# A stage under its law
+
+STAGE = {
+    "alpha1": [1.9, 2.0],
+    "alpha2": [1.9, 2.0],
+    "gamma1": [0.85, 0.95, 1.05],
+    "beta2": [0.0, 0.1, 0.2],
+    "mu2": [0.75, 0.85, 0.95],
+}
+
+
+def stage_search(drive, plant, with_noise, **options):
+    made = plant("A").simulate(drive("A", samples=601), tolerance=1e-5)
+    noisy = with_noise(made, 1e-5, 3)
+    settings = {"coefficients": "least-squares", "m": M, "keep": 12} | options
+    return ftlm.search_orders(noisy, ftlm.flexible_link(), ftlm.Lattice(orders=STAGE), **settings)
+
+
+def stage_scores(run, orders, criterion, norm):
+    """Score of a tuple of free orders by dense matrices, or None where it makes no equations."""
+    structure = ftlm.flexible_link().with_orders(orders)
+    names = ("theta11", "theta12", "I1")
+    means = {n: oracles.pulse_means(run[n], M, "zoh" if n == "I1" else "foh") for n in names}
+    total = 0.0
+    coefficients = {}
+    for item in structure.equations:
+        y, alpha = means[item.output], item.order.constant
+        terms = [(t.signal, t.order.constant, t.coefficient) for t in item.terms]
+        q = oracles.regressors(
+            [means[s] for s, _, _ in terms], [o for _, o, _ in terms], alpha, run.duration, haar=False
+        )
+        # Columns differ by orders of magnitude; the core scales them too.
+        size = np.linalg.norm(q, axis=0)
+        x = oracles.least_squares(q / size, y) / size
+        coefficients |= dict(zip([c for _, _, c in terms], x, strict=True))
+        if criterion == "equation-error":
+            e = y - q @ x
+        else:
+            own = [(c, o) for c, (s, o, _) in zip(x, terms, strict=True) if s == item.output]
+            others = [(c, o, means[s]) for c, (s, o, _) in zip(x, terms, strict=True) if s != item.output]
+            e = y - oracles.free_run(own, others, alpha, M, run.duration)
+        if norm == "l1":
+            total += np.sum(np.abs(e)) / (np.std(y) * M)
+        else:
+            total += np.sqrt(np.mean(e**2)) / np.std(y)
+    return total, coefficients
+
+
+@pytest.mark.parametrize(
+    ("criterion", "norm"), [("output-error", "l1"), ("output-error", "l2"), ("equation-error", "l2")]
+)
+def test_stage_under_its_law_is_enumeration(drive, plant, with_noise, criterion, norm):
+    found = stage_search(drive, plant, with_noise, criterion=criterion, norm=norm)
+    made = with_noise(plant("A").simulate(drive("A", samples=601), tolerance=1e-5), 1e-5, 3)
+    expected = []
+    names = list(found.orders)
+    for values in itertools.product(*(sorted(STAGE[n]) for n in names)):
+        orders = dict(zip(names, values, strict=True))
+        try:
+            score, coefficients = stage_scores(made, orders, criterion, norm)
+        except ftlm.ModelError:
+            continue  # orders that make no equation: not a candidate
+        expected.append((score, orders, coefficients))
+    assert found.candidates == len(expected) < 108
+    expected.sort(key=lambda row: row[0])
+    for row, (score, orders, coefficients) in zip(found.table, expected, strict=False):
+        assert row.score == pytest.approx(score, rel=1e-5)
+        assert row.orders == orders
+        assert row.coefficients == {n: pytest.approx(v, rel=1e-3, abs=1e-6) for n, v in coefficients.items()}
+
+
+def test_one_equation_under_a_law_is_searched_too(run):
+    # D^(alpha - 1) in place of a free order: the same scores as the free search at those orders.
+    structure = ftlm.equation("D^alpha y = a D^(alpha-1) y + c y + b u", initial="rest")
+    found = ftlm.search_orders(
+        run, structure, ftlm.lattice(step=0.2, alpha=(1.2, 2.0)), m=M, coefficients="least-squares"
+    )
+    assert found.candidates == 5
+    for row in found.table:
+        fixed = {"alpha": row.orders["alpha"], "beta": row.orders["alpha"] - 1, "mu": 0.0, "nu": 0.0}
+        score, _ = evaluate([Record(run)], fixed, "output-error", "l1", "least-squares", "time")
+        # Each equation's score is divided by its scale, sigma(y) M.
+        assert row.score == pytest.approx(score / (np.std(Record(run).y) * M), rel=1e-8)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What the orders may be
+
+
+def values(lattice, text=EQUATION, **options):
+    return lattice.values(ftlm.equation(text, **options))
+
+
+def test_default_lattice_is_the_papers():
+    found = values(ftlm.lattice())
+    assert found["alpha"] == tuple(round(1.05 + 0.05 * i, 9) for i in range(20))
+    assert found["beta"] == found["mu"] == found["nu"] == tuple(round(0.05 * i, 9) for i in range(41))
+    assert list(found) == ["alpha", "beta", "mu", "nu"]
+    assert ftlm.Lattice() == ftlm.lattice()
+
+
+@pytest.mark.parametrize(
+    ("spec", "expected"),
+    [
+        (0.3, (0.3,)),
+        ((0.1, 0.5), (0.1, 0.3, 0.5)),
+        ((0.1, 0.5, 0.4), (0.1, 0.5)),
+        ([0.1, 0.5], (0.1, 0.5)),
+        ([0.5, 0.1, 0.4], (0.1, 0.4, 0.5)),
+        ("0.1:0.3:0.1", (0.1, 0.2, 0.3)),
+        ("0.3", (0.3,)),
+        (np.array([0.2, 0.1]), (0.1, 0.2)),
+    ],
+)
+def test_axes_of_a_lattice(spec, expected):
+    assert values(ftlm.lattice(step=0.2, beta=spec))["beta"] == expected
+
+
+def test_values_of_the_structure_come_before_the_defaults_and_those_of_the_lattice_before_both():
+    options = {"orders": {"alpha": "1:2:0.5", "beta": [0.1, 0.2]}}
+    found = values(ftlm.lattice(step=0.5), **options)
+    assert found["alpha"] == (1.0, 1.5, 2.0)
+    assert found["beta"] == (0.1, 0.2)
+    assert found["mu"] == (0.0, 0.5, 1.0, 1.5, 2.0)
+    found = values(ftlm.lattice(step=0.5, beta=0.7), **options)
+    assert found["beta"] == (0.7,)
+    assert values(ftlm.Lattice(0.5, orders={"alpha": "1:1.5:0.25"}))["alpha"] == (1.0, 1.25, 1.5)
+
+
+def test_other_orders_end_at_the_largest_alpha():
+    assert values(ftlm.lattice(step=0.1, alpha=(0.3, 0.6)))["beta"] == (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+    assert values(ftlm.lattice(step=0.5), "D^1.2 y = a D^beta y + b u")["beta"] == (0.0, 0.5, 1.0)
+
+
+def test_candidates_obey_the_ranges_and_are_counted_once(run):
+    structure = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u", initial="rest")
+    lattice = ftlm.Lattice(
+        orders={"alpha": [0.5, 1.0], "beta": [0.0, 0.4, 0.5, 0.9, 1.5], "mu": [0.0, 0.4], "nu": [0.7, -0.2, 1.0]}
+    )
+    found = ftlm.search_orders(run, structure, lattice, m=M, coefficients="least-squares", keep=1000)
+    expected = set()
+    for alpha in (0.5, 1.0):
+        for beta, mu, nu in itertools.product((0.0, 0.4, 0.5, 0.9, 1.5), (0.0, 0.4), (0.7, -0.2, 1.0)):
+            if beta == mu or max(beta, mu) >= alpha or nu > alpha:
+                continue
+            # (0, 0.4) and (0.4, 0) are one candidate: both lie on both axes.
+            expected.add((alpha, *(sorted((beta, mu), reverse=True) if {beta, mu} == {0.0, 0.4} else (beta, mu)), nu))
+    assert {(r.orders["alpha"], r.orders["beta"], r.orders["mu"], r.orders["nu"]) for r in found.table} == expected
+    assert found.candidates == len(expected)
+
+
+def test_fixed_coefficients_make_own_orders_distinguishable(run):
+    orders = {"beta": [0.0, 0.6], "mu": [0.0, 0.6]}
+    lattice = ftlm.Lattice(orders=orders)
+    free, tied = (
+        ftlm.search_orders(
+            run,
+            ftlm.equation("D^1.6 y = a D^beta y + c D^mu y + b u", fixed=fixed),
+            lattice,
+            m=M,
+            coefficients="least-squares",
+        )
+        for fixed in ({}, {"a": -3.0})
+    )
+    assert free.candidates == 1
+    assert tied.candidates == 2
+    assert tied.orders == {"beta": 0.6, "mu": 0.0}
+    assert tied.coefficients == {"c": pytest.approx(-8, rel=0.1), "b": pytest.approx(5, rel=0.1)}
+    assert tied.model.coefficients["a"] == -3.0
+
+
+def test_orders_on_the_edge_of_their_interval_are_named(run):
+    structure = ftlm.equation("D^alpha y = a D^beta y + c y + b u", initial="rest")
+
+    def edges(**orders):
+        lattice = ftlm.lattice(step=0.1, **orders)
+        found = ftlm.search_orders(run, structure, lattice, m=256, coefficients="least-squares")
+        return found.edges, str(found)
+
+    assert edges(alpha=(1.4, 1.8), beta=(0.3, 0.9))[0] == {}
+    found, text = edges(alpha=(1.2, 1.6), beta=(0.3, 0.9))
+    assert found == {"alpha": 1.6}
+    assert "warning: order alpha = 1.6 is on the edge of its interval; widen it" in text
+    assert edges(alpha=(1.4, 1.8), beta=(0.6, 0.9))[0] == {"beta": 0.6}
+    # Two values are a question, not an interval.
+    assert edges(alpha=(1.5, 1.6), beta=(0.3, 0.9))[0] == {}
+
+
+def test_alpha_of_two_is_no_edge(clean_a):
+    found = ftlm.search_orders(
+        clean_a, ftlm.flexible_link().equation("theta12"), ftlm.lattice(step=0.1, alpha=(1.5, 2.0), gamma2=1.05, mu2=[0.1, 0.85], beta2=[0.1, 0.85]),
+        m=512, coefficients="least-squares",
+    )  # fmt: skip
+    assert found.orders["alpha2"] == 2.0
+    assert found.edges == {}
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Candidates without a score
+
+
+def test_dependent_regressors_are_a_reason_on_the_row(run):
+    twice = ftlm.Run.from_arrays(
+        step=run.step, inputs={"u": run["u"], "v": 2 * run["u"]}, outputs={"y": run["y"]}, name="twice"
+    )
+    structure = ftlm.equation("D^1.6 y = a D^beta y + c y + b u + d D^nu v", initial="rest")
+    lattice = ftlm.Lattice(orders={"beta": [0.4, 0.6], "nu": [0.0, 0.3]})
+    found = ftlm.search_orders(twice, structure, lattice, m=M, coefficients="least-squares")
+    assert found.candidates == 4
+    assert found.pruned["singular"] == 2
+    assert found.failures == [({"beta": b, "nu": 0.0}, "singular") for b in (0.6, 0.4)]
+    assert {r.orders["nu"] for r in found.table} == {0.3}
+    # A prior tells them apart.
+    assert ftlm.search_orders(twice, structure, lattice, m=M).pruned["singular"] == 0
+    with pytest.raises(ftlm.ModelError, match="none of 2 candidates has a finite score"):
+        ftlm.search_orders(
+            twice,
+            structure.with_orders({"nu": 0.0}),
+            ftlm.Lattice(orders={"beta": [0.4, 0.6]}),
+            m=M,
+            coefficients="least-squares",
+        )
+
+
+def test_diverging_candidates_are_a_reason_on_the_row():
+    n = 401
+    u = np.where(np.arange(n) % 80 < 40, 1.0, -1.0)
+    growing = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.cumsum(u)})
+    structure = ftlm.equation("D^alpha y = 15 y + b u", initial="rest")
+    lattice = ftlm.Lattice(orders={"alpha": [0.7, 1.0, 3.0]})
+    brute = ftlm.search_orders(growing, structure, lattice, m=400, coefficients="least-squares", early_stopping=False)
+    assert brute.pruned["diverged"] == 2
+    assert brute.failures == [({"alpha": 0.7}, "diverged"), ({"alpha": 1.0}, "diverged")]
+    assert [r.orders["alpha"] for r in brute.table] == [3.0]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Results
+
+
+def test_the_model_is_that_of_the_first_row(run):
+    found = search(run, coefficients="least-squares")
+    assert (
+        found.orders == found.model.orders == found.table[0].orders == {"alpha": 1.6, "beta": 0.6, "mu": 0.0, "nu": 0.0}
+    )
+    assert found.coefficients == found.model.coefficients
+    assert found.score == found.table[0].score
+    compared = found.model.compare(run, m=M)
+    assert compared.output_error["y"].error == pytest.approx(found.score, rel=1e-9)
+    assert found.model.m == found.m == M
+    assert found.model.units == {"u": "A", "y": "rad"}
+    assert found.model.about["orders from"] == "order search"
+
+
+def test_the_table_prints_and_is_json(run):
+    found = search(run, keep=2, coefficients="least-squares", norm="l2")
+    head, first, second_row, last = str(found).splitlines()
+    assert head.split() == ["rank", "RMSE", "alpha", "beta", "mu", "nu", "a", "c", "b"]
+    assert first.split()[0] == "1"
+    assert second_row.split()[0] == "2"
+    assert last.startswith("36 candidates: 2 kept, ")
+    document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert document["candidates"] == 36
+    assert document["settings"] == {"criterion": "output-error", "norm": "l2", "coefficients": "least-squares"}
+    assert document["table"][0]["orders"] == found.orders
+    assert "error" in str(search(run, keep=2, coefficients="least-squares")).splitlines()[0]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Progress and interruption
+
+
+def test_progress_is_told_to_the_end(run):
+    told = []
+    found = search(run, progress=lambda done, total: told.append((done, total)))
+    assert told[-1] == (found.candidates, found.candidates)
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+
+
+def test_an_error_in_progress_is_the_callers(run):
+    def fail(done, total):
+        raise RuntimeError(f"enough after {total}")
+
+    with pytest.raises(RuntimeError, match="enough after 36"):
+        search(run, progress=fail)
+    assert search(run).candidates == 36  # and the next search runs
+
+
+def test_an_error_in_progress_ends_a_long_search(clean_a):
+    told = []
+
+    def fail(done, total):
+        told.append((done, total))
+        if total:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        long_search(clean_a, progress=fail)
+    done, total = told[-1]
+    assert total == 313_845
+    assert done < total
+
+
+def long_search(run, **options):
+    return ftlm.search_orders(
+        run, ftlm.flexible_link().equation("theta12"), ftlm.lattice(alpha=(1.05, 2.0)), early_stopping=False,
+        coefficients="least-squares", **options,
+    )  # fmt: skip
+
+
+INTERRUPTED = """
+import signal, sys
+import numpy as np
+import ftlm
+signal.signal(signal.SIGINT, signal.default_int_handler)
+n = 4097
+u = np.where(np.arange(n) % 1000 < 500, 1.0, -1.0)
+rng = np.random.default_rng(0)
+run = ftlm.Run.from_arrays(step=0.002, inputs={"u": u}, outputs={"y": np.cumsum(rng.standard_normal(n))})
+small = ftlm.equation("D^alpha y = a y + b u")
+large = {large!r}
+structure = ftlm.equation(large)
+last = [0, 0]
+def progress(done, total):
+    last[:] = done, total
+    print("started", done, total, flush=True)
+try:
+    ftlm.search_orders(run, structure, early_stopping=False, m=4096, coefficients="least-squares", progress=progress)
+    print("finished")
+except KeyboardInterrupt:
+    print("interrupted", last[0] < last[1])
+print("again", ftlm.search_orders(run, small, m=64).candidates)
+"""
+
+
+@pytest.mark.parametrize(
+    "large",
+    [
+        "D^alpha y = a D^beta y + c D^mu y + b D^nu u",
+        "D^alpha y = a D^beta y + c D^mu y + d D^(alpha-beta) u + b D^nu u",
+    ],
+    ids=["one equation", "a law"],
+)
+def test_control_c_ends_a_search(large):
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTED.replace("{large!r}", repr(large))],
+        stdout=subprocess.PIPE, text=True, env=environment,
+    ) as child:  # fmt: skip
+        try:
+            for line in child.stdout:
+                if line.startswith("started") and line.split()[2] != "0":
+                    break
+            child.send_signal(signal.SIGINT)
+            rest, _ = child.communicate(timeout=20)  # a loose guard: brute force would take minutes
+        finally:
+            child.kill()
+    lines = [line for line in rest.splitlines() if not line.startswith("started")]
+    assert lines == ["interrupted True", "again 20"]
+    assert child.returncode == 0
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Refusals
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"criterion": "error"}, "criterion = 'error' is not known in this version; use 'output-error' or 'equation-error'"),
+        ({"norm": "l3"}, "norm = 'l3' is not known in this version; use 'l1' or 'l2'"),
+        ({"coefficients": "ridge"}, "coefficients = 'ridge' is not known in this version; use 'multi-innovation' or"),
+        ({"coefficients": "instrumental-variables"}, "coefficients = 'instrumental-variables' is not known in this version"),
+        ({"rows": "fourier"}, "rows = 'fourier' is not known in this version; use 'haar' or 'time'"),
+        ({"keep": 0}, "keep = 0 is outside [1, 100000]"),
+        ({"keep": 100_001}, "keep = 100001 is outside"),
+        ({"keep": 2.5}, "keep = 2.5 is outside"),
+        ({"keep": "all"}, "keep = 'all' is outside"),
+        ({"threads": 0}, "threads = 0 is outside [1, 1024]"),
+        ({"threads": 1025}, "threads = 1025 is outside [1, 1024]"),
+        ({"threads": True}, "threads = True is outside"),
+        ({"threads": float("inf")}, "threads = inf is outside"),
+        ({"innovation_length": 0}, "innovation length p = 0 is no whole number from 1"),
+        ({"innovation_length": -7}, "innovation length p = -7 is no whole number from 1"),
+        ({"innovation_length": None}, "innovation length p = None is no whole number from 1"),
+        ({"prior_covariance": 0}, "prior covariance K0 = 0 is not positive"),
+        ({"prior_covariance": -1.0}, "prior covariance K0 = -1.0 is not positive"),
+        ({"prior_covariance": float("nan")}, "prior covariance K0 = nan is not positive"),
+        ({"prior_covariance": "weak"}, "prior covariance K0 = 'weak' is not a number"),
+        ({"m": 513}, "m = 513 is more than run 'small, simulated"),
+        ({"m": 100}, "m = 100 is no power of two, which Haar rows need; take m = 64 or 128, or rows='time'"),
+        ({"m": 0}, "m = 0 is no number of pulses"),
+    ],
+)  # fmt: skip
+def test_settings_that_mean_nothing_are_refused(run, options, message):
+    with pytest.raises(ftlm.ModelError) as refused:
+        ftlm.search_orders(run, ftlm.equation(EQUATION), ftlm.Lattice(orders=GRID), **options)
+    assert message in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: ftlm.lattice(step=0), "order alpha: step 0 is not positive; the paper's is 0.05"),
+        (lambda: ftlm.lattice(step=-0.1), "step -0.1 is not positive"),
+        (lambda: ftlm.lattice(step="0.1"), "= '0.1' is not a number"),
+        (lambda: ftlm.lattice(alpha=(0, 2)), "alpha interval 0:2 starts outside (0, 3]"),
+        (lambda: ftlm.lattice(alpha=(1, 4)), "order alpha = 4 is outside [-3, 3]"),
+        (lambda: ftlm.lattice(alpha=(2, 1)), "order alpha: interval 2:1 is empty"),
+        (lambda: ftlm.lattice(alpha=2.0), "alpha = 2.0 is no interval; write (low, high)"),
+        (lambda: ftlm.lattice(alpha=(1, 2, 3)), "alpha = (1, 2, 3) is no interval"),
+        (lambda: ftlm.lattice(alpha=("1", 2)), "alpha = '1' is not a number"),
+        (lambda: values(ftlm.lattice(beta="x")), "order beta: 'x' is no interval"),
+        (lambda: values(ftlm.lattice(beta=(2, 1))), "order beta: interval 2:1 is empty"),
+        (lambda: values(ftlm.lattice(gama=1)), "lattice order 'gama' is no free order; free are alpha, beta, mu, nu"),
+        (lambda: values(ftlm.lattice(beta=1), "D^1.5 y = a y"), "lattice order 'beta' is no free order; free are none"),
+        (lambda: values(ftlm.Lattice(step=1e-7)), "has 9.5e+06 values, more than 1000000"),
+    ],
+)  # fmt: skip
+def test_lattices_that_are_none_are_refused(make, message):
+    with pytest.raises(ftlm.ModelError) as refused:
+        make()
+    assert message in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "lattice", "message"),
+    [
+        (EQUATION, {"orders": {"alpha": [0.5], "beta": [1.0]}}, "the lattice holds no candidate"),
+        (EQUATION, {"orders": {"alpha": [0.0]}}, "order alpha = 0 is outside (0, 3]; move the interval of alpha"),
+        ("D^alpha y = a D^b y + c D^e y + d D^f y + g D^h y + u", {"step": 0.002}, "candidates, more than the limit of 500000000"),
+        ("D^alpha y = a D^(alpha+0.1) y + b u", {}, "the lattice holds no candidate"),
+        ("D^alpha y = a D^(alpha-beta) y + b D^(mu) u + c D^nu u", {"step": 0.002}, "candidates, more than the limit of 500000000"),
+        ("D^1.5 y = a y + b u", {}, "every order is a number, so there is nothing to search"),
+        ("D^alpha y = a y + b u; D^beta z = c z", {}, "the equations share no order law, so they are searched one by one: pass .equation('y')"),
+    ],
+)  # fmt: skip
+def test_nothing_or_too_much_to_search_is_refused(run, text, lattice, message):
+    with pytest.raises(ftlm.ModelError) as refused:
+        ftlm.search_orders(run, ftlm.equation(text), ftlm.Lattice(**lattice), m=M, threads=1)
+    assert message in str(refused.value)
+
+
+def test_what_is_no_structure_no_lattice_and_no_run_is_refused(run):
+    with pytest.raises(ftlm.ModelError, match="equation is str, not a structure; use ftlm.equation or flexible_link"):
+        ftlm.search_orders(run, EQUATION)
+    with pytest.raises(ftlm.ModelError, match="lattice is dict, not a Lattice"):
+        ftlm.search_orders(run, ftlm.equation(EQUATION), GRID)
+    with pytest.raises(ftlm.DataError, match="no run is given"):
+        ftlm.search_orders([], ftlm.equation(EQUATION))
+    with pytest.raises(ftlm.DataError, match="has no signal 'w', which the model needs"):
+        ftlm.search_orders(run, ftlm.equation("D^alpha y = a y + b w"))
+
+
+def test_a_constant_output_is_refused(run):
+    still = ftlm.Run.from_arrays(step=0.1, inputs={"u": run["u"]}, outputs={"y": np.full(513, 2.5)}, name="still")
+    with pytest.raises(
+        ftlm.DataError, match=r"output 'y' of run 'still': constant, every row is 2\.5, first at row 0, 513 in all"
+    ):
+        ftlm.search_orders(still, ftlm.equation(EQUATION))
+
+
+def test_threads():
+    assert check_threads(None) == available_threads() >= 1
+    assert check_threads(3) == 3
+    assert check_threads(np.int64(2)) == 2
+
+
+def test_settings_state_what_matters_and_nothing_else():
+    made = Settings.check("output-error", "l1", "multi-innovation", 7, 1.0, "haar", 20, 1)
+    assert made.needs_haar
+    assert made.to_dict() == {
+        "criterion": "output-error", "norm": "l1", "coefficients": "multi-innovation",
+        "innovation_length": 7, "prior_covariance": 1.0, "rows": "haar",
+    }  # fmt: skip
+    plain = replace(made, coefficients="least-squares")
+    assert not plain.needs_haar
+    assert plain.to_dict() == {"criterion": "output-error", "norm": "l1", "coefficients": "least-squares"}
+    assert plain.core()[2] == 0
+
+
+def test_power_means_of_the_oracle_are_those_of_a_power():
+    # The oracle above builds initial terms itself: its first pulse has the closed form h^e/(e + 1).
+    record = Record(ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(65)}, outputs={"y": np.arange(65.0)}))
+    np.testing.assert_allclose(record.powers((0.5,))[0, 0], 0.1**0.5 / 1.5)
+    assert gamma(2.5) == pytest.approx(0.75 * np.sqrt(np.pi))

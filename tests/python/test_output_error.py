@@ -1,0 +1,204 @@
+"""Joint output error: the Jacobian, the optimum beside SciPy's, recovery of the truth with honest intervals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import ftlm
+from ftlm import _core
+from ftlm.demo import demo_plant
+from ftlm.output_error import FreeProblem, experiment, fit_output_error, is_white
+
+THREE_TERMS = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
+
+
+def three_terms(noise_db: float, seed: int, *, rows: int = 1025, period: float = 5.0) -> ftlm.Run:
+    """0.8 D^2.2 y + 0.5 D^0.9 y + y = u under a square input, white noise on y."""
+    step = 20.0 / (rows - 1)
+    t = np.arange(rows) * step
+    u = np.sign(np.sin(2 * np.pi * (t + step / 2) / period))
+    truth = ftlm.Model(ftlm.equation("D^2.2 y = -0.625 D^0.9 y - 1.25 y + 1.25 u"))
+    clean = truth.simulate(ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": 0 * t}), tolerance=1e-7)
+    sigma = np.std(clean["y"]) * 10 ** (-noise_db / 20)
+    noisy = clean["y"] + sigma * np.random.default_rng(seed).standard_normal(rows)
+    return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": noisy}, name=f"seed {seed}")
+
+
+def structure() -> ftlm.Structure:
+    return replace(ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u"), initial="rest")
+
+
+def arm_run(stage: int, rows: int, noise: float, seed: int) -> ftlm.Run:
+    t = np.arange(rows) * 0.002
+    current = np.where((t + 0.001) % 2 < 1, 0.3, -0.3)
+    names = (f"theta{stage}1", f"theta{stage}2")
+    blank = ftlm.Run.from_arrays(
+        step=0.002, inputs={f"I{stage}": current}, outputs={n: np.zeros(rows) for n in names}, name="arm"
+    )
+    clean = ftlm.simulate(demo_plant(stage), blank, tolerance=1e-7)
+    rng = np.random.default_rng(seed)
+    outputs = {n: clean[n] + noise * np.std(clean[n]) * rng.standard_normal(rows) for n in names}
+    return ftlm.Run.from_arrays(step=0.002, inputs={f"I{stage}": current}, outputs=outputs, name="arm")
+
+
+def residuals_at(problem: FreeProblem, prepared: list, initial: object, orders: list, coefficients: list) -> dict:
+    """One evaluation, no step."""
+    return _core.output_error(
+        prepared, problem.laws(problem.structure.signals), [(0.01, 3.0)] * len(orders), ["plain"] * len(coefficients),
+        problem.structure.coupling == "simulated", initial, orders, coefficients, 1, 1e-12,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("coupling", ["simulated", "measured"])
+@pytest.mark.parametrize("initial", [(False, []), (True, [])])
+def test_the_analytic_jacobian_is_that_of_finite_differences(coupling: str, initial: tuple) -> None:
+    run = arm_run(1, 301, 1e-3, 0)
+    words = "caputo" if initial[0] else "rest"
+    problem = FreeProblem.of(replace(ftlm.flexible_link(stage=1, coupling=coupling), initial=words))
+    prepared = [experiment(run, problem, words, [1.0, 10.0], every=2)]
+    # Away from whole differences of orders, where initial terms merge.
+    named = {"alpha1": 1.93, "alpha2": 1.91, "gamma1": 0.9, "beta2": 0.13, "mu2": 0.8}
+    named |= {"a1": 500.0, "b1": -50.0, "d1": 8.0, "g1": 120.0, "r1": 1.5}
+    names = [*problem.orders, *problem.coefficients]
+    point = np.array([named[n] for n in names])
+    count = len(problem.orders)
+    base = residuals_at(problem, prepared, initial, list(point[:count]), list(point[count:]))
+    weights = np.linalg.norm(base["jacobian"], axis=1)
+    for i, name in enumerate(names):
+        shift = 1e-6 * max(abs(point[i]), 1.0)
+        sides = []
+        for sign in (1, -1):
+            moved = point.copy()
+            moved[i] += sign * shift
+            sides.append(residuals_at(problem, prepared, initial, list(moved[:count]), list(moved[count:])))
+        slope = (np.asarray(sides[0]["residuals"]) - np.asarray(sides[1]["residuals"])) / (2 * shift)
+        found = np.asarray(base["jacobian"][i])
+        if initial[0]:
+            # The projection on the initial terms is Kaufman's: exact up to terms of the size of the residual, so the
+            # gradient of the cost, not each residual's slope, is exact.
+            gradient = float(slope @ base["residuals"])
+            assert float(found @ base["residuals"]) == pytest.approx(gradient, rel=2e-3, abs=1e-4 * weights[i]), name
+        else:
+            assert np.max(np.abs(slope - found)) < 2e-5 * np.max(np.abs(found)) + 1e-9 * weights[i], name
+
+
+def test_the_optimum_is_scipys() -> None:
+    run = three_terms(30, 5, rows=513)
+    problem = FreeProblem.of(structure())
+    prepared = [experiment(run, problem, "rest", [20.0])]
+    start = np.array([2.1, 1.0, -0.7, -1.1, 1.1])
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        return np.asarray(residuals_at(problem, prepared, (False, []), list(x[:2]), list(x[2:]))["residuals"])
+
+    theirs = least_squares(residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    ours = _core.output_error(
+        prepared, problem.laws(("y", "u")), [(0.01, 3.0)] * 2, ["logarithm"] * 3, False, (False, []),
+        list(start[:2]), list(start[2:]), 100, 1e-12,
+    )  # fmt: skip
+    assert ours["status"] == "converged"
+    assert ours["cost"] == pytest.approx(theirs.cost, rel=1e-8)
+    assert np.array(ours["orders"] + ours["coefficients"]) == pytest.approx(theirs.x, rel=1e-4)
+    assert ours["evaluations"] < theirs.nfev * 3
+
+
+def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
+    scores = []
+    for seed in range(16):
+        found = fit_output_error([three_terms(40, seed)], structure())
+        assert found.names == list(THREE_TERMS)
+        errors = np.array(list(found.standard_errors.values()))
+        scores.append((found.values - np.array(list(THREE_TERMS.values()))) / errors)
+    z = np.array(scores)
+    # 80 correlated scores: wide bounds, but a scheme that is biased or overconfident fails them.
+    assert np.mean(np.abs(z) < 1.96) > 0.85
+    assert np.all(np.abs(z.mean(axis=0)) < 1.0)
+    assert np.max(np.abs(z)) < 4.5
+
+
+@pytest.mark.parametrize(("stage", "noise"), [(1, 1e-2), (1, 1e-4), (2, 1e-2)])
+def test_the_arm_is_recovered_from_an_automatic_start_under_both_laws(stage: int, noise: float) -> None:
+    run = arm_run(stage, 3001, noise, 3)
+    found = ftlm.identify(run, ftlm.flexible_link(stage=stage), method="output-error")
+    truth = {n: v for n, v in demo_plant(stage).orders.items()} | demo_plant(stage).coefficients
+    assert found.joint is not None
+    for name, value in {**found.orders, **found.joint.coefficients}.items():
+        if name in truth:
+            assert abs(value - truth[name]) < 5 * found.standard_errors[name], name
+    for name, (low, high) in found.intervals.items():
+        assert low < high, name
+    for output, noise_found in found.joint.noise.items():
+        assert noise_found == pytest.approx(noise * np.std(run[output]), rel=0.06)
+    coefficients = found.coefficients
+    d, h = 2 * stage, 2 * stage - 1
+    assert coefficients[f"b{d}"] == -coefficients[f"b{h}"]
+    assert coefficients[f"a{d}"] == pytest.approx(-coefficients[f"a{h}"] * found.joint.coefficients[f"r{stage}"])
+
+
+def test_printed_figures_are_those_of_compare_and_the_model_saves(tmp_path) -> None:
+    run = three_terms(40, 1)
+    found = ftlm.identify(run, ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u"))
+    assert found.method == "output-error"
+    assert found.fit_percent["y"] > 98
+    again = ftlm.load_model(found.model.save(tmp_path / "m.json")).compare(run)
+    assert again.fit_percent["y"] == pytest.approx(found.fit_percent["y"], abs=1e-12)
+    assert "±" in str(found)
+    assert set(found.to_dict()["intervals"]) == set(THREE_TERMS)
+
+
+def test_several_runs_of_different_length_and_step_tell_more_than_one() -> None:
+    short, long = three_terms(30, 2, rows=513), three_terms(30, 3, rows=1025, period=3.0)
+    alone = fit_output_error([short], structure())
+    both = fit_output_error([short, long], structure())
+    values = dict(zip(both.names, both.values, strict=True))
+    for name, truth in THREE_TERMS.items():
+        assert both.standard_errors[name] < alone.standard_errors[name]
+        assert abs(values[name] - truth) < 4.5 * both.standard_errors[name]
+
+
+def test_a_run_that_does_not_start_at_rest_keeps_its_initial_terms_to_itself() -> None:
+    # Free decay from y(0) = 1 under a small input: without initial terms nothing fits.
+    t = np.arange(801) * 0.02
+    u = 0.3 * np.sign(np.sin(2.5 * t))
+    model = ftlm.Model(ftlm.equation("D^1.6 y = -0.8 D^0.7 y - 2.0 y + 1.5 u", initial="caputo"))
+    blank = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * t})
+    # D^0.7 of the constant leaves t^0.9 beside t^0 (mathematics of initial terms): 0.8/Γ(1.9).
+    clean = model.simulate(blank, initial={"y": {0.0: 1.0, 0.9: 0.8 / 0.9617658319073874}})
+    noisy = clean["y"] + 1e-3 * np.random.default_rng(0).standard_normal(801)
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": noisy})
+    found = ftlm.identify(run, ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u"))
+    truth = {"alpha": 1.6, "nu": 0.7, "a1": -0.8, "a0": -2.0, "b0": 1.5}
+    for name, value in {**found.orders, **found.coefficients}.items():
+        assert abs(value - truth[name]) < 5 * found.standard_errors[name] + 1e-6, name
+    assert found.fit_percent["y"] > 99
+
+
+def test_what_the_run_cannot_tell_is_said_in_words() -> None:
+    # One sine at one frequency cannot tell five numbers.
+    t = np.arange(1025) * 0.02
+    u = np.sin(2.0 * t)
+    truth = ftlm.Model(ftlm.equation("D^2.2 y = -0.625 D^0.9 y - 1.25 y + 1.25 u"))
+    clean = truth.simulate(ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * t}))["y"]
+    noisy = clean + 0.05 * np.std(clean) * np.random.default_rng(4).standard_normal(t.size)
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": noisy}).slice(8.0, None)
+    found = ftlm.identify(run, ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u"))
+    assert any("cannot be told" in w or "not different from 0" in w or "bound" in w for w in found.warnings)
+
+
+def test_white_noise_is_white_and_coloured_noise_is_not() -> None:
+    rng = np.random.default_rng(11)
+    whites = [is_white(rng.standard_normal(2000)) for _ in range(200)]
+    assert 0.95 < np.mean(whites) <= 1.0
+    coloured = np.convolve(rng.standard_normal(2001), [1.0, 0.3])[1:2001]
+    assert not is_white(coloured)
+
+
+def test_the_search_is_the_same_for_any_number_of_threads() -> None:
+    run = three_terms(30, 7, rows=513)
+    first, second = (fit_output_error([run], structure(), threads=n) for n in (1, 2))
+    assert np.array_equal(first.values, second.values)
+    assert first.cost == second.cost
