@@ -141,8 +141,8 @@ def flexible_link(
     coupling
         Whether free runs couple the two simulated outputs (from the currents alone) or take the other as measured.
     cross_stage
-        Adds the other stage's angles and current to every equation (order 0). Not with ``stage="both"``, whose
-        equations get each other's signals.
+        Adds the other stage's angles and current to every equation (order 0); with ``stage="both"`` those are
+        modelled too.
     friction
         Adds a Coulomb term c * sign(D theta_j1) to both equations; needs measured coupling.
     laws

@@ -369,10 +369,12 @@ fn a_division_under_way_gives_the_quotient_block_by_block() {
             let whole = series::divide(&n, &d).unwrap();
             assert_eq!((division.terms(), division.solved()), (m, 0));
             let inverse = [1.0 / d[0]];
+            if pass == 0 {
+                division.add(0, 0, &n);
+            }
             while division.solved() < m {
                 let (start, reads) = (division.solved(), division.reads());
                 let end = (start + BLOCK).min(m);
-                division.add(0, start, &n[start..end]);
                 let series = |_: usize, _: usize, len: usize| {
                     assert!(len <= reads, "{len} terms read, {reads} announced");
                     &d[..len]
@@ -380,13 +382,17 @@ fn a_division_under_way_gives_the_quotient_block_by_block() {
                 if pass == 0 {
                     division.advance(&inverse, series);
                 } else {
+                    // The numerator as late as it is needed, each block read before its effect on the rest is known.
+                    division.add(0, start, &n[start..end]);
                     division.solve_block(&inverse, series);
-                    assert_eq!(bits(division.quotient(0)), bits(&whole[..end]));
+                    assert!(distance(division.quotient(0), &whole[..end]) <= 1e-13 * largest(&whole[..end]));
                     division.join(series);
                 }
                 assert_eq!(division.solved(), end);
             }
-            assert_eq!(bits(division.quotient(0)), bits(&whole));
+            if pass == 0 {
+                assert_eq!(bits(division.quotient(0)), bits(&whole));
+            }
         }
         assert_eq!(division.into_quotients()[0].len(), m);
     }
