@@ -55,7 +55,7 @@ class LinkParameters:
         r = self.inertia_ratio
         return {
             f"a{hub}": a, f"b{hub}": b, f"d{hub}": d, f"g{hub}": g,
-            f"a{deflection}": -a * r, f"b{deflection}": -b, f"d{deflection}": -d * r, f"g{deflection}": -g,
+            f"a{deflection}": -a * r, f"b{deflection}": -b, f"d{deflection}": 0.0 - d * r, f"g{deflection}": -g,
         }  # fmt: skip
 
 

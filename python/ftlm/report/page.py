@@ -171,7 +171,9 @@ def identification_page(
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     sections = [
         Section("Warnings", words[1:] if warnings else words, warnings),
-        Section("Equations", [equation_html(e) for e in model.equations], tables=[parameter_table(model)]),
+        Section(
+            "Equations", [equation_html(e) for e in model.equations], tables=[parameter_table(model, result.joint)]
+        ),
         Section("Errors", tables=[errors_table(compared, units=units)]),
         Section(
             "Measured and simulated",

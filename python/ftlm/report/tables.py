@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from ftlm.identification import Identification
     from ftlm.models import Equation, Model, Order
     from ftlm.order_search import SearchResult
+    from ftlm.output_error import JointFit
     from ftlm.validation import Comparison, Metrics
 
 __all__ = [
@@ -229,12 +230,25 @@ def _derivative_html(order: Order, signal: str) -> Markup:
 # ------------------------------------------------------------------------------------------------ one model
 
 
-def parameter_table(model: Model, *, title: str = "Orders and coefficients") -> Table:
-    """Return free orders and coefficients with the place of each, beside the values that the maker states."""
+def parameter_table(model: Model, joint: JointFit | None = None, *, title: str = "Orders and coefficients") -> Table:
+    """Return orders and coefficients with the place of each, beside standard errors and the values the maker states.
+
+    Parameters
+    ----------
+    model
+        The model.
+    joint
+        The fit that it came from, where there is one: it knows the standard errors.
+    title
+        Caption.
+    """
     reference = model.structure.reference
+    errors = {} if joint is None else joint.standard_errors
     rows: list[list[Cell]] = [
-        [symbol_html(name), Exact(value), None, "free order"] for name, value in model.orders.items()
+        [symbol_html(name), Exact(value) if joint is None else value, errors.get(name), None, "free order"]
+        for name, value in model.orders.items()
     ]
+    shown = set(model.orders)
     for item in model.equations:
         for term in item.terms:
             if term.name is None:
@@ -243,15 +257,28 @@ def parameter_table(model: Model, *, title: str = "Orders and coefficients") -> 
                 _derivative_html(term.order, term.signal), symbol_html(item.output)
             )
             stated = reference.get(term.name)
+            shown.add(term.name)
             # + 0.0 makes the negative zero of a product of signs a plain zero.
             rows.append([
-                symbol_html(term.name), float(term.coefficient), None if stated is None else stated + 0.0, place
+                symbol_html(term.name), float(term.coefficient), errors.get(term.name),
+                None if stated is None else stated + 0.0, place,
             ])  # fmt: skip
-    note = "No standard errors are given here: this table does not say how many of the digits mean something."
-    if not reference:
-        return Table(title, ("parameter", "value", "what it is"), [[*row[:2], row[3]] for row in rows], note=note)
-    note += " Stated values belong to the integer orders of the maker's model."
-    return Table(title, ("parameter", "value", "stated", "what it is"), rows, note=note)
+    if joint is not None:
+        rows += [
+            [symbol_html(n), v, errors[n], None, "free in the coefficient law"]
+            for n, v in joint.coefficients.items()
+            if n not in shown
+        ]
+    columns = ["parameter", "value", "standard error", "stated", "what it is"]
+    if joint is None:
+        note = "No standard errors are given here: this table does not say how many of the digits mean something."
+    else:
+        note = "95 % intervals are the value ± 1.96 standard errors. A coefficient without one follows from the law."
+    left_out = ([] if joint is not None else [2]) + ([] if reference else [3])
+    if reference:
+        note += " Stated values belong to the integer orders of the maker's model."
+    kept = [i for i in range(len(columns)) if i not in left_out]
+    return Table(title, tuple(columns[i] for i in kept), [[row[i] for i in kept] for row in rows], note=note)
 
 
 def settings_table(result: Identification, *, title: str = "What the result depends on") -> Table:
@@ -262,7 +289,7 @@ def settings_table(result: Identification, *, title: str = "What the result depe
     rows: list[list[Cell]] = [
         ["structure", structure.name],
         ["coupling in free runs", structure.coupling],
-        ["coefficients by", result.method],
+        ["estimator", result.method],
         ["block pulses a run, M", int(used["m"])],
     ]
     if "innovation_length" in used:
@@ -271,6 +298,13 @@ def settings_table(result: Identification, *, title: str = "What the result depe
             [Markup("prior covariance, K<sub>0</sub>"), Exact(used["prior_covariance"])],
             ["rows of the recursion", coordinates.get(used["rows"], used["rows"])],
         ]  # fmt: skip
+    if "refinement" in used:
+        rows += [
+            ["pulses a sample interval", int(used["refinement"])],
+            ["automatic starts", int(used["starts"])],
+        ]
+        for name, level in used["noise"].items():
+            rows.append([f"noise found on {symbol(name)}", float(level)])
     rows.append(["initial terms", initial.get(str(used["initial"]), str(used["initial"]))])
     if result.searches:
         norm = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}.get(used["norm"], used["norm"])
