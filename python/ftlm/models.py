@@ -980,6 +980,16 @@ def numeric(item: Equation) -> str:
 def load_model(path: str | os.PathLike[str]) -> Model:
     """Read a model written by :meth:`Model.save`.
 
+    Parameters
+    ----------
+    path
+        The file.
+
+    Returns
+    -------
+    Model
+        The same to the last bit, without what is of use only before identification (lattices, laws, references).
+
     Raises
     ------
     DataError

@@ -191,10 +191,10 @@ BAD = {
         "output 'y' of run 'run': constant, every row is 2.0, first at row 0, 65 in all",
         lambda: identify(run(np.full(N, 2.0))),
     ),
-    "NaN in a run": (DATA, "signal 'y': not finite, first at row 3, 2 in all", lambda: run(spoiled(3, 9))),
+    "NaN in a run": (DATA, "signal 'y': NaN, first at row 3, 2 in all", lambda: run(spoiled(3, 9))),
     "infinity in a run": (
         DATA,
-        "signal 'y': not finite, first at row 5, 1 in all",
+        "signal 'y': infinity (-inf), first at row 5, 1 in all",
         lambda: run(spoiled(5, by=-math.inf)),
     ),
     "empty run": (DATA, "0 rows", lambda: run(Y[:0], U[:0])),

@@ -1,0 +1,340 @@
+"""The rules of the house, enforced: who may import what, what every file and every public name says of itself."""
+
+import ast
+import importlib.util
+import inspect
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+
+import pytest
+
+import ftlm
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = ROOT / "python" / "ftlm"
+PYTHON = sorted(PACKAGE.rglob("*.py"))
+RUST = sorted((ROOT / "rust").rglob("*.rs"))
+
+
+def name_of(path):
+    return str(path.relative_to(ROOT))
+
+
+def code_of(path):
+    """Rust source without comments, strings and test modules."""
+    text = path.read_text(encoding="utf-8")
+    text = re.sub(r'"(?:\\.|[^"\\])*"', '""', text)
+    text = re.sub(r"//[^\n]*", "", text)
+    return re.sub(r"#\[cfg\(test\)\]\s*mod \w+ \{.*?\n\}", "", text, flags=re.DOTALL)
+
+
+def imports_of(path):
+    """Top-level names of everything that a Python file imports, at whatever depth."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            found.add(node.module.split(".")[0])
+    return found
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Who may use what
+
+
+def uses(path, crate):
+    return re.search(rf"\b(?:use\s+{crate}\b|{crate}::)", code_of(path)) is not None
+
+
+@pytest.mark.parametrize(
+    ("crate", "home"),
+    [
+        ("faer", "dense.rs"),
+        ("nalgebra", "small.rs"),
+        ("realfft", "fft.rs"),
+        ("rustfft", "fft.rs"),
+        ("num_complex", "fft.rs"),
+    ],
+)
+def test_one_file_uses_a_crate_of_linear_algebra_or_transforms(crate, home):
+    users = [name_of(path) for path in RUST if uses(path, crate)]
+    assert set(users) <= {f"rust/{home}"}
+    if crate in ("faer", "nalgebra", "realfft"):
+        assert users == [f"rust/{home}"]
+
+
+@pytest.mark.parametrize("crate", ["pyo3", "numpy"])
+def test_only_the_bindings_know_python(crate):
+    users = {name_of(path.parent) for path in RUST if uses(path, crate)}
+    assert users == {"rust/python"}
+
+
+def test_bindings_are_an_optional_feature():
+    manifest = tomllib.loads((ROOT / "Cargo.toml").read_text(encoding="utf-8"))
+    assert manifest["features"]["default"] == []
+    assert all(manifest["dependencies"][crate]["optional"] for crate in ("pyo3", "numpy"))
+    assert re.search(r'#\[cfg\(feature = "python"\)\]\s*mod python;', (ROOT / "rust" / "lib.rs").read_text())
+    assert not manifest["dependencies"]["faer"]["default-features"]  # its rayon would nest inside a search
+
+
+def test_rust_does_no_files_clocks_or_unsafe_code():
+    for path in RUST:
+        code = code_of(path)
+        assert "std::fs" not in code, path
+        assert not re.search(r"\bunsafe\b(?!_)", code), path
+        if path.name not in ("virtual_arm.rs", "search.rs"):
+            assert "std::time" not in code, path
+
+
+@pytest.mark.parametrize("path", RUST, ids=name_of)
+def test_rust_never_gives_up_on_user_data(path):
+    found = re.findall(r"\.unwrap\(\)|\.expect\(|\b(?:panic|unreachable|todo|unimplemented)!", code_of(path))
+    assert found == []
+
+
+def test_only_the_report_draws():
+    users = {name_of(path) for path in PYTHON if imports_of(path) & {"matplotlib", "pylab", "plotly"}}
+    assert all(name.startswith("python/ftlm/report/") for name in users)
+
+
+@pytest.mark.parametrize("path", PYTHON, ids=name_of)
+def test_nothing_runs_or_unpickles_what_it_is_given(path):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    called = {n.func.id for n in ast.walk(tree) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)}
+    assert not called & {"eval", "exec", "compile"}
+    assert not imports_of(path) & {"pickle", "shelve", "marshal", "dill", "joblib"}
+    keywords = {k.arg for n in ast.walk(tree) if isinstance(n, ast.Call) for k in n.keywords}
+    assert "shell" not in keywords
+
+
+def test_importing_the_package_imports_little():
+    script = (
+        "import sys; before = set(sys.modules); import ftlm; "
+        "new = {m.split('.')[0] for m in set(sys.modules) - before}; "
+        "print(sorted(m for m in new if m not in sys.stdlib_module_names))"
+    )
+    ran = subprocess.run([sys.executable, "-W", "error", "-c", script], capture_output=True, text=True, check=True)
+    found = set(ast.literal_eval(ran.stdout))
+    assert not found & {"scipy", "pandas", "polars", "pyarrow", "matplotlib", "sympy", "mpmath", "control", "dask"}
+    # The core needs NumPy and msgspec; the rest of the core install serves the command line and the report.
+    # (msgspec looks for typing_extensions and takes it where it is.)
+    assert found <= {"ftlm", "numpy", "msgspec", "typing_extensions"}
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# No loop over samples in Python
+
+COUNTS = ("size", "length", "m")
+
+
+def counts_samples(node):
+    """Whether an expression is the number of samples or pulses of something, give or take a constant."""
+    if isinstance(node, ast.BinOp):
+        return counts_samples(node.left) or counts_samples(node.right)
+    if isinstance(node, ast.Attribute):
+        return node.attr in COUNTS
+    if isinstance(node, ast.Name):
+        return node.id == "m"
+    if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Attribute) and node.value.attr == "shape":
+        return ast.unparse(node.slice) in ("0", "-1")
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "len":
+        return any(is_signal(a) for a in node.args)
+    return False
+
+
+def is_signal(node):
+    """Whether an expression is a signal of a run or a record."""
+    if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name):
+        return node.value.id == "run"
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+        return node.func.attr in ("of", "nditer") or (node.func.attr == "tolist" and is_signal(node.func.value))
+    return isinstance(node, ast.Name) and node.id == "samples"
+
+
+def loops_over_samples(source):
+    """What the loops and comprehensions run over that step through samples."""
+    found = set()
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, (ast.For, ast.comprehension)):
+            continue
+        pending = [node.iter]
+        while pending:
+            it = pending.pop()
+            if isinstance(it, ast.Call) and isinstance(it.func, ast.Name):
+                if it.func.id in ("enumerate", "zip", "reversed", "iter"):
+                    pending += it.args
+                    continue
+                if it.func.id == "range" and any(counts_samples(a) for a in it.args):
+                    found.add(ast.unparse(node.iter))
+            if is_signal(it):
+                found.add(ast.unparse(node.iter))
+    return sorted(found)
+
+
+@pytest.mark.parametrize("path", PYTHON, ids=name_of)
+def test_python_does_not_loop_over_samples(path):
+    # Approximate: it knows the names that samples and their number go by. Exempt are the q8 loop, paced by its board,
+    # and the report, which writes the thinned points of a picture one by one.
+    if name_of(path).startswith(("python/ftlm/rig/quanser.py", "python/ftlm/report/")):
+        return
+    assert loops_over_samples(path.read_text(encoding="utf-8")) == []
+
+
+@pytest.mark.parametrize(
+    ("source", "count"),
+    [
+        ("for i in range(len(run['y'])): pass", 1),
+        ("for i, v in enumerate(run['y']): pass", 1),
+        ("for i in range(run.length): pass", 1),
+        ("for k in range(1, m): pass", 1),
+        ("for k in range(y.shape[0] - 1): pass", 1),
+        ("x = [v * 2 for v in samples]", 1),
+        ("x = [a - b for a, b in zip(rec.of('y'), rec.of('u'))]", 1),
+        ("for name in run.outputs: pass", 0),
+        ("for i in range(4): pass", 0),
+        ("for k in range(x.shape[1]): pass", 0),
+        ("x = [run[n] for n in run.inputs]", 0),
+    ],
+)
+def test_the_check_for_loops_finds_loops(source, count):
+    assert len(loops_over_samples(source)) == count
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What files and names say of themselves
+
+OWN = sorted(
+    {
+        *PYTHON,
+        *(ROOT / "tests" / "python").glob("*.py"),
+        *(ROOT / "benches").glob("*.py"),
+        *(ROOT / "examples").glob("*.py"),
+    }
+)
+
+
+@pytest.mark.parametrize("path", OWN, ids=name_of)
+def test_a_python_file_opens_with_what_it_is_for(path):
+    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+    assert text
+    first = text.split("\n\n")[0].strip()
+    assert first[-1] in ".:"
+    assert len(first) > 20
+
+
+@pytest.mark.parametrize(
+    "path",
+    [*RUST, *sorted((ROOT / "tests" / "rust").rglob("*.rs")), *sorted((ROOT / "benches").glob("*.rs"))],
+    ids=name_of,
+)
+def test_a_rust_file_opens_with_what_it_is_for(path):
+    opening = path.read_text(encoding="utf-8").split("\n\n")[0]
+    lines = [line for line in opening.splitlines() if line.startswith("//!")]
+    assert opening.startswith("//! ")
+    assert "." in " ".join(lines)
+
+
+def test_public_names_are_what_they_should_be():
+    assert ftlm.__all__ == sorted(
+        ftlm.__all__, key=lambda n: (not n.isupper(), not n[0].isupper(), n.startswith("_") * -1, n)
+    )
+    for name in ftlm.__all__:
+        assert hasattr(ftlm, name)
+    public = {n for n, value in vars(ftlm).items() if not n.startswith("_") and not inspect.ismodule(value)}
+    assert public <= set(ftlm.__all__)
+
+
+@pytest.mark.parametrize("name", [n for n in ftlm.__all__ if n not in ("PARAMETERS", "__version__")])
+def test_every_public_name_has_a_docstring(name):
+    text = getattr(ftlm, name).__doc__
+    assert text
+    assert text.strip().splitlines()[0].rstrip()[-1] in ".:"
+
+
+def documented(text):
+    """Names in the Parameters section of a numpydoc docstring."""
+    found = re.search(
+        r"^Parameters\n-{10}\n(.*?)(?=^\S[^\n]*\n-{3,}\n|\Z)", inspect.cleandoc(text), re.MULTILINE | re.DOTALL
+    )
+    if found is None:
+        return set()
+    heads = [line.split(" : ")[0] for line in found[1].splitlines() if line and not line.startswith(" ")]
+    return {name.strip().lstrip("*").replace("\\", "") for head in heads for name in head.split(",")}
+
+
+FUNCTIONS = [n for n in ftlm.__all__ if inspect.isfunction(getattr(ftlm, n))]
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_every_parameter_of_every_public_function_is_documented(name):
+    function = getattr(ftlm, name)
+    parameters = set(inspect.signature(function).parameters)
+    assert documented(function.__doc__) == parameters
+    sections = re.findall(r"^(\w[\w ]*)\n-{3,}$", inspect.cleandoc(function.__doc__), re.MULTILINE)
+    assert {"Returns", "Raises"} <= set(sections)
+    assert [s for s in ("Parameters", "Returns", "Raises", "Notes", "Examples") if s in sections] == sections
+
+
+@pytest.mark.parametrize("name", [n for n in ftlm.__all__ if is_dataclass(getattr(ftlm, n))])
+def test_every_field_of_every_public_record_is_documented(name):
+    record = getattr(ftlm, name)
+    assert documented(record.__doc__) == {f.name for f in fields(record)}
+
+
+@pytest.mark.parametrize(
+    "name", ["Run", "Model", "Structure", "Identification", "SearchResult", "Comparison", "Order", "Lattice"]
+)
+def test_every_public_member_has_a_docstring(name):
+    for member, value in vars(getattr(ftlm, name)).items():
+        if member.startswith("_") or not (callable(value) or isinstance(value, (property, classmethod))):
+            continue
+        assert inspect.getdoc(getattr(getattr(ftlm, name), member)), member
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# One version, one machine's paths nowhere, stubs that are true
+
+
+def test_one_version():
+    manifest = tomllib.loads((ROOT / "Cargo.toml").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert ftlm.__version__ == manifest["package"]["version"]
+    assert project["project"]["dynamic"] == ["version"]
+
+
+def tracked():
+    git = shutil.which("git")
+    if git is None or not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout")
+    listed = subprocess.run([git, "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True)
+    return [ROOT / name for name in listed.stdout.split("\0") if name and (ROOT / name).is_file()]
+
+
+def test_no_path_of_a_machine_in_a_tracked_file():
+    # Put together here, so that this file does not find itself.
+    machine = re.compile(
+        "|".join(["/ho" + "me/", "/ro" + "ot/", "/wo" + "rk/", "/Us" + "ers/", r"[A-Z]:\\Us" + "ers"]).encode()
+    )
+    found = [name_of(path) for path in tracked() if machine.search(path.read_bytes())]
+    assert found == []
+
+
+def test_no_built_or_temporary_file_is_tracked():
+    bad = (".so", ".pyd", ".pyc", ".orig", ".rej", ".whl", ".egg-info")
+    assert [name_of(p) for p in tracked() if p.name.endswith(bad) or "__pycache__" in p.parts] == []
+
+
+def test_stubs_are_true():
+    if importlib.util.find_spec("mypy") is None:
+        pytest.skip("mypy is not installed")
+    assert (PACKAGE / "py.typed").exists()
+    ran = subprocess.run(
+        [sys.executable, "-m", "mypy.stubtest", "ftlm._core"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 0, ran.stdout + ran.stderr
