@@ -200,9 +200,14 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
         if delay:
             raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
         return _core.pulse_means(samples, m, False)
+    held = run.intersample[name] == "zoh"
     if delay:
-        samples = _core.delayed(samples, delay / run.step, 0.0 if at_rest else float(samples[0]))
-    return _core.pulse_means(samples, m, run.intersample[name] == "zoh")
+        intervals = run.length - 1
+        # On a finer grid the delayed command switches within an interval, so it is held on that grid before the delay.
+        every = m // intervals if held and m % intervals == 0 else 1
+        samples = np.repeat(samples, every)[: intervals * every + 1]
+        samples = _core.delayed(samples, delay / run.step * every, 0.0 if at_rest else float(samples[0]))
+    return _core.pulse_means(samples, m, held)
 
 
 # ------------------------------------------------------------------------------------------------ as the core takes it

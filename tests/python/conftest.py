@@ -5,11 +5,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import settings
 
 import ftlm
 
 ROOT = Path(__file__).resolve().parents[2]
 REFERENCE = ROOT / "tests" / "reference"
+
+# The same examples in every run, and no clock.
+settings.register_profile("ftlm", derandomize=True, deadline=None)
+settings.load_profile("ftlm")
 
 
 @pytest.fixture(scope="session")

@@ -430,6 +430,29 @@ def test_printed_a1_column_is_a_prior_weighed_against_the_data(p):
     assert -1.0824 * p / (p + 1.164) == pytest.approx(PRINTED_A1[p], rel=0.003)
 
 
+PRINTED_COLUMNS = {
+    # p = 1, 3, 5, 7 of the paper's tables, and how closely x p/(p + c) follows: a2 has two strong directions.
+    "a1": ((-0.5002, -0.7798, -0.8789, -0.9302), 0.003),
+    "a3": ((-0.8114, -1.0049, -1.0556, -1.0791), 0.003),
+    "a2": ((-0.7308, -0.9449, -1.1164, -1.2655), 0.1),
+}
+
+
+@pytest.mark.parametrize("name", PRINTED_COLUMNS)
+def test_printed_columns_follow_x_p_over_p_plus_c(name):
+    column, share = PRINTED_COLUMNS[name]
+    p = np.array([1.0, 3.0, 5.0, 7.0])
+    # 1/a = 1/x + (c/x)/p: a straight line in 1/p.
+    slope, level = np.polyfit(1 / p, 1 / np.array(column), 1)
+    x, c = 1 / level, slope / level
+    miss = np.max(np.abs(x * p / (p + c) / column - 1))
+    assert miss <= share
+    if name == "a1":
+        assert (x, c) == (pytest.approx(-1.0824, rel=0.003), pytest.approx(1.164, rel=0.005))
+    if name == "a2":
+        assert miss > 0.02
+
+
 def test_one_coefficient_follows_x_p_over_p_plus_c():
     # What the column shows, on the estimator itself: with one coefficient the prior of K0 = 1 is worth c = 1/|q|^2
     # rows, but for the p - 1 last rows, which are used less often and here carry nothing.

@@ -101,6 +101,28 @@ def test_before_a_record_that_does_not_start_at_rest_an_input_was_what_it_is_fir
     )
 
 
+@pytest.mark.parametrize("delay", [0.05, 0.01, 0.047, 0.3])
+def test_a_delayed_command_switches_within_an_interval_of_a_finer_grid(delay):
+    u = np.random.default_rng(5).standard_normal(13)
+    structure = ftlm.equation("D y = a y + b u", delay={"u": delay}, initial="rest")
+    m, step = 12 * 20, 0.1
+    found = record(make_run(inputs={"u": u}, step=step), structure, m).of("u")
+    # Exact means of the delayed, held command from its integral, a broken line.
+    knots, integral = np.arange(14) * step, np.concatenate([[0.0], np.cumsum(u) * step])
+    edges = np.interp(np.arange(m + 1) * step * 12 / m - delay, knots, integral)
+    np.testing.assert_allclose(found, np.diff(edges) / (step * 12 / m), atol=1e-11)
+
+
+@pytest.mark.parametrize("order", [0.5, 1.6])
+def test_a_simulated_delay_does_not_depend_on_how_the_command_is_sampled(order):
+    # 2.5 samples of one run are 5 of another that holds the same command in half the step.
+    u = np.where(np.arange(201) % 100 < 50, 1.0, -0.6)
+    late = ftlm.Model(ftlm.equation(f"D^{order} y = -3 y + 5 u", delay={"u": 0.05}))
+    coarse = late.simulate(make_run(inputs={"u": u}, step=0.02), tolerance=1e-6)["y"]
+    fine = late.simulate(make_run(inputs={"u": np.repeat(u, 2)[:401]}, step=0.01), tolerance=1e-6)["y"]
+    np.testing.assert_allclose(coarse, fine[::2], atol=5e-6 * np.abs(fine).max())
+
+
 def test_delay_is_identified_with_the_model(small_model):
     # An input delayed by 2.5 samples: with the delay in the structure the coefficients are right, without it wrong.
     n = 400

@@ -139,6 +139,20 @@ def test_first_sample_is_read_before_the_first_command():
     assert model("D^1.5 y = -y + 2 D^1.5 u").simulate(measured)["y"][0] == pytest.approx(6.0)
 
 
+def test_first_sample_is_what_initial_terms_feed_through_and_filter_make_it():
+    run = zeros_run(inputs={"u": np.zeros(41)}, n=41, outputs=("y", "z"))
+    text = "D^2 y = -4 y + 0.5 D^2 z + u; D^1.5 z = -2 z"
+    start = {"z": {0.0: 2.0}, "y": {0.0: 3.0}}
+    coupled = model(text, "simulated").simulate(run, initial=start, tolerance=1e-5)
+    assert (coupled["z"][0], coupled["y"][0]) == (pytest.approx(2.0), pytest.approx(4.0))
+    assert coupled["y"][1] == pytest.approx(4.0, abs=0.2)
+    # A lead (2 D + 1)/(D + 1) passes what is there at once, doubled.
+    lead = ftlm.SensorFilter(("z",), ((2.0, 1.0), (1.0, 0.0)), ((1.0, 1.0), (1.0, 0.0)))
+    filtered = model(text, "simulated", sensor_filter=lead).simulate(run, initial=start, tolerance=1e-5)
+    assert (filtered["z"][0], filtered["y"][0]) == (pytest.approx(4.0), pytest.approx(4.0))
+    assert filtered["z"][1] == pytest.approx(4.0, abs=0.2)
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Coupling
 

@@ -7,7 +7,7 @@ use ftlm::estimate::least_squares::{self, Regression};
 use ftlm::estimate::multi_innovation::{closed_form, recursion, Innovation, Rows};
 use ftlm::regressors::{Bank, Index, Key, Record, BANK_LIMIT};
 use ftlm::small::{self, Rank};
-use ftlm::{haar, simulate};
+use ftlm::{haar, series, simulate};
 use proptest::prelude::*;
 
 use crate::common::{
@@ -94,6 +94,26 @@ fn records_keep_their_own_length_step_and_initial_terms() {
     // Without them the records contradict each other.
     let found = least_squares::fit(&records, &model.structure, &FREE, &Initial::Rest).unwrap();
     assert!(relative_distance(&found.coefficients, &model.coefficients) > 1e-2);
+}
+
+#[test]
+fn a_record_through_a_sensor_filter_keeps_its_equation() {
+    // Series commute: filtered signals obey the equation of the unfiltered ones, with filtered initial terms.
+    let model = damped();
+    let initial = [(0.0, 0.5), (0.9, 1.5), (1.0, -0.3)];
+    let m = 500;
+    let plain = obeying(&model, m, 0.01, &initial, 0.0, 65);
+    let filter: Vec<f64> = (0..m).map(|k| 0.2 * 0.8_f64.powi(i32::try_from(k).unwrap())).collect();
+    let signals = (0..3).map(|s| series::multiply_naive(&filter, plain.signal(s), m)).collect();
+    let filtered = Record::new(0.01, signals, Some(filter.clone())).unwrap();
+    for (exponent, _) in initial {
+        let oracle = series::multiply_naive(&filter, &plain.initial_term(exponent), m);
+        assert!(relative_distance(&filtered.initial_term(exponent), &oracle) < 1e-13);
+    }
+    let powers = Initial::Powers(vec![0.0, 0.9, 1.0]);
+    let found = least_squares::fit(&[filtered], &model.structure, &FREE, &powers).unwrap();
+    check("coefficients through a filter", relative_distance(&found.coefficients, &model.coefficients), 1e-10);
+    check("initial terms through a filter", distance(&found.initial[0], &initial.map(|t| t.1)), 1e-10);
 }
 
 #[test]
