@@ -61,7 +61,9 @@ impl Kernel {
         Self::with_length(series, 2 * series.len())
     }
 
-    fn with_length(series: &[f64], total: usize) -> Self {
+    /// Caches a series for products of up to `total` terms in all factors together.
+    #[must_use]
+    pub fn with_length(series: &[f64], total: usize) -> Self {
         let plan = fft::plan(fft::fast_length(total));
         let mut time = vec![0.0; plan.len()];
         time[..series.len()].copy_from_slice(series);
@@ -97,9 +99,32 @@ impl SumOfProducts {
     /// An empty sum of products of series of m terms.
     #[must_use]
     pub fn new(m: usize) -> Self {
-        let plan = fft::plan(fft::fast_length(2 * m));
+        Self::with_length(2 * m)
+    }
+
+    /// An empty sum of products of up to `total` terms in all factors together: three factors of m terms need 3m.
+    #[must_use]
+    pub fn with_length(total: usize) -> Self {
+        let plan = fft::plan(fft::fast_length(total));
         let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
         Self { plan, spectrum }
+    }
+
+    /// Forgets what was added.
+    pub fn clear(&mut self) {
+        self.spectrum.fill(Bin::new(0.0, 0.0));
+    }
+
+    /// Adds a series by itself.
+    pub fn add_series(&mut self, series: &Kernel) {
+        self.spectrum.iter_mut().zip(&series.spectrum).for_each(|(sum, x)| *sum += x);
+    }
+
+    /// Adds the product of another sum with a series; all cached for the same number of terms.
+    pub fn add_product(&mut self, other: &Self, series: &Kernel) {
+        for ((sum, x), y) in self.spectrum.iter_mut().zip(&other.spectrum).zip(&series.spectrum) {
+            *sum += x * y;
+        }
     }
 
     /// Adds weight·a·b; both cached for the same m as the sum.

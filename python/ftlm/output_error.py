@@ -8,6 +8,7 @@ until it no longer matters, and turns the optimum into numbers with intervals.
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -551,15 +552,25 @@ def fit_output_error(
     if start is None:
         coarse = experiments(alike, thinned=decimation)
         attempts = start_attempts(runs, problem, initial, threads)
-        reached = []
-        for done, attempt in enumerate(attempts):
-            if progress is not None:
-                progress(done, len(attempts))
+
+        def tried(attempt: Attempt) -> Attempt | None:
             try:
-                reached.append(descend(problem, coarse, signals, initial, attempt, evaluations=60))
+                return descend(problem, coarse, signals, initial, attempt, evaluations=60)
             except FtlmError:
                 # A start whose free run is not finite is no start; if none is left, that is said below.
-                continue
+                return None
+
+        reached = []
+        with ThreadPoolExecutor(threads) as pool:
+            try:
+                for done, ended in enumerate(pool.map(tried, attempts)):
+                    if ended is not None:
+                        reached.append(ended)
+                    if progress is not None:
+                        progress(done, len(attempts))
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
         reached.sort(key=lambda a: a.level)
         starts = [(a.level, a.origin) for a in reached]
         kept = distinct(reached)[:FINALISTS]

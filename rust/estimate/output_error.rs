@@ -1,8 +1,8 @@
 //! Joint output error: all equations of a model, all records, all orders continuous, by Levenberg–Marquardt.
 //!
-//! For white noise on the outputs this is maximum likelihood. The free run solves A y = b in series; its sensitivity to
-//! a parameter is the same system with another right-hand side, A ∂y = ∂b − ∂A y, so an analytic Jacobian costs one
-//! solve a parameter. Initial terms are linear and projected out (variable projection, Kaufman's form,
+//! For white noise on the outputs this is maximum likelihood. The free run solves A y = b in series, by exact division.
+//! Its sensitivity to a parameter is A⁻¹(∂b − ∂A y), a sum of products of three series: with the spectra of A⁻¹ at hand,
+//! one inverse transform a parameter and output. Rejected steps cost no Jacobian. Initial terms are linear and projected out (variable projection, Kaufman's form,
 //! doi:10.1007/BF01932995). Records are compared sample by sample: y_k with the mean of the pulses on either side of kh,
 //! on a grid that may be finer than the samples.
 
@@ -97,6 +97,27 @@ impl Experiment {
     fn compared(&self) -> usize {
         (self.record.m() / self.every).saturating_sub(1)
     }
+
+    /// Weighted samples of pulse means, all outputs after one another.
+    fn sampled(&self, response: &[Vec<f64>]) -> Vec<f64> {
+        let mut samples = Vec::with_capacity(response.len() * self.compared());
+        for (i, means) in response.iter().enumerate() {
+            let filtered;
+            let means = match &self.filter {
+                Some((filter, applies)) if applies[i] => {
+                    filtered = series::multiply(filter, means, means.len());
+                    &filtered
+                }
+                _ => means,
+            };
+            let w = self.weights[i];
+            samples.extend((1..=self.compared()).map(|k| {
+                let edge = k * self.every;
+                0.5 * w * (means[edge - 1] + means[edge])
+            }));
+        }
+        samples
+    }
 }
 
 /// Where the search for the optimum ended.
@@ -133,16 +154,34 @@ pub struct Fit {
     pub status: Status,
 }
 
-/// Coefficient of a term, kernel of its integral, and the kernel's derivative with respect to the order.
-type Operator = (f64, Kernel, Kernel);
-
+/// Residuals at a point, and what their derivatives there are made of.
 struct Evaluation {
     cost: f64,
     residuals: Vec<f64>,
-    jacobian: Vec<Vec<f64>>,
     initial: Vec<Vec<Vec<f64>>>,
     exponents: Vec<Vec<f64>>,
+    parts: Vec<Part>,
 }
+
+/// Coefficient of a term, kernel of its integral, and the kernel's derivative with respect to the order.
+type Operator = (f64, Vec<f64>, Vec<f64>);
+
+/// What one experiment leaves behind for its sensitivities.
+struct Part {
+    /// A of A y = b.
+    matrix: Vec<Vec<Vec<f64>>>,
+    /// Spectra of A⁻¹ where initial terms needed them already.
+    inverse: Option<Vec<Vec<Kernel>>>,
+    /// Of each term of each equation.
+    operators: Vec<Vec<Operator>>,
+    /// Simulated pulse means, initial terms included.
+    response: Vec<Vec<f64>>,
+    /// Orthonormal basis of the sampled responses to the initial terms.
+    basis: Vec<Vec<f64>>,
+}
+
+/// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
+const FACTORS: usize = 3;
 
 impl FreeModel {
     fn structures(&self, orders: &[f64]) -> Vec<Structure> {
@@ -156,51 +195,47 @@ impl FreeModel {
             .collect()
     }
 
-    /// Residuals and their derivatives at given orders and coefficients.
+    /// The unknown that a signal of equation i is, if it is one.
+    fn unknown(&self, i: usize, signal: usize) -> Option<usize> {
+        if self.coupled {
+            self.equations.iter().position(|e| e.output == signal)
+        } else {
+            (signal == self.equations[i].output).then_some(i)
+        }
+    }
+
+    /// Residuals at given orders and coefficients.
     fn evaluate(&self, experiments: &[Experiment], orders: &[f64], coefficients: &[f64]) -> Result<Evaluation> {
         let structures = self.structures(orders);
-        let count = orders.len() + coefficients.len();
         let mut out = Evaluation {
             cost: 0.0,
             residuals: Vec::new(),
-            jacobian: vec![Vec::new(); count],
             initial: Vec::new(),
             exponents: structures.iter().map(|s| s.initial_exponents(&self.initial)).collect(),
+            parts: Vec::with_capacity(experiments.len()),
         };
         for experiment in experiments {
-            self.evaluate_one(experiment, &structures, orders, coefficients, &mut out)?;
+            self.evaluate_one(experiment, &structures, coefficients, &mut out)?;
         }
         out.cost = 0.5 * out.residuals.iter().map(|e| e * e).sum::<f64>();
         Ok(out)
     }
 
-    #[allow(clippy::too_many_lines)]
     fn evaluate_one(
         &self,
         experiment: &Experiment,
         structures: &[Structure],
-        orders: &[f64],
         coefficients: &[f64],
         out: &mut Evaluation,
     ) -> Result<()> {
         let record = &experiment.record;
         let (m, n) = (record.m(), structures.len());
-        let outputs: Vec<usize> = structures.iter().map(|s| s.output).collect();
-        // The unknown that a term's signal is, if it is one.
-        let unknown = |i: usize, signal: usize| {
-            if self.coupled {
-                outputs.iter().position(|&o| o == signal)
-            } else {
-                (signal == outputs[i]).then_some(i)
-            }
-        };
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
         let mut buffers = Buffers::default();
-        let drivers: Vec<Kernel> = (0..record.len()).map(|s| Kernel::new(record.signal(s))).collect();
-        let mut kernels: Vec<Vec<Operator>> = Vec::with_capacity(n);
+        let mut drivers: Vec<Option<Kernel>> = (0..record.len()).map(|_| None).collect();
+        let mut operators = Vec::with_capacity(n);
         let mut sum = SumOfProducts::new(m);
-        let mut effect = vec![0.0; m];
         for (i, structure) in structures.iter().enumerate() {
             matrix[i][i][0] += 1.0;
             let mut row = Vec::with_capacity(structure.terms.len());
@@ -214,125 +249,195 @@ impl FreeModel {
                 }
                 let c = self.equations[i].terms[k].2.at(coefficients);
                 let (kernel, slope) = kernel_with_derivative(eta, m, record.step());
-                let spectrum = Kernel::new(&kernel);
-                match unknown(i, term.signal) {
-                    Some(j) => matrix[i][j].iter_mut().zip(&kernel).for_each(|(a, v)| *a -= c * v),
-                    None => sum.add(c, &spectrum, &drivers[term.signal]),
+                if let Some(j) = self.unknown(i, term.signal) {
+                    matrix[i][j].iter_mut().zip(&kernel).for_each(|(a, v)| *a -= c * v);
+                } else {
+                    let driver = drivers[term.signal].get_or_insert_with(|| Kernel::new(record.signal(term.signal)));
+                    sum.add(c, &Kernel::new(&kernel), driver);
                 }
-                row.push((c, spectrum, Kernel::new(&slope)));
+                row.push((c, kernel, slope));
             }
             sum.take(&mut rhs[i], &mut buffers);
-            kernels.push(row);
+            operators.push(row);
         }
-        let mut solver = Solver::new(&matrix)?;
-        // Weighted samples of a response, all outputs after one another.
-        let sampled = |response: &[Vec<f64>]| -> Vec<f64> {
-            let mut samples = Vec::with_capacity(n * experiment.compared());
-            for (i, means) in response.iter().enumerate() {
-                let filtered;
-                let means = match &experiment.filter {
-                    Some((filter, applies)) if applies[i] => {
-                        filtered = series::multiply(filter, means, m);
-                        &filtered
-                    }
-                    _ => means,
-                };
-                let w = experiment.weights[i];
-                samples.extend((1..=experiment.compared()).map(|k| {
-                    let edge = k * experiment.every;
-                    0.5 * w * (means[edge - 1] + means[edge])
-                }));
-            }
-            samples
-        };
-        let mut response = solver.solve(&rhs)?;
+        let mut response = Solver::new(&matrix)?.solve(&rhs)?;
         let mut residuals: Vec<f64> = experiment
             .samples
             .iter()
             .zip(&experiment.weights)
             .flat_map(|(y, w)| y[1..=experiment.compared()].iter().map(move |v| v * w))
             .collect();
-        residuals.iter_mut().zip(sampled(&response)).for_each(|(e, v)| *e -= v);
+        residuals.iter_mut().zip(experiment.sampled(&response)).for_each(|(e, v)| *e -= v);
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
 
         // Initial terms: the projection of the residuals on their responses.
-        let mut basis = Vec::new();
-        let mut terms = Vec::new();
-        for (i, list) in out.exponents.iter().enumerate() {
-            for &exponent in list {
-                let mut right = vec![vec![0.0; m]; n];
-                right[i] = record.initial_term(exponent);
-                let column = solver.solve(&right)?;
-                terms.push((i, exponent, sampled(&column), column));
-            }
-        }
-        let columns: Vec<Vec<f64>> = terms.iter().map(|t| t.2.clone()).collect();
-        let (values, _) = super::least_squares::solve(&columns, &residuals, 0)?;
-        for ((_, _, column, _), x) in terms.iter().zip(&values) {
-            residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
-        }
-        for ((_, _, _, column), x) in terms.iter().zip(&values) {
-            for (means, c) in response.iter_mut().zip(column) {
-                means.iter_mut().zip(c).for_each(|(y, v)| *y += x * v);
-            }
-        }
         let mut initial: Vec<Vec<f64>> = vec![Vec::new(); n];
-        for ((i, _, _, _), &x) in terms.iter().zip(&values) {
-            initial[*i].push(x);
+        let mut basis = Vec::new();
+        let mut inverse = None;
+        if out.exponents.iter().any(|list| !list.is_empty()) {
+            let made = inverse_spectra(&matrix)?;
+            let mut target = SumOfProducts::with_length(FACTORS * m);
+            let mut terms = Vec::new();
+            for (i, list) in out.exponents.iter().enumerate() {
+                for &exponent in list {
+                    let power = Kernel::with_length(&record.initial_term(exponent), FACTORS * m);
+                    let means: Vec<Vec<f64>> = made
+                        .iter()
+                        .map(|row| {
+                            let mut means = vec![0.0; m];
+                            target.add(1.0, &row[i], &power);
+                            target.take(&mut means, &mut buffers);
+                            means
+                        })
+                        .collect();
+                    terms.push((i, experiment.sampled(&means), means));
+                }
+            }
+            inverse = Some(made);
+            let columns: Vec<Vec<f64>> = terms.iter().map(|t| t.1.clone()).collect();
+            let (values, _) = super::least_squares::solve(&columns, &residuals, 0)?;
+            for ((i, column, means), x) in terms.iter().zip(&values) {
+                initial[*i].push(*x);
+                residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
+                for (total, part) in response.iter_mut().zip(means) {
+                    total.iter_mut().zip(part).for_each(|(y, v)| *y += x * v);
+                }
+            }
+            for column in columns {
+                orthonormal(&mut basis, column);
+            }
         }
-        for column in columns {
-            orthonormal(&mut basis, column);
-        }
+        out.residuals.extend(residuals);
+        out.initial.push(initial);
+        out.parts.push(Part { matrix, inverse, operators, response, basis });
+        Ok(())
+    }
 
-        let responses: Vec<Kernel> = response.iter().map(|means| Kernel::new(means)).collect();
-        for parameter in 0..orders.len() + coefficients.len() {
-            let mut right = vec![vec![0.0; m]; n];
-            let mut touched = false;
+    /// Derivatives of the residuals at an evaluated point with respect to orders, then coefficients (plain
+    /// coordinates), initial terms projected out.
+    fn jacobian(
+        &self,
+        experiments: &[Experiment],
+        orders: &[f64],
+        coefficients: &[f64],
+        at: &Evaluation,
+    ) -> Result<Vec<Vec<f64>>> {
+        let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); orders.len() + coefficients.len()];
+        for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
+            self.sensitivities(experiment, part, orders, coefficients, &at.initial[index], &mut jacobian)?;
+        }
+        if jacobian.iter().flatten().any(|v| !v.is_finite()) {
+            return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
+        }
+        Ok(jacobian)
+    }
+
+    /// One experiment's rows of the Jacobian: A⁻¹(∂b − ∂A y) as products of three spectra.
+    fn sensitivities(
+        &self,
+        experiment: &Experiment,
+        part: &Part,
+        orders: &[f64],
+        coefficients: &[f64],
+        initial: &[Vec<f64>],
+        jacobian: &mut [Vec<f64>],
+    ) -> Result<()> {
+        let record = &experiment.record;
+        let (m, n) = (record.m(), self.equations.len());
+        let total = FACTORS * m;
+        let spectrum = |series: &[f64]| Kernel::with_length(series, total);
+        let made;
+        let inverse = match &part.inverse {
+            Some(inverse) => inverse,
+            None => {
+                made = inverse_spectra(&part.matrix)?;
+                &made
+            }
+        };
+        let responses: Vec<Kernel> = part.response.iter().map(|means| spectrum(means)).collect();
+        let mut drivers: Vec<Option<Kernel>> = (0..record.len()).map(|_| None).collect();
+        let mut spectra: Vec<Vec<(Option<Kernel>, Option<Kernel>)>> =
+            part.operators.iter().map(|row| row.iter().map(|_| (None, None)).collect()).collect();
+        let mut rights: Vec<SumOfProducts> = (0..n).map(|_| SumOfProducts::with_length(total)).collect();
+        let mut target = SumOfProducts::with_length(total);
+        let mut buffers = Buffers::default();
+        for (parameter, out) in jacobian.iter_mut().enumerate() {
+            let mut moves = vec![false; n];
             for (i, equation) in self.equations.iter().enumerate() {
-                let mut moves = false;
+                rights[i].clear();
                 for (k, (signal, order, monomial)) in equation.terms.iter().enumerate() {
-                    let (c, kernel, slope) = &kernels[i][k];
+                    let (c, kernel, slope) = &part.operators[i][k];
+                    let (kept, kept_slope) = &mut spectra[i][k];
                     let (weight, operator) = if parameter < orders.len() {
                         let d_eta = equation.order.weights.get(parameter).unwrap_or(&0.0)
                             - order.weights.get(parameter).unwrap_or(&0.0);
-                        (c * d_eta, slope)
+                        (c * d_eta, (kept_slope, slope))
                     } else {
-                        (monomial.slope(coefficients, parameter - orders.len()), kernel)
+                        (monomial.slope(coefficients, parameter - orders.len()), (kept, kernel))
                     };
                     if weight == 0.0 {
                         continue;
                     }
-                    moves = true;
-                    let driver = unknown(i, *signal).map_or(&drivers[*signal], |j| &responses[j]);
-                    sum.add(weight, operator, driver);
-                }
-                if moves {
-                    touched = true;
-                    sum.take(&mut effect, &mut buffers);
-                    right[i].copy_from_slice(&effect);
+                    moves[i] = true;
+                    let operator = operator.0.get_or_insert_with(|| spectrum(operator.1));
+                    let driver = match self.unknown(i, *signal) {
+                        Some(j) => &responses[j],
+                        None => drivers[*signal].get_or_insert_with(|| spectrum(record.signal(*signal))),
+                    };
+                    rights[i].add(weight, operator, driver);
                 }
                 if parameter < orders.len() {
-                    let moved = initial_slope(self, i, parameter, orders, &initial[i], record)?;
-                    if let Some(moved) = moved {
-                        touched = true;
-                        right[i].iter_mut().zip(moved).for_each(|(b, v)| *b += v);
+                    if let Some(moved) = initial_slope(self, i, parameter, orders, &initial[i], record)? {
+                        moves[i] = true;
+                        rights[i].add_series(&spectrum(&moved));
                     }
                 }
             }
-            let mut column = if touched { sampled(&solver.solve(&right)?) } else { vec![0.0; residuals.len()] };
-            for direction in &basis {
+            if !moves.contains(&true) {
+                out.extend(std::iter::repeat_n(0.0, n * experiment.compared()));
+                continue;
+            }
+            let means: Vec<Vec<f64>> = inverse
+                .iter()
+                .map(|row| {
+                    for (i, _) in moves.iter().enumerate().filter(|(_, &moves)| moves) {
+                        target.add_product(&rights[i], &row[i]);
+                    }
+                    let mut means = vec![0.0; m];
+                    target.take(&mut means, &mut buffers);
+                    means
+                })
+                .collect();
+            let mut column = experiment.sampled(&means);
+            for direction in &part.basis {
                 let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
                 column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
             }
             // Residuals fall where the response rises.
-            out.jacobian[parameter].extend(column.iter().map(|v| -v));
+            out.extend(column.iter().map(|v| -v));
         }
-        out.residuals.extend(residuals);
-        out.initial.push(initial);
         Ok(())
     }
+}
+
+/// Spectra of the series of A⁻¹, ready for products of [`FACTORS`] series.
+fn inverse_spectra(matrix: &[Vec<Vec<f64>>]) -> Result<Vec<Vec<Kernel>>> {
+    let n = matrix.len();
+    let m = matrix.first().and_then(|row| row.first()).map_or(0, Vec::len);
+    let mut solver = Solver::new(matrix)?;
+    let mut rows: Vec<Vec<Kernel>> = (0..n).map(|_| Vec::with_capacity(n)).collect();
+    for j in 0..n {
+        let mut unit = vec![vec![0.0; m]; n];
+        if let Some(first) = unit[j].first_mut() {
+            *first = 1.0;
+        }
+        for (row, series) in rows.iter_mut().zip(solver.solve(&unit)?) {
+            row.push(Kernel::with_length(&series, FACTORS * m));
+        }
+    }
+    Ok(rows)
 }
 
 /// An affine order without rounding to the grain: it moves continuously here.
@@ -451,11 +556,12 @@ pub fn fit(
         start_orders.iter().zip(&model.order_bounds).map(|(&o, &(low, high))| o.clamp(low, high)).collect();
     let mut coefficients = start_coefficients.to_vec();
     let mut current = model.evaluate(experiments, &orders, &coefficients)?;
+    let mut jacobian = model.jacobian(experiments, &orders, &coefficients, &current)?;
     let mut evaluations = 1;
     let mut damping = 1e-3;
     let mut status = Status::Exhausted;
     'outer: while evaluations < settings.evaluations {
-        let (r, scales) = scaled_factor(model, &current, &coefficients);
+        let (r, scales) = scaled_factor(model, &jacobian, &current.residuals, &coefficients);
         let k = scales.len();
         let stride = k + 1;
         loop {
@@ -483,8 +589,20 @@ pub fn fit(
             evaluations += 1;
             match model.evaluate(experiments, &next_orders, &next) {
                 Ok(found) if found.cost.is_finite() && found.cost < current.cost => {
+                    let slopes = match model.jacobian(experiments, &next_orders, &next, &found) {
+                        Ok(slopes) => slopes,
+                        Err(Error::Diverged { .. }) => {
+                            damping *= 10.0;
+                            if damping > 1e12 {
+                                status = Status::Stalled;
+                                break 'outer;
+                            }
+                            continue;
+                        }
+                        Err(error) => return Err(error),
+                    };
                     let gain = (current.cost - found.cost) / current.cost.max(f64::MIN_POSITIVE);
-                    (orders, coefficients, current) = (next_orders, next, found);
+                    (orders, coefficients, current, jacobian) = (next_orders, next, found, slopes);
                     damping = (damping * 0.1).max(1e-12);
                     if gain <= settings.tolerance {
                         status = Status::Converged;
@@ -512,7 +630,7 @@ pub fn fit(
         coefficients,
         cost: current.cost,
         residuals: current.residuals,
-        jacobian: current.jacobian,
+        jacobian,
         initial: current.initial,
         exponents: current.exponents,
         evaluations,
@@ -541,18 +659,23 @@ fn stretch(coordinate: Coordinate, value: f64) -> f64 {
 }
 
 /// R of the QR factorisation of [J | e] with J in coordinates and unit columns, and the columns' norms.
-fn scaled_factor(model: &FreeModel, current: &Evaluation, coefficients: &[f64]) -> (Vec<f64>, Vec<f64>) {
-    let orders = current.jacobian.len() - coefficients.len();
-    let mut columns = Vec::with_capacity(current.jacobian.len() + 1);
-    let mut scales = Vec::with_capacity(current.jacobian.len());
-    for (i, column) in current.jacobian.iter().enumerate() {
+fn scaled_factor(
+    model: &FreeModel,
+    jacobian: &[Vec<f64>],
+    residuals: &[f64],
+    coefficients: &[f64],
+) -> (Vec<f64>, Vec<f64>) {
+    let orders = jacobian.len() - coefficients.len();
+    let mut columns = Vec::with_capacity(jacobian.len() + 1);
+    let mut scales = Vec::with_capacity(jacobian.len());
+    for (i, column) in jacobian.iter().enumerate() {
         let factor = if i < orders { 1.0 } else { stretch(model.coordinates[i - orders], coefficients[i - orders]) };
         let norm = column.iter().map(|v| (v * factor) * (v * factor)).sum::<f64>().sqrt();
         let scale = if norm > 0.0 { factor / norm } else { 0.0 };
         columns.push(column.iter().map(|v| v * scale).collect());
         scales.push(norm);
     }
-    columns.push(current.residuals.clone());
+    columns.push(residuals.to_vec());
     (dense::triangular_factor(&columns), scales)
 }
 
