@@ -20,6 +20,7 @@ from ftlm.operators import (
     operational_matrix,
 )
 from ftlm.order_search import Lattice, SearchResult, SearchRow, lattice, search_orders
+from ftlm.residuals import CorrelationTest, InformationCriteria, OutputResiduals, Residuals, information_criteria, resid
 from ftlm.runs import Run
 from ftlm.simulation import explicit_euler, simulate
 from ftlm.validation import Comparison, Metrics, compare, metrics
@@ -28,10 +29,12 @@ __all__ = [
     "PARAMETERS",
     "Comparison",
     "ConvergenceError",
+    "CorrelationTest",
     "DataError",
     "Equation",
     "FtlmError",
     "Identification",
+    "InformationCriteria",
     "InternalError",
     "Lattice",
     "LinkParameters",
@@ -39,6 +42,8 @@ __all__ = [
     "Model",
     "ModelError",
     "Order",
+    "OutputResiduals",
+    "Residuals",
     "RigFault",
     "Run",
     "SearchResult",
@@ -59,6 +64,7 @@ __all__ = [
     "haar_matrix",
     "haar_transform",
     "identify",
+    "information_criteria",
     "lattice",
     "link_model",
     "load",
@@ -67,6 +73,7 @@ __all__ = [
     "multi_innovation_trace",
     "operational_matrix",
     "order_law",
+    "resid",
     "search_orders",
     "simulate",
 ]

@@ -436,15 +436,17 @@ def inspect(
     resample: Resample = None,
     as_json: Json = False,
 ) -> None:
-    """Show what a run holds: ranges, noise, quantisation, rest."""
+    """Show what a run holds: ranges, noise, quantisation, rest, and what to do about it before identification."""
     from ftlm.inspection import inspect_run  # noqa: PLC0415
 
     options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
-    found = [inspect_run(run) for run in load_runs(files, sliced, **options)]
+    runs = load_runs(files, sliced, **options)
+    found = [(inspect_run(run), run.advice()) for run in runs]
     if as_json:
-        print(json.dumps([f.to_dict() for f in found], indent=1, ensure_ascii=False))
+        data = [{**figures.to_dict(), "advice": advice.to_dict()} for figures, advice in found]
+        print(json.dumps(data, indent=1, ensure_ascii=False))
     else:
-        print("\n\n".join(str(f) for f in found))
+        print("\n\n".join(f"{figures}\n{advice}" for figures, advice in found))
 
 
 @app.command()
@@ -514,7 +516,7 @@ def identify(
         identification_page(found, report, validation=others or None, force=force)
     show(found, as_json=as_json)
     if others and not as_json:
-        print(f"\nvalidation on {', '.join(r.name for r in others)}\n{found.model.compare(others)}")
+        print(f"\nvalidation on {', '.join(r.name for r in others)}\n{found.validate(others)}")
 
 
 @app.command()
@@ -621,6 +623,32 @@ def compare(
             listed = ", ".join(f"{name} {fit:.4g} %" for name, fit in low.items())
             print(f"ftlm: fit below {min_fit:g} %: {listed}", file=sys.stderr)
             raise typer.Exit(EXIT_VALIDATION)
+
+
+@app.command()
+@guarded
+def resid(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="A saved model.")],
+    files: Files,
+    lags: Annotated[int, typer.Option("--lags", min=1, help="Largest lag in samples.")] = 25,
+    time: Time = None,
+    sampling: Step = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    units: Units = None,
+    columns: Columns = None,
+    between: Between = None,
+    sliced: Slice = None,
+    resample: Resample = None,
+    as_json: Json = False,
+) -> None:
+    """Test a saved model's residuals: are they white, and independent of the inputs? Exit with 4 where not."""
+    loaded = ftlm.load_model(model)
+    options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
+    found = loaded.resid(load_runs(files, sliced, **options), lags=lags)
+    show(found, as_json=as_json)
+    if not found.passed:
+        raise typer.Exit(EXIT_VALIDATION)
 
 
 @app.command()

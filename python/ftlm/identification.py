@@ -10,7 +10,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.checks import whole_number
-from ftlm.errors import InternalError, ModelError
+from ftlm.errors import DataError, InternalError, ModelError
 from ftlm.models import Model, Structure, numeric
 from ftlm.order_search import (
     Lattice,
@@ -24,7 +24,14 @@ from ftlm.order_search import (
 )
 from ftlm.output_error import FreeProblem, JointFit, fit_output_error, is_white
 from ftlm.records import initial_tuple, structure_tuple
-from ftlm.validation import Comparison, Metrics, as_runs, compare
+from ftlm.residuals import (
+    InformationCriteria,
+    Residuals,
+    information_criteria,
+    resid,
+    residual_warnings,
+)
+from ftlm.validation import Comparison, Metrics, as_runs, compare, validation_warnings
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -41,6 +48,8 @@ LATER = ("instrumental-variables", "genetic")
 PULLED = 0.05
 #: Two parameters more correlated than this cannot be told apart.
 INSEPARABLE = 0.995
+#: Residuals of an output-error fit below this share of the output are rounding and discretisation.
+ROUNDING = 3e-5
 #: Two coefficients further apart than this share do not obey the coefficient law.
 LAW_BROKEN = 0.05
 
@@ -66,6 +75,10 @@ class Identification:
         What makes the model doubtful, in words.
     joint
         The optimum of the joint output error with its covariance; None for the equation-error methods.
+    residuals
+        Residual tests on the runs it was identified from; None where these are too short.
+    information
+        Information criteria, orders counted as parameters; None where there are no residuals.
     """
 
     model: Model
@@ -75,6 +88,8 @@ class Identification:
     settings: dict[str, Any]
     warnings: tuple[str, ...] = field(default=())
     joint: JointFit | None = None
+    residuals: Residuals | None = None
+    information: InformationCriteria | None = None
 
     @property
     def orders(self) -> dict[str, float]:
@@ -111,6 +126,33 @@ class Identification:
         """Fit of the free run in percent, by output."""
         return self.comparison.fit_percent
 
+    def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
+        """Residual tests on other runs; see :func:`ftlm.resid`."""
+        return resid(self.model, runs, lags=lags)
+
+    def validate(self, runs: Run | Sequence[Run]) -> Comparison:
+        """Both errors on runs that the model was not identified from, with what they say against the model.
+
+        Parameters
+        ----------
+        runs
+            One run or several with the same names and units.
+
+        Returns
+        -------
+        Comparison
+            Its warnings name a fit that is lost, and runs that the model was identified from.
+
+        Raises
+        ------
+        DataError
+            Runs that do not fit the model.
+        """
+        others = as_runs(runs)
+        found = compare(self.model, others)
+        words = [*found.warnings, *validation_warnings(self.comparison, found), *discretisation(self.model, found)]
+        return replace(found, warnings=tuple(dict.fromkeys(words)))
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
@@ -122,6 +164,8 @@ class Identification:
             "standard_errors": self.standard_errors,
             "intervals": {n: list(i) for n, i in self.intervals.items()},
             **self.comparison.to_dict(),
+            "residuals": None if self.residuals is None else self.residuals.to_dict(),
+            "information": None if self.information is None else self.information.to_dict(),
             "searches": {name: s.to_dict() for name, s in self.searches.items()},
             "warnings": list(self.warnings),
         }
@@ -140,6 +184,12 @@ class Identification:
         if errors:
             lines.append("  (value ± standard error; 95 % intervals are ± 1.96 of these)")
         lines.append(str(replace(self.comparison, warnings=())))
+        if self.residuals is not None:
+            white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.white.items())
+            free = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.independent.items())
+            lines.append(f"residuals white: {white}; independent of the inputs: {free} (99 %)")
+        if self.information is not None:
+            lines.append(str(self.information))
         for name, search in self.searches.items():
             pruned = ", ".join(f"{count} {reason}" for reason, count in search.pruned.items() if count)
             lines.append(f"order search ({name}): {search.candidates} candidates, {len(search.table)} kept, {pruned}")
@@ -272,8 +322,21 @@ def identify(
         warnings += [f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in search.edges.items()]
     warnings += [f"run {r.name}: {w}" for r in found for w in r.warnings]
     warnings += discretisation(model, comparison)
+    tests, criteria = _judged(model, found, len(orders) + len(coefficients))
+    warnings += [] if tests is None else residual_warnings(tests)
     used = {**settings.to_dict(), "m": pulses, "initial": initial}
-    return Identification(model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)))
+    return Identification(
+        model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)), residuals=tests, information=criteria
+    )
+
+
+def _judged(model: Model, runs: Sequence[Run], parameters: int) -> tuple[Residuals | None, InformationCriteria | None]:
+    """Residual tests and information criteria; None where a run is too short for them."""
+    try:
+        tests = resid(model, runs)
+    except DataError:
+        return None, None
+    return tests, information_criteria(tests, parameters)
 
 
 def _identify_output_error(
@@ -304,7 +367,12 @@ def _identify_output_error(
     warnings = list(comparison.warnings) + _uncertain(joint, problem)
     warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings]
     warnings += discretisation(model, comparison)
-    return Identification(model, "output-error", comparison, {}, used, tuple(dict.fromkeys(warnings)), joint)
+    tests, criteria = _judged(model, runs, len(joint.names))
+    # That they are coloured is said already, with what it means for the intervals.
+    warnings += [] if tests is None else [w for w in residual_warnings(tests, floor=ROUNDING) if "not white" not in w]
+    return Identification(
+        model, "output-error", comparison, {}, used, tuple(dict.fromkeys(warnings)), joint, tests, criteria
+    )
 
 
 def _uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:

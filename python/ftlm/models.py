@@ -22,6 +22,7 @@ from ftlm.errors import DataError, ModelError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from ftlm.residuals import Residuals
     from ftlm.runs import Run
     from ftlm.validation import Comparison
 
@@ -935,6 +936,12 @@ class Model:
         from ftlm.validation import compare  # noqa: PLC0415 — validation reads models
 
         return compare(self, runs, m=m)
+
+    def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
+        """Whiteness of the residuals and their independence of the inputs; see :func:`ftlm.resid`."""
+        from ftlm.residuals import resid  # noqa: PLC0415 — the tests read models
+
+        return resid(self, runs, lags=lags)
 
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the model as JSON, atomically.

@@ -12,12 +12,15 @@ import os
 import re
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NoReturn, TypeAlias, cast
+from typing import TYPE_CHECKING, Any, Literal, NoReturn, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 
 from ftlm.errors import DataError
+
+if TYPE_CHECKING:
+    from ftlm.advice import Advice
 
 __all__ = ["Run", "check_compatible"]
 
@@ -583,6 +586,22 @@ class Run:
                     values.size,
                     "check the sensor and the column, or load a part of the record in which it moves with slice=",
                 )
+
+    def advice(self) -> Advice:
+        """What to know about this run before a model is identified from it, in sentences with numbers.
+
+        Looks for dead, constant and zeroed channels, saturation, spikes, encoders that wrap, outputs that do not start
+        at rest, drift that no input explains, feedback from outputs to inputs, runs that are too short, and inputs that
+        excite too little. Nothing is repaired.
+
+        Returns
+        -------
+        Advice
+            Prints as sentences; empty where nothing stands out.
+        """
+        from ftlm.advice import advise  # noqa: PLC0415 — advice reads runs
+
+        return advise(self)
 
     def to_csv(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write this run to a csv file that `ftlm.load` reads back bit for bit, without being told the columns.

@@ -24,12 +24,14 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-__all__ = ["Comparison", "Metrics", "compare", "metrics", "near_identity"]
+__all__ = ["Comparison", "Metrics", "compare", "metrics", "near_identity", "validation_warnings"]
 
 #: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
 NEAR_IDENTITY = 0.25
 #: A free run this many times worse than the equation error says that the equation error flatters.
 FLATTERED = 5.0
+#: Points of fit lost from estimation to validation beyond which the model describes its own data, not the machine.
+LOST = 20.0
 #: A free run with a normalised residual above this explains nothing.
 USELESS = 0.5
 
@@ -278,4 +280,39 @@ def near_identity(
             )
         elif useless:
             warnings.append(f"{name}: the free run explains little of the output (NR {output.nr:.3g})")
+    return warnings
+
+
+def validation_warnings(own: Comparison, found: Comparison) -> list[str]:
+    """Say what validation runs hold against a model, or against themselves.
+
+    Parameters
+    ----------
+    own
+        On the runs that the model was identified from.
+    found
+        On the validation runs.
+
+    Returns
+    -------
+    list of str
+        Runs that validate nothing, and outputs whose fit is lost.
+    """
+    warnings = []
+    for k, (name, _, _) in enumerate(own.per_run):
+        for j, (other, _, _) in enumerate(found.per_run):
+            if all(np.array_equal(own.measured[o][k], found.measured[o][j]) for o in own.measured):
+                warnings.append(
+                    f"{other}: its outputs are those of {name}, which the model was identified from; "
+                    "it validates nothing"
+                )
+    for other, _, figures in found.per_run:
+        for output, f in figures.items():
+            before = own.output_error[output].fit
+            # Negated so that a fit that is not a number counts as lost.
+            if np.isfinite(before) and not f.fit >= before - LOST:
+                warnings.append(
+                    f"{other}: the fit of {output} falls from {before:.3g} % on the estimation data to {f.fit:.3g} %; "
+                    "the model describes the data it was identified from better than the machine"
+                )
     return warnings

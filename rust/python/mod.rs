@@ -27,7 +27,8 @@ mod _core {
 
     #[pymodule_export]
     use super::simulate::{
-        equation_error, explicit_euler, metrics, nyquist_margin, respond, respond_with_initial, trace_errors,
+        correlation, equation_error, explicit_euler, metrics, nyquist_margin, respond, respond_with_initial,
+        trace_errors,
     };
 
     #[pymodule_export]

@@ -1,4 +1,4 @@
-//! Free runs, the two errors, explicit Euler and the four figures.
+//! Free runs, the two errors, explicit Euler, the four figures and the correlations of residuals.
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
@@ -121,4 +121,18 @@ pub fn metrics(
     check_length("residuals", measured.len(), residuals.len())?;
     let found = crate::metrics::metrics(&measured, &residuals);
     Ok((found.error, found.rmse, found.nr, found.fit_percent))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn correlation<'py>(
+    py: Python<'py>,
+    x: Vec<PyReadonlyArray1<'py, f64>>,
+    y: Vec<PyReadonlyArray1<'py, f64>>,
+    lags: usize,
+) -> PyResult<(Bound<'py, PyArray1<f64>>, f64, usize)> {
+    let x = x.iter().map(|a| vector("x", a)).collect::<PyResult<Vec<_>>>()?;
+    let y = y.iter().map(|a| vector("y", a)).collect::<PyResult<Vec<_>>>()?;
+    let found = detached(py, || crate::metrics::correlation(&x, &y, lags))?;
+    Ok((PyArray1::from_vec(py, found.values), found.variance, found.window))
 }

@@ -112,10 +112,29 @@ def test_simulate_writes_a_run_that_loads_without_columns(folder: Path) -> None:
     assert np.array_equal(simulated["u"], measured["u"])
 
 
+def test_residual_tests_of_a_saved_model_have_an_exit_code(folder: Path) -> None:
+    rng = np.random.default_rng(1)
+    clean = ftlm.load(folder / "square.csv")
+    noisy = ftlm.Run.from_arrays(
+        step=clean.step, inputs={"u": clean["u"]}, outputs={"y": clean["y"] + 0.02 * rng.standard_normal(clean.length)}
+    )
+    noisy.to_csv(folder / "noisy.csv", force=True)
+    for name, a0, code in (("true", -4.0, 0), ("wrong", -3.0, 4)):
+        model = ftlm.Model(ftlm.equation(f"D^1.5 y = -2.0 D^0.5 y + {a0} y + 3.0 u"))
+        model.save(folder / f"{name}.json", force=True)
+        ran = ftlm_command("resid", f"{name}.json", "noisy.csv", cwd=folder)
+        assert ran.returncode == code, ran.stdout + ran.stderr
+        assert ("FAILED" in ran.stdout) is (code == 4)
+        document = json.loads(ftlm_command("resid", f"{name}.json", "noisy.csv", "--json", cwd=folder).stdout)
+        assert document["passed"] is (code == 0)
+    assert ftlm_command("resid", "true.json", "noisy.csv", "--lags", "9999", cwd=folder).returncode == 3
+
+
 def test_inspect_and_doctor_speak(folder: Path) -> None:
     inspected = ftlm_command("inspect", "square.csv", cwd=folder)
     assert inspected.returncode == 0
     assert "1025 rows" in inspected.stdout
+    assert "advice on square" in inspected.stdout
     assert json.loads(ftlm_command("inspect", "square.csv", "--json", cwd=folder).stdout)[0]["rows"] == 1025
     doctor = json.loads(ftlm_command("doctor", "--json", cwd=folder).stdout)
     assert doctor["ftlm"] == ftlm.__version__

@@ -171,7 +171,7 @@ def test_a_lost_fit_is_said(tmp_path, identified, sine):
         outputs={"theta11": -sine["theta11"], "theta12": -sine["theta12"]}, units=sine.units,
     )  # fmt: skip
     text = report.identification_page(identified, tmp_path / "p.html", validation=other).read_text("utf-8")
-    assert "validation run other: theta12: the fit falls from" in text
+    assert "validation run other: the fit of theta12 falls from" in text
 
 
 def test_hostile_names_are_inert(tmp_path, page):

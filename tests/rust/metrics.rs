@@ -1,7 +1,7 @@
 //! The four figures of a response, and the errors that computations name.
 
 use ftlm::error::{check_finite, check_length, check_step, Error, Kind};
-use ftlm::metrics::metrics;
+use ftlm::metrics::{correlation, covariances, covariances_naive, metrics};
 
 #[test]
 fn the_four_figures_of_a_small_case() {
@@ -58,4 +58,78 @@ fn every_error_has_its_family() {
     for (error, kind) in families {
         assert_eq!(error.kind(), kind, "{error}");
     }
+}
+
+/// White numbers, uniform over (−1/2, 1/2), by splitmix64.
+fn white(n: usize, seed: u64) -> Vec<f64> {
+    let mut state = seed.wrapping_mul(0xD1B5_4A32_D192_ED03);
+    (0..n)
+        .map(|_| {
+            state = state.wrapping_add(0x9E37_79B9_7F4A_7C15);
+            let mut z = (state ^ (state >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+            z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+            #[allow(clippy::cast_precision_loss)]
+            let unit = ((z ^ (z >> 31)) >> 11) as f64 / (1u64 << 53) as f64;
+            unit - 0.5
+        })
+        .collect()
+}
+
+#[test]
+fn covariances_by_spectra_are_those_by_definition() {
+    for (n, lags) in [(1, 0), (2, 1), (7, 3), (100, 25), (1025, 64), (3000, 2999)] {
+        let (x, y) = (white(n, 1), white(n, 2));
+        let (fast, naive) = (covariances(&x, &y, lags), covariances_naive(&x, &y, lags));
+        assert_eq!(fast.len(), 2 * lags + 1);
+        for (a, b) in fast.iter().zip(&naive) {
+            assert!((a - b).abs() <= 1e-13 * (n as f64), "{n} {lags}: {a} {b}");
+        }
+    }
+    // The sign of a lag: x follows y by two samples.
+    let y = white(50, 3);
+    let mut x = vec![0.0; 50];
+    x[2..].copy_from_slice(&y[..48]);
+    let found = covariances(&x, &y, 4);
+    let largest = (0..9).max_by(|&a, &b| found[a].total_cmp(&found[b]));
+    assert_eq!(largest, Some(4 + 2));
+}
+
+#[test]
+fn correlations_of_independent_signals_have_the_stated_variance() {
+    let filtered = |x: &[f64], pole: f64| {
+        let mut last = 0.0;
+        x.iter()
+            .map(|v| {
+                last = pole * last + v;
+                last
+            })
+            .collect::<Vec<f64>>()
+    };
+    for (pole_x, pole_y) in [(0.0, 0.0), (0.0, 0.95), (0.9, 0.0), (0.9, 0.95)] {
+        let (mut squares, mut stated) = (0.0, 0.0);
+        let repeats = 400;
+        for seed in 0..repeats {
+            let x = filtered(&white(1000, 2 * seed + 11), pole_x);
+            let y = filtered(&white(1000, 2 * seed + 12), pole_y);
+            let found = correlation(&[x], &[y], 0).expect("lengths agree");
+            squares += found.values[0] * found.values[0];
+            stated += found.variance;
+        }
+        let ratio = squares / stated;
+        assert!((0.8..1.25).contains(&ratio), "poles {pole_x} {pole_y}: {ratio}");
+    }
+}
+
+#[test]
+fn correlations_are_pooled_over_runs_and_normalised() {
+    let (a, b) = (white(300, 5), white(200, 6));
+    let shifted: Vec<f64> = b.iter().map(|v| 10.0 + v).collect();
+    let found = correlation(&[a.clone(), shifted.clone()], &[a.clone(), shifted], 3).expect("lengths agree");
+    assert!((found.values[3] - 1.0).abs() < 1e-12);
+    assert!(found.values[4].abs() < 0.2, "the mean of each run is its own");
+    let still = correlation(&[vec![1.0; 9]], &[vec![2.0; 9]], 2).expect("lengths agree");
+    assert!(still.values.iter().all(|v| *v == 0.0));
+    assert!(matches!(correlation(std::slice::from_ref(&a), &[b], 3), Err(Error::Length { .. })));
+    assert!(matches!(correlation(std::slice::from_ref(&a), &[a.clone(), a.clone()], 3), Err(Error::Length { .. })));
+    assert!(matches!(correlation(&[vec![0.0; 3]], &[vec![0.0; 3]], 3), Err(Error::OutOfRange { .. })));
 }

@@ -7,11 +7,9 @@ from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING
 
-import numpy as np
 from jinja2 import Environment, StrictUndefined, Template
 
 from ftlm import __version__
-from ftlm.identification import discretisation
 from ftlm.models import write_atomically
 from ftlm.report.figures import POINTS, Figure, chart_css, comparison_charts
 from ftlm.report.tables import (
@@ -26,7 +24,7 @@ from ftlm.report.tables import (
     settings_table,
     symbol,
 )
-from ftlm.validation import as_runs, compare
+from ftlm.validation import as_runs
 
 if TYPE_CHECKING:
     import os
@@ -42,8 +40,6 @@ __all__ = ["Section", "identification_page", "write_page"]
 #: Charts of a page and points in all of them: at no more than 10 bytes a point the page stays below 2 MB.
 PAGE_CHARTS = 60
 PAGE_POINTS = 120_000
-#: Points of fit lost from estimation to validation beyond which the model describes its own data, not the machine.
-LOST = 20.0
 
 
 @dataclass(frozen=True)
@@ -148,13 +144,14 @@ def identification_page(
     """
     model, units = result.model, result.model.units
     others = [] if validation is None else as_runs(validation)
-    validated = [compare(model, run) for run in others]
+    validated = [result.validate(run) for run in others]
     estimation = ("estimation", result.comparison)
     compared = [estimation, *(("validation", c) for c in validated)]
 
     warnings = list(result.warnings)
     for run, found in zip(others, validated, strict=True):
-        warnings += [f"validation run {run.name}: {w}" for w in _validation_warnings(result, found, run)]
+        warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in found.warnings]
+        warnings += [f"validation run {run.name}: {w}" for w in run.warnings]
     warnings = list(dict.fromkeys(warnings))
     words = [
         "No check raised a warning. Checked: free run against equation error, orders close to one another or on the "
@@ -198,23 +195,3 @@ def _lead(compared: Sequence[tuple[str, Comparison]]) -> str:
         runs = ", ".join(name for name, _, _ in found.per_run)
         sentences.append(f"Fit of the free run, {label} ({runs}): {fits}.")
     return " ".join(sentences)
-
-
-def _validation_warnings(result: Identification, found: Comparison, run: Run) -> list[str]:
-    """Return what makes the validation doubtful, or the model in its light."""
-    own = result.comparison
-    warnings = [*found.warnings, *run.warnings, *discretisation(result.model, found)]
-    for k, (name, _, _) in enumerate(own.per_run):
-        if all(np.array_equal(own.measured[o][k], found.measured[o][0]) for o in own.measured):
-            warnings.append(
-                f"its outputs are those of {name}, which the model was identified from; it validates nothing"
-            )
-    for output, fit in found.fit_percent.items():
-        before = own.fit_percent[output]
-        # Negated so that a fit that is not a number counts as lost.
-        if np.isfinite(before) and not fit >= before - LOST:
-            warnings.append(
-                f"{output}: the fit falls from {number(before, 3)} % on the estimation data to {number(fit, 3)} %; "
-                "the model describes the data it was identified from better than the machine"
-            )
-    return warnings

@@ -1,0 +1,255 @@
+"""Residual tests refuse one true model in a hundred and find what a model lacks; information criteria count orders."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm import _core
+from ftlm.residuals import chi_squared_99, residual_warnings
+
+WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
+
+
+@pytest.fixture(scope="module")
+def noisy(small_run, with_noise):
+    return with_noise(small_run, 0.02, 1)
+
+
+@pytest.fixture(scope="module")
+def long_run(small_model):
+    """A minute and a half under a random two-level input: many independent stretches."""
+    rng = np.random.default_rng(12)
+    u = np.repeat(rng.choice([-1.0, 1.0], 180), 25)
+    clean = small_model.simulate(blank(u), tolerance=1e-5)
+    y = clean["y"] + 0.02 * rng.standard_normal(u.size)
+    return ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y}, name="long")
+
+
+# ------------------------------------------------------------------------------------------------ the mathematics
+
+
+@pytest.mark.parametrize("lags", [1, 5, 25, 100])
+def test_the_quantile_is_that_of_chi_squared(lags):
+    scipy = pytest.importorskip("scipy.stats")
+    assert chi_squared_99(lags) == pytest.approx(scipy.chi2.ppf(0.99, lags), rel=0.03 if lags < 5 else 0.003)
+
+
+def test_correlations_are_numpys():
+    rng = np.random.default_rng(1)
+    e, u = rng.standard_normal((2, 400))
+    values, variance, _ = _core.correlation([e], [u], 25)
+    a, b = e - e.mean(), u - u.mean()
+    full = np.correlate(a, b, "full")[400 - 1 - 25 : 400 + 25] / (np.linalg.norm(a) * np.linalg.norm(b))
+    np.testing.assert_allclose(values, full, atol=1e-14)
+    assert variance == pytest.approx(1 / 400, rel=0.3)
+
+
+def blank(u, step=0.02):
+    return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": 0 * u}, name="blank")
+
+
+def test_one_true_model_in_a_hundred_is_refused(small_model, small_run, with_noise):
+    verdicts = [small_model.resid(with_noise(small_run, 0.05, seed)) for seed in range(300)]
+    whiteness = sum(not v.white["y"] for v in verdicts)
+    independence = sum(not v.independent["y"] for v in verdicts)
+    # One in a hundred each: 3 of 300, at most 9 with a probability of 99.9 %; the second is conservative for an input
+    # whose lags are alike.
+    assert whiteness <= 9
+    assert independence <= 9
+    values = np.concatenate([v.outputs["y"].whiteness.values[1:] for v in verdicts])
+    outside = np.mean(np.abs(values) > verdicts[0].outputs["y"].whiteness.band)
+    assert 0.005 < outside < 0.02
+
+
+def test_coloured_noise_fails_whiteness_and_not_independence(small_model, small_run):
+    refused = 0
+    for seed in range(60):
+        rng = np.random.default_rng([9, seed])
+        white = rng.standard_normal(small_run.length + 50)
+        coloured = np.convolve(white, 0.8 ** np.arange(50), "valid")[: small_run.length]
+        run = ftlm.Run.from_arrays(
+            step=small_run.step, inputs={"u": small_run["u"]}, outputs={"y": small_run["y"] + 0.02 * coloured}
+        )
+        found = small_model.resid(run)
+        assert not found.white["y"]
+        refused += not found.independent["y"]
+    # With the band of white residuals it would be a third of them.
+    assert refused <= 4
+
+
+def test_a_lacking_term_is_found(long_run):
+    lacking = ftlm.Model(ftlm.equation("D^1.6 y = -2 D^0.6 y - 8 y + 5 u"))
+    found = lacking.resid(long_run)
+    assert not found.passed
+    assert not found.independent["y"]
+    text = str(found)
+    assert "FAILED" in text
+    assert "residuals still follow u" in text
+    assert "residuals are not white" in text
+
+
+def test_feedback_is_told_from_a_lacking_term(small_model):
+    # The input answers the noise three samples later; the model is the true one.
+    rng = np.random.default_rng(3)
+    n = 2000
+    noise = 0.1 * rng.standard_normal(n)
+    u = np.repeat(rng.choice([-1.0, 1.0], n // 40), 40) - 2 * np.concatenate([np.zeros(3), noise[:-3]])
+    clean = small_model.simulate(blank(u), tolerance=1e-5)
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": clean["y"] + noise})
+    found = small_model.resid(run)
+    assert found.independent["y"]
+    assert found.outputs["y"].feedback == ("u",)
+    lag = int(found.outputs["y"].inputs["u"].lags[np.argmax(np.abs(found.outputs["y"].inputs["u"].values))])
+    assert lag == -3
+    assert "closed loop" in str(found)
+    assert residual_warnings(found) == []
+
+
+# ------------------------------------------------------------------------------------------------ what is tested
+
+
+def test_residuals_are_samples_less_the_free_run(small_model, small_run, noisy):
+    found = small_model.resid(noisy)
+    exact = (noisy["y"] - small_run["y"])[1:-1]
+    assert found.refinement >= 2
+    assert np.max(np.abs(found.outputs["y"].residuals[0] - exact)) < 0.05 * np.std(exact)
+    assert found.outputs["y"].rms == pytest.approx(0.02, rel=0.1)
+    assert found.passed
+    assert found.initial_terms == 0
+
+
+def test_initial_terms_are_fitted_to_each_run(small_model, noisy):
+    structure = replace(small_model.structure, initial="caputo")
+    late = noisy.slice(1.5, None)
+    found = ftlm.Model(structure).resid([noisy, late])
+    assert found.initial_terms > 0
+    assert len(found.outputs["y"].residuals) == 2
+    assert found.runs == (noisy.name, late.name)
+
+
+def test_inputs_that_the_model_does_not_read_are_tested_too(small_model, noisy):
+    other = np.random.default_rng(8).standard_normal(noisy.length)
+    y = noisy["y"] + 0.02 * np.concatenate([[0.0], other[:-1]])
+    run = ftlm.Run.from_arrays(step=noisy.step, inputs={"u": noisy["u"], "v": other}, outputs={"y": y})
+    found = small_model.resid(run)
+    assert set(found.outputs["y"].inputs) == {"u", "v"}
+    assert not found.outputs["y"].inputs["v"].passed
+    assert found.outputs["y"].inputs["v"].largest[0] == 1
+    assert found.outputs["y"].inputs["u"].passed
+
+
+@pytest.mark.parametrize("coupling", ["simulated", "measured"])
+@pytest.mark.parametrize("sensor", [None, "z"])
+def test_the_true_coupled_model_passes(coupling, sensor):
+    text = "D^1.7 y = -20 y - 2 D^0.7 y + 15 z + 10 u; D^1.2 z = -5 z + 3 D^0.4 y + u"
+    sensor_filter = ftlm.SensorFilter.low_pass([sensor], frequency=1.0) if sensor else None
+    structure = ftlm.equation(text, sensor_filter=sensor_filter)
+    n = 1201
+    u = np.where(np.arange(n) % 200 < 120, 1.0, -0.5)
+    empty = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": np.zeros(n), "z": np.zeros(n)})
+    clean = ftlm.Model(replace(structure, coupling="simulated")).simulate(empty, tolerance=1e-7)
+    rng = np.random.default_rng(2)
+    # With measured coupling, noise on one output is the other's input: only what is compared gets any.
+    noise = {"y": 0.02, "z": 0.02 if coupling == "simulated" else 0.0}
+    outputs = {o: clean[o] + noise[o] * rng.standard_normal(n) for o in ("y", "z")}
+    found = ftlm.Model(replace(structure, coupling=coupling)).resid(
+        ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs=outputs)
+    )
+    filtered = coupling == "measured" and sensor == "z"
+    # A measured output that passes the filter before it is compared brings coloured noise with it.
+    assert found.white["y"] is not filtered
+    assert found.independent["y"]
+
+
+def test_an_unstable_model_fails_in_words(small_run):
+    found = ftlm.Model(ftlm.equation("D^1 y = 400 y + u")).resid(small_run)
+    assert not found.passed
+    assert "leaves the range of numbers" in str(found)
+    json.dumps(found.to_dict(), allow_nan=False)
+    assert "leaves the range" in residual_warnings(found)[0]
+
+
+def test_residuals_print_and_are_json(small_model, noisy):
+    found = small_model.resid(noisy, lags=10)
+    assert str(found).startswith("residual tests at 99 % on small, simulated, noise 0.02, seed 1: passed")
+    document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert document["passed"] is True
+    assert document["outputs"]["y"]["inputs"]["u"]["lags"] == list(range(-10, 11))
+    assert found.outputs["y"].whiteness.lags.tolist() == list(range(11))
+    assert found._repr_html_().startswith("<pre>")
+
+
+def test_refusals_name_the_thing_and_the_way_out(small_model, small_run):
+    with pytest.raises(ftlm.DataError, match="has 40 rows, correlations up to 25 lags need 53; give a longer run"):
+        small_model.resid(small_run.slice(0, 0.8))
+    for lags in (0, -1, 1.5, "x", None):
+        with pytest.raises(ftlm.ModelError, match="is no number of lags"):
+            small_model.resid(small_run, lags=lags)
+    other = ftlm.Run.from_arrays(step=0.02, inputs={"w": small_run["u"]}, outputs={"y": small_run["y"]})
+    with pytest.raises(ftlm.DataError, match="has no signal 'u', which the model needs"):
+        small_model.resid(other)
+    with pytest.raises(ftlm.ModelError, match="not a Model"):
+        ftlm.resid("model.json", small_run)
+
+
+# ------------------------------------------------------------------------------------------------ after identification
+
+
+def test_identify_reports_both_tests_and_the_criteria(noisy):
+    found = ftlm.identify(noisy, ftlm.equation(WORDS), method="least-squares", m=512)
+    assert found.residuals is not None
+    assert found.information.parameters == 4  # a, c, b and the noise level
+    assert found.information.samples == noisy.length - 2
+    assert "AIC " in str(found)
+    assert "residuals white" in str(found)
+    assert json.loads(json.dumps(found.to_dict(), default=list, allow_nan=False))["information"]["parameters"] == 4
+    assert found.resid(noisy).outputs["y"].rms == found.residuals.outputs["y"].rms
+
+
+def test_a_model_that_leaves_something_out_says_so(long_run):
+    poor = ftlm.equation("D^1 y = c y + b u")
+    for method in ("least-squares", "output-error"):
+        found = ftlm.identify(long_run, poor, method=method)
+        assert any("not white" in w for w in found.warnings), found.warnings
+        assert any("residuals still follow u" in w for w in found.warnings), found.warnings
+
+
+def test_information_criteria_by_hand(small_model, noisy):
+    tests = small_model.resid(noisy)
+    found = ftlm.information_criteria(tests, 3)
+    n, k, rms = noisy.length - 2, 4, tests.outputs["y"].rms
+    likelihood = -0.5 * n * (math.log(2 * math.pi * rms**2) + 1)
+    assert found.log_likelihood == pytest.approx(likelihood, rel=1e-12)
+    assert found.aic == pytest.approx(2 * k - 2 * likelihood, rel=1e-12)
+    assert found.aicc == pytest.approx(found.aic + 2 * k * (k + 1) / (n - k - 1), rel=1e-12)
+    assert found.bic == pytest.approx(k * math.log(n) - 2 * likelihood, rel=1e-12)
+    with pytest.raises(ftlm.ModelError, match="no number of parameters"):
+        ftlm.information_criteria(tests, -1)
+
+
+def test_criteria_prefer_the_true_structure(noisy):
+    true = ftlm.equation(WORDS)
+    poor = ftlm.equation("D^2 y = a D y + c y + b u")
+    rich = ftlm.equation("D^1.6 y = a D^0.6 y + c y + b u + d D^0.3 y + e D^0.8 u")
+    bic = [ftlm.identify(noisy, s, method="output-error").information.bic for s in (true, poor, rich)]
+    assert bic[0] < bic[1]
+    assert bic[0] < bic[2]
+
+
+# ------------------------------------------------------------------------------------------------ validation
+
+
+def test_validation_far_below_estimation_is_said(noisy, small_model):
+    found = ftlm.identify(noisy, ftlm.equation(WORDS), method="least-squares", m=512)
+    other = ftlm.Run.from_arrays(step=noisy.step, inputs={"u": noisy["u"]}, outputs={"y": -noisy["y"]}, name="mirrored")
+    lost = found.validate(other)
+    assert any(w.startswith("mirrored: the fit of y falls from") for w in lost.warnings)
+    again = found.validate(noisy)
+    assert any("validates nothing" in w for w in again.warnings)
+    fresh = small_model.simulate(blank(np.sin(0.02 * np.arange(800) ** 1.1)), tolerance=1e-5)
+    assert found.validate(fresh).warnings == ()
+    assert found.validate(fresh).fit_percent == found.model.compare(fresh).fit_percent
