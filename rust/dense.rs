@@ -53,3 +53,21 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
     }
     out
 }
+
+/// Adds a column to an orthonormal basis unless less than this share of it lies outside the span. O(k m).
+pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share: f64) {
+    let size = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let whole = size(&column);
+    // Twice is enough (Kahan, Parlett).
+    for _ in 0..2 {
+        for direction in basis.iter() {
+            let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
+            column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
+        }
+    }
+    let left = size(&column);
+    if left > share * whole && left.is_finite() {
+        column.iter_mut().for_each(|v| *v /= left);
+        basis.push(column);
+    }
+}

@@ -60,6 +60,17 @@ pub fn plan(len: usize) -> Plan {
         .clone()
 }
 
+/// Squared magnitudes of a signal's transform, from frequency 0 to Nyquist's, zero-padded to a fast length.
+#[must_use]
+pub fn power_spectrum(signal: impl ExactSizeIterator<Item = f64>) -> Vec<f64> {
+    let plan = plan(fast_length(signal.len()));
+    let mut time: Vec<f64> = signal.collect();
+    time.resize(plan.len(), 0.0);
+    let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
+    plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+    spectrum.iter().map(Bin::norm_sqr).collect()
+}
+
 impl Plan {
     /// Number of real points.
     #[must_use]

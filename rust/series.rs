@@ -87,6 +87,16 @@ impl Kernel {
         let read = out.len().min(buffers.time.len());
         out[..read].copy_from_slice(&buffers.time[..read]);
     }
+
+    /// The first `out.len()` terms of the product with another cached series of the same length: one transform.
+    pub fn times(&self, other: &Self, out: &mut [f64], buffers: &mut Buffers) {
+        buffers.spectrum.clear();
+        buffers.spectrum.extend(self.spectrum.iter().zip(&other.spectrum).map(|(x, y)| x * y));
+        buffers.time.resize(self.plan.len(), 0.0);
+        let time = &mut buffers.time[..self.plan.len()];
+        self.plan.inverse(&mut buffers.spectrum, time, &mut buffers.workspace);
+        out.copy_from_slice(&time[..out.len()]);
+    }
 }
 
 /// A sum of products of series, formed in the frequency domain: one inverse transform however many products.

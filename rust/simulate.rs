@@ -69,6 +69,17 @@ impl System {
         Ok(Self { matrix, rhs })
     }
 
+    /// Solution with given initial terms.
+    fn with_initial(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
+        let mut rhs = self.rhs.clone();
+        for (b, terms) in rhs.iter_mut().zip(initial) {
+            for &(exponent, coefficient) in terms {
+                b.iter_mut().zip(record.initial_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
+            }
+        }
+        self.solve(&rhs)
+    }
+
     fn solve(&self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
         series::solve(&self.matrix, &borrowed)
@@ -84,14 +95,28 @@ impl System {
 /// # Errors
 /// Orders or signals that make no equation, [`Error::LeadingZero`] where the outputs cannot be solved for.
 pub fn respond(equations: &[Equation], record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
-    let system = System::new(equations, record)?;
-    let mut rhs = system.rhs.clone();
-    for (b, terms) in rhs.iter_mut().zip(initial) {
-        for &(exponent, coefficient) in terms {
-            b.iter_mut().zip(record.initial_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
+    System::new(equations, record)?.with_initial(record, initial)
+}
+
+/// Free run of a damped copy of the equations: the series of their outputs read at ρz, ρ = e^{−decay}, which makes every
+/// model stable for a large enough decay [1/pulse]. Instruments need be clean, not exact.
+///
+/// # Errors
+/// As [`respond`].
+#[allow(clippy::cast_precision_loss)]
+pub fn respond_damped(
+    equations: &[Equation],
+    record: &Record,
+    initial: &[Vec<(f64, f64)>],
+    decay: f64,
+) -> Result<Vec<Vec<f64>>> {
+    let mut system = System::new(equations, record)?;
+    if decay > 0.0 {
+        for series in system.matrix.iter_mut().flatten() {
+            series.iter_mut().enumerate().for_each(|(k, a)| *a *= libm::exp(-decay * k as f64));
         }
     }
-    system.solve(&rhs)
+    system.with_initial(record, initial)
 }
 
 /// Free run whose initial terms are those that bring it closest to the measured outputs.

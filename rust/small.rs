@@ -29,6 +29,41 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
     }
 }
 
+/// Row-major inverse of a row-major k × k matrix whose rows and columns may differ in scale by any factor.
+///
+/// # Errors
+/// [`Error::Singular`] where rounding cannot tell its rows apart.
+pub fn scaled_inverse(matrix: &[f64], k: usize) -> Result<Vec<f64>> {
+    // Rows, then columns, to unit largest element: what is then nearly singular is so whatever the units.
+    let largest = |values: &mut dyn Iterator<Item = f64>| values.fold(0.0_f64, |a, v| a.max(v.abs()));
+    let mut a = DMatrix::from_row_slice(k, k, matrix);
+    let rows: Vec<f64> = (0..k).map(|i| largest(&mut a.row(i).iter().copied())).collect();
+    for (i, scale) in rows.iter().enumerate() {
+        a.row_mut(i).unscale_mut(*scale);
+    }
+    let columns: Vec<f64> = (0..k).map(|j| largest(&mut a.column(j).iter().copied())).collect();
+    for (j, scale) in columns.iter().enumerate() {
+        a.column_mut(j).unscale_mut(*scale);
+    }
+    let singular = |index| Error::Singular { index, count: k };
+    if let Some(bad) = rows.iter().chain(&columns).position(|s| !(*s > 0.0 && s.is_finite())) {
+        return Err(singular(bad % k.max(1)));
+    }
+    let factor = a.full_piv_lu();
+    let pivots = factor.u().diagonal();
+    if let Some(bad) = pivots.iter().position(|p| p.is_nan() || p.abs() <= PIVOT_FLOOR) {
+        return Err(singular(bad));
+    }
+    let inverse = factor.try_inverse().ok_or_else(|| singular(0))?;
+    let mut out = vec![0.0; k * k];
+    for i in 0..k {
+        for j in 0..k {
+            out[i * k + j] = inverse[(i, j)] / (columns[i] * rows[j]);
+        }
+    }
+    Ok(out)
+}
+
 /// Which regressors a solve kept.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Rank {

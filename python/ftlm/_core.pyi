@@ -154,6 +154,17 @@ def multi_innovation(
     haar: bool,
     recursion: bool,
 ) -> tuple[_Estimate, _Matrix | None]: ...
+def instrumental_variables(
+    runs: Sequence[_Record],
+    clean: Sequence[_Record],
+    equations: Sequence[_Structure],
+    inputs: Sequence[bool],
+    fixed: Sequence[Sequence[float | None]],
+    terms: _Initial,
+    iterations: int,
+    tolerance: float,
+) -> tuple[list[_Estimate], list[list[float]], int, bool, bool]: ...
+def projected(run: _Record, signal: int, inputs: Sequence[int], at_rest: bool) -> _Floats: ...
 def output_error(
     runs: Sequence[_Experiment],
     laws: Sequence[_FreeEquation],

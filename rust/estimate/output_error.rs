@@ -17,6 +17,9 @@ use crate::small::back_substitute;
 /// Own-output orders closer to α than this make the equation say that the output equals itself.
 const LEAST_INTEGRATION: f64 = 1e-3;
 
+/// An initial term whose response lies in the span of the others up to this share adds nothing to the projection.
+const SPANNED: f64 = 1e-12;
+
 /// In which coordinate a coefficient is estimated: scales decide whether the optimum is reached.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Coordinate {
@@ -306,7 +309,7 @@ impl FreeModel {
                 }
             }
             for column in columns {
-                orthonormal(&mut basis, column);
+                dense::extend_orthonormal(&mut basis, column, SPANNED);
             }
         }
         out.residuals.extend(residuals);
@@ -482,24 +485,6 @@ fn initial_slope(
         out.iter_mut().zip(above.iter().zip(&below)).for_each(|(v, (a, b))| *v += x * (a - b) / (2.0 * SHIFT));
     }
     Ok(moved.then_some(out))
-}
-
-/// Adds a column to an orthonormal basis unless it lies in its span.
-fn orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>) {
-    let size = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
-    let whole = size(&column);
-    // Twice is enough (Kahan, Parlett).
-    for _ in 0..2 {
-        for direction in basis.iter() {
-            let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
-            column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
-        }
-    }
-    let left = size(&column);
-    if left > 1e-12 * whole && left.is_finite() {
-        column.iter_mut().for_each(|v| *v /= left);
-        basis.push(column);
-    }
 }
 
 /// Settings of [`fit`].

@@ -23,7 +23,7 @@ mod _core {
     };
 
     #[pymodule_export]
-    use super::estimate::{least_squares, multi_innovation, output_error};
+    use super::estimate::{instrumental_variables, least_squares, multi_innovation, output_error, projected};
 
     #[pymodule_export]
     use super::simulate::{

@@ -9,6 +9,7 @@ mod equation;
 mod estimators;
 mod fractional;
 mod haar;
+mod instrumental_variables;
 mod kernels;
 mod means;
 mod metrics;
