@@ -11,7 +11,10 @@
 //! 6. [`search`]: the orders themselves, exhaustively over a lattice;
 //! 7. [`simulate`], [`metrics`]: free runs, the two errors, and what they amount to.
 //!
-//! The mathematics knows no file, no clock and no Python; bindings live behind the feature `python`.
+//! Runs come from a file or from a rig: [`virtual_arm`] is the arm itself, with its past in bounded [`memory`];
+//! [`guard`] stands between commands and motors.
+//!
+//! The mathematics knows no file, no clock (but for the pace of the virtual rig) and no Python; bindings live behind the feature `python`.
 #![forbid(unsafe_op_in_unsafe_fn)]
 #![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
 
@@ -36,6 +39,10 @@ pub mod search;
 
 pub mod metrics;
 pub mod simulate;
+
+pub mod guard;
+pub mod memory;
+pub mod virtual_arm;
 
 #[cfg(feature = "python")]
 mod python;

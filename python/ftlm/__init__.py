@@ -4,6 +4,7 @@ Public names in the order in which a measurement passes them: runs, operators, e
 order search, simulation and validation.
 """
 
+from ftlm import rig
 from ftlm._core import __version__
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
 from ftlm.files import load
@@ -74,6 +75,7 @@ __all__ = [
     "operational_matrix",
     "order_law",
     "resid",
+    "rig",
     "search_orders",
     "simulate",
 ]

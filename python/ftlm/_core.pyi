@@ -3,14 +3,16 @@
 Arrays are float64. A signal is a vector of pulse means unless it says samples; a record holds one signal a row.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Final, Literal, TypeAlias, TypedDict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final, Literal, TypeAlias, TypedDict, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
     "SIMD",
+    "Guard",
+    "VirtualArm",
     "__version__",
     "block_pulse_kernel",
     "block_pulse_matrix",
@@ -21,6 +23,7 @@ __all__ = [
     "filter_series",
     "fractional_derivative",
     "fractional_integral",
+    "fractional_memory",
     "grunwald_letnikov_weights",
     "haar_inverse",
     "haar_matrix",
@@ -223,3 +226,50 @@ def search_stage(
     settings: _Options,
     progress: _Progress | None,
 ) -> _FoundStage: ...
+
+@final
+class Guard:
+    def __new__(cls, settings: Mapping[str, Any]) -> Guard: ...
+    def rest(self, analog: Sequence[float], counts: Sequence[int], switches: Sequence[int]) -> None: ...
+    def read(
+        self, analog: Sequence[float], counts: Sequence[int], switches: Sequence[int], late: float
+    ) -> list[float]: ...
+    def command(self, current: Sequence[float]) -> list[float]: ...
+    def fail(self, why: str) -> None: ...
+    @property
+    def fault(self) -> str | None: ...
+    @property
+    def written(self) -> list[float]: ...
+    @property
+    def bias(self) -> list[float]: ...
+    @property
+    def missed(self) -> int: ...
+
+@final
+class VirtualArm:
+    def __new__(
+        cls, arm: Mapping[str, Any], sensors: Mapping[str, Any], step: float, longest_substep: float, horizon: float
+    ) -> VirtualArm: ...
+    def start(self, paced: bool) -> None: ...
+    def read(self, noise: Sequence[float]) -> tuple[list[float], list[int], list[int]]: ...
+    def advance(self, volts: Sequence[float], enabled: bool) -> None: ...
+    def inject(self, what: str, channel: int, sample: int, value: float) -> None: ...
+    def rest(
+        self, guard: Guard, noise: _Matrix, output: Callable[[float, float], tuple[tuple[float, float], bool]]
+    ) -> None: ...
+    def run(
+        self,
+        guard: Guard,
+        commands: _Matrix,
+        noise: _Matrix,
+        output: Callable[[float, float], tuple[tuple[float, float], bool]],
+    ) -> None: ...
+    def take(self) -> _Matrix: ...
+    @property
+    def sample(self) -> int: ...
+    @property
+    def angles(self) -> list[float]: ...
+    @property
+    def memory(self) -> int: ...
+
+def fractional_memory(samples: _Vector, order: float, step: float, tolerance: float) -> tuple[_Vector, int]: ...

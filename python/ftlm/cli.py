@@ -16,6 +16,7 @@ import typer
 
 import ftlm
 from ftlm.errors import DataError, FtlmError, InternalError, ModelError, RigFault
+from ftlm.rig.commands import record
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -419,6 +420,9 @@ def demo(
     else:
         print(demo_text(found))
         print("\nwritten: " + ", ".join(str(f) for f in found.files))
+
+
+app.command()(guarded(record))
 
 
 @app.command()

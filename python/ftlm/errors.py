@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ftlm.runs import Run
+
 __all__ = ["ConvergenceError", "DataError", "FtlmError", "InternalError", "ModelError", "RigFault"]
 
 
@@ -21,8 +26,10 @@ class ConvergenceError(FtlmError):
     """An estimator that ended without an answer that can be trusted."""
 
 
-class RigFault(FtlmError):  # noqa: N818 — a fault, as people at a rig say  # noqa: N818 — a fault, as people at a rig say
-    """A fault of the rig, with its cause in words."""
+class RigFault(FtlmError):  # noqa: N818 — a fault, as people at a rig say
+    """A fault of the rig, with its cause in words; `run` is what was recorded until then, if three rows were."""
+
+    run: Run | None = None
 
 
 class InternalError(FtlmError):

@@ -76,6 +76,7 @@ class _Header:
     units: dict[str, str]
     intersample: dict[str, str]
     warnings: tuple[str, ...]
+    about: dict[str, object]
 
 
 @dataclass(frozen=True)
@@ -220,6 +221,7 @@ def load(
         time_label="time" if clock is None else f"{clock.source.name}: column {clock.name!r} (time)",
         known_step=header.step if header is not None and clock is not None and clock.name == "t_s" else None,
         facts=() if header is None else header.warnings,
+        about={} if header is None else header.about,
     )
 
 
@@ -702,6 +704,7 @@ def _ftlm_header(path: Path, line: bytes) -> _Header | None:
             units=_field(told, "units", dict),
             intersample=_field(told, "intersample", dict),
             warnings=tuple(_field(told, "warnings", list)),
+            about=_field({"about": {}} | told, "about", dict),
         )
         words = (
             header.inputs,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import difflib
 import functools
 import html
@@ -137,7 +138,18 @@ class Run:
     `intersample` says: ``"zoh"`` (a command, held until the next row) or ``"foh"`` (a measured signal, linear).
     """
 
-    __slots__ = ("_data", "_facts", "_inputs", "_intersample", "_name", "_outputs", "_start", "_step", "_units")
+    __slots__ = (
+        "_about",
+        "_data",
+        "_facts",
+        "_inputs",
+        "_intersample",
+        "_name",
+        "_outputs",
+        "_start",
+        "_step",
+        "_units",
+    )
 
     _name: str
     _step: float
@@ -148,6 +160,7 @@ class Run:
     _intersample: dict[str, Intersample]
     _facts: tuple[str, ...]
     _data: dict[str, Array]
+    _about: dict[str, Any]
 
     def __init__(self) -> None:
         raise TypeError("a Run is made by Run.from_arrays, Run.from_frame or ftlm.load")
@@ -170,6 +183,7 @@ class Run:
             units=self._units,
             intersample=self._intersample,
             facts=self._facts,
+            about=self._about,
         ), ()
 
     @classmethod
@@ -381,6 +395,11 @@ class Run:
             if _is_constant(self._data[name])
         )
         return self._facts + constant
+
+    @property
+    def about(self) -> dict[str, Any]:
+        """How the run was made, for JSON: a rig says its name, seed, input, parameters and faults. A copy."""
+        return copy.deepcopy(self._about)
 
     def __getitem__(self, name: str) -> Array:
         """Return a signal in SI units, shape (N,), read-only; `DataError` for an unknown name."""
@@ -607,8 +626,8 @@ class Run:
         """Write this run to a csv file that `ftlm.load` reads back bit for bit, without being told the columns.
 
         The first line is a comment, ``# ftlm-run 1`` and a JSON object that holds name, step, start, inputs, outputs,
-        units, intersample and warnings; then come a header ``t_s,…`` and the rows. The file is written beside its
-        place and renamed, so a reader never sees half of it.
+        units, intersample and warnings, and `about` where a rig made the run; then come a header ``t_s,…`` and the
+        rows. The file is written beside its place and renamed, so a reader never sees half of it.
 
         Parameters
         ----------
@@ -636,7 +655,7 @@ class Run:
             "units": self._units,
             "intersample": self._intersample,
             "warnings": list(self._facts),
-        }
+        } | ({"about": self._about} if self._about else {})
         columns = [self._written_time(), *(self._data[name] for name in self.signals)]
         lines = [
             f"{_CSV_MARK}{_CSV_VERSION} {json.dumps(header, ensure_ascii=False, allow_nan=False)}",
@@ -678,6 +697,7 @@ class Run:
             units=self._units if units is None else units,
             intersample=self._intersample if intersample is None else intersample,
             facts=self._facts if facts is None else facts,
+            about=self._about,
         )
 
     def _unknown(self, name: object) -> DataError:
@@ -753,6 +773,7 @@ def build(
     time_label: str = "time",
     known_step: float | None = None,
     facts: tuple[str, ...] = (),
+    about: Mapping[str, Any] | None = None,
 ) -> Run:
     """Check everything and make the run; `labels` says what errors call a signal, `known_step` what the file stated."""
     _check_run_name(name)
@@ -843,6 +864,7 @@ def build(
         units={signal: scales[signal][0] for signal in order},
         intersample=behaviour,
         facts=tuple(dict.fromkeys(facts)),
+        about=about,
     )
 
 
@@ -857,6 +879,7 @@ def _restore(
     units: Mapping[str, str],
     intersample: Mapping[str, Intersample],
     facts: tuple[str, ...],
+    about: Mapping[str, Any] | None = None,
 ) -> Run:
     run = object.__new__(Run)
     for field, value in (
@@ -869,6 +892,7 @@ def _restore(
         ("_units", {signal: units[signal] for signal in inputs + outputs}),
         ("_intersample", {signal: intersample[signal] for signal in inputs}),
         ("_facts", facts),
+        ("_about", copy.deepcopy(dict(about or {}))),
     ):
         object.__setattr__(run, field, value)
     return run

@@ -7,6 +7,7 @@ mod estimate;
 mod operators;
 mod search;
 mod simulate;
+mod virtual_arm;
 
 use pyo3::prelude::*;
 
@@ -33,6 +34,9 @@ mod _core {
 
     #[pymodule_export]
     use super::search::{lattice_size, search, search_stage};
+
+    #[pymodule_export]
+    use super::virtual_arm::{fractional_memory, Guard, VirtualArm};
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {

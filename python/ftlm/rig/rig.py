@@ -1,0 +1,307 @@
+"""One interface for both rigs: the arm's channels and limits, the order of a start, and the way out of every run."""
+
+from __future__ import annotations
+
+import math
+import signal
+import threading
+import weakref
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+from ftlm import _core
+from ftlm.errors import FtlmError, ModelError, RigFault
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+__all__ = ["COLUMNS", "Board", "Limits", "Rig", "shut_down"]
+
+#: Deflection per volt of strain gauge [rad/V]; the sign is reversed.
+STRAIN_SCALE = (0.013636, 0.018694)
+#: Current per volt of the sense [A/V]; the sign is reversed.
+SENSE_SCALE = 2.0
+#: Current per volt of the command [A/V]; the sign is reversed.
+COMMAND_SCALE = 0.5
+#: Hub angle per count [rad]: 1024 lines read fourfold, behind gears of 100:1 and 50:1.
+ENCODER_SCALE = (2.0 * math.pi / 4096.0 / 100.0, 2.0 * math.pi / 4096.0 / 50.0)
+#: Largest commands that the amplifiers are set up for [A].
+CURRENT_LIMIT = (0.94, 1.2)
+#: Time at rest before every run over which the gauges' bias is averaged [s].
+REST = 0.2
+#: Longest run that may be asked for [s].
+LONGEST = 600.0
+#: Range of the watchdog's time [s]. 0 would switch it off; a second is already a long time for a motor.
+WATCHDOG_RANGE = (0.01, 1.0)
+#: What a row of a run holds.
+COLUMNS = ("I1", "I2", "theta11", "theta12", "theta21", "theta22", "I1_measured", "I2_measured")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What the innermost write and the checks of every sample hold a run to; pairs are stage 1 and stage 2.
+
+    Parameters
+    ----------
+    current
+        Largest command [A].
+    slew
+        Largest change of a command [A/s]. A reversal from end to end takes two samples of 2 ms.
+    continuous
+        Current that a motor bears for ever [A]: the mean square over `thermal_time` stays below its square.
+    thermal_time
+        [s].
+    deflection
+        Trip of the links [rad].
+    saturation
+        Gauge volts that count as saturated.
+    moving_current
+        Current under which a hub must move [A]; below it friction may hold it.
+    standstill
+        Time that it may stand still under it [s].
+    fastest
+        Fastest hub [rad/s]; a faster count is a fault of the encoder.
+    late
+        Longest delay of a write [s].
+    missed
+        Missed deadlines in a row that are borne.
+    """
+
+    current: tuple[float, float] = CURRENT_LIMIT
+    slew: tuple[float, float] = (500.0, 500.0)
+    continuous: tuple[float, float] = (0.7 * CURRENT_LIMIT[0], 0.7 * CURRENT_LIMIT[1])
+    thermal_time: float = 10.0
+    deflection: tuple[float, float] = (math.radians(5.0), math.radians(7.5))
+    saturation: float = 9.99
+    moving_current: float = 0.25
+    standstill: float = 0.5
+    fastest: float = 20.0
+    late: float = 0.05
+    missed: int = 20
+
+    def guard(self, step: float, sensor_filter: tuple[float, float] | None = None) -> _core.Guard:
+        """The guard that enforces them at a sampling step [s]."""
+        return _core.Guard(
+            {
+                "step": step,
+                "strain_scale": STRAIN_SCALE,
+                "sense_scale": SENSE_SCALE,
+                "command_scale": COMMAND_SCALE,
+                "encoder_scale": ENCODER_SCALE,
+                "current_limit": self.current,
+                "slew": self.slew,
+                "continuous": self.continuous,
+                "thermal_time": self.thermal_time,
+                "deflection_limit": self.deflection,
+                "saturation": self.saturation,
+                "moving_current": self.moving_current,
+                "standstill": self.standstill,
+                "fastest": self.fastest,
+                "late_limit": self.late,
+                "missed_limit": self.missed,
+                "filter": sensor_filter,
+            }
+        )
+
+
+class Board(Protocol):
+    """What a rig must be able to do; the order is :class:`Rig`'s."""
+
+    name: str
+    hardware: bool
+
+    def open(self) -> None:
+        """Takes possession of the board."""
+
+    def configure(self, rate: float) -> None:
+        """Sets ranges, directions and encoders, zeroes outputs, makes the one task that reads all channels."""
+
+    def set_expiration(self) -> None:
+        """Tells the watchdog to put 0 V out, and the digital lines in their safe state."""
+
+    def unsafe(self) -> str | None:
+        """What is missing for the watchdog to stop the motors, in words; None when nothing is."""
+
+    def start_watchdog(self, seconds: float) -> None:
+        """Starts the watchdog."""
+
+    def start(self, rate: float) -> None:
+        """Starts sampling."""
+
+    def enable(self, on: bool) -> None:
+        """Switches the amplifiers."""
+
+    def write(self, volts: tuple[float, float]) -> None:
+        """Puts volts out."""
+
+    def rest(self, guard: _core.Guard, samples: int) -> None:
+        """Samples with 0 V out."""
+
+    def run(self, guard: _core.Guard, commands: Floats) -> None:
+        """Samples under commands, shape (n, 2) [A], until they end or a fault latches."""
+
+    def take(self) -> Floats:
+        """Rows since the last call: COLUMNS and the delay [s]."""
+
+    def stop(self) -> None:
+        """Stops the task."""
+
+    def stop_watchdog(self) -> None:
+        """Stops the watchdog."""
+
+    def close(self) -> None:
+        """Lets go of the board."""
+
+
+def shut_down(board: Board) -> list[str]:
+    """Every step of the way out, each tried whatever became of the one before; what went wrong, in words.
+
+    A step that is interrupted (a second Ctrl-C) is done again.
+    """
+    steps: tuple[tuple[str, Callable[[], None]], ...] = (
+        ("writing 0 V", lambda: board.write((0.0, 0.0))),
+        ("disabling the amplifiers", lambda: board.enable(False)),
+        ("stopping the task", board.stop),
+        ("stopping the watchdog", board.stop_watchdog),
+        ("closing the board", board.close),
+    )
+    troubles = []
+    for name, step in steps:
+        for again in (True, False):
+            try:
+                step()
+            except (KeyboardInterrupt, SystemExit):
+                if again:
+                    continue
+            except BaseException as error:
+                troubles.append(f"{name} failed: {error}")
+            break
+    return troubles
+
+
+class Rig:
+    """A rig between its start and its way out; use it in a ``with`` statement.
+
+    However the block is left (its end, an exception, Ctrl-C, SIGTERM, garbage collection), 0 V is written, the
+    amplifiers are disabled, task and watchdog stopped and the board closed, each step tried even if one before it
+    fails. If the program dies or freezes, the watchdog puts 0 V out.
+
+    Parameters
+    ----------
+    board
+        The virtual board or the Q8-USB.
+    rate
+        Samples per second.
+    watchdog
+        Time after which the watchdog puts 0 V out [s], 0.01 to 1.
+    limit
+        Longest run [s]; no command is written after it.
+    limits
+        What every write is held to.
+    sensor_filter
+        Natural frequency [rad/s] and damping of a low-pass on both recorded deflections.
+    """
+
+    def __init__(
+        self,
+        board: Board,
+        *,
+        rate: float = 500.0,
+        watchdog: float = 0.1,
+        limit: float = 30.0,
+        limits: Limits | None = None,
+        sensor_filter: tuple[float, float] | None = None,
+    ) -> None:
+        low, high = WATCHDOG_RANGE
+        if not low <= watchdog <= high:
+            raise ModelError(
+                f"watchdog = {watchdog!r} s is outside [{low:g}, {high:g}] s; 0 would leave the motors running when "
+                "the program dies"
+            )
+        if not 0 < limit <= LONGEST:
+            raise ModelError(f"limit = {limit!r} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
+        self.board = board
+        self.rate = rate
+        self.watchdog = watchdog
+        self.limit = limit
+        self.limits = limits or Limits()
+        self.guard = self.limits.guard(1.0 / rate, sensor_filter)
+        self.troubles: list[str] = []
+        self._samples = 0
+        self._finalizer: weakref.finalize[Any, Any] | None = None
+        self._handler: Any = None
+
+    def __enter__(self) -> Rig:
+        board = self.board
+        self._finalizer = weakref.finalize(self, shut_down, board)
+        if threading.current_thread() is threading.main_thread():
+            self._handler = signal.signal(signal.SIGTERM, _terminated)
+        try:
+            board.open()
+            board.configure(self.rate)
+            board.set_expiration()
+            missing = board.unsafe()
+            if missing is not None:
+                raise RigFault(
+                    f"{board.name}: {missing}; the motors are not started without a watchdog that stops them"
+                )
+            board.start_watchdog(self.watchdog)
+            board.start(self.rate)
+            board.rest(self.guard, max(2, round(REST * self.rate)))
+            self._check()
+            board.enable(True)
+        except BaseException:
+            self._leave()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> Literal[False]:
+        self._leave()
+        return False
+
+    def _leave(self) -> None:
+        try:
+            if self._finalizer is not None:
+                self.troubles += self._finalizer() or []
+        finally:
+            if self._handler is not None:
+                signal.signal(signal.SIGTERM, self._handler)
+                self._handler = None
+
+    def _check(self) -> None:
+        if self.guard.fault is not None:
+            raise RigFault(f"{self.board.name}: {self.guard.fault}")
+
+    def run(self, commands: Floats) -> None:
+        """Runs commands, shape (n, 2) [A]; rows wait in :meth:`take`.
+
+        Raises
+        ------
+        RigFault
+            A fault latched: the motors are at 0 V and stay there.
+        """
+        self._check()
+        if self._samples + len(commands) > self.limit * self.rate + 1.5:
+            self.guard.fail(f"the time limit of {self.limit:g} s is over; ask for a longer one")
+            self.board.write((0.0, 0.0))
+            self._check()
+        self._samples += len(commands)
+        try:
+            self.board.run(self.guard, commands)
+        except FtlmError as error:
+            self.guard.fail(str(error))
+        self._check()
+
+    def take(self) -> Floats:
+        """Rows since the last call, shape (n, 9): COLUMNS and how late each was [s]."""
+        return self.board.take()
+
+
+def _terminated(number: int, frame: FrameType | None) -> None:
+    raise SystemExit(128 + number)

@@ -1,0 +1,559 @@
+//! The physical two-link arm stepped sample by sample, with its converters, paced in real time or not.
+//!
+//! Each stage obeys (22)–(23) with Newton's order 2 on the left. The hub's Coulomb friction is a set-valued torque, so
+//! it counts as a current that is subtracted from the motor's and may take any value up to its limit at standstill.
+//! Stage 2 rides on link 1: with φ = θ₁₁ + θ₁₂ its base accelerates by φ″, and its motor's torque pulls on link 1,
+//!
+//!   J₁₁θ₁₁″ = τ₁ + …,   J₁₂φ″ = … − κτ₂,   J₂₁(κφ″ + θ₂₁″) = τ₂ + …,   κ = 0 (apart) … 1 (the real mounting),
+//!
+//! which follow from one Lagrangian for every κ. Fractional derivatives of the angles are integrals of their rates,
+//! D^ν θ = I^{1−ν} θ′ and D^ν θ = I^{2−ν} θ″, exact for rates that are linear over a substep; the past lives in a fixed
+//! number of exponentials ([`crate::memory`]). One substep is a trapezoidal step, implicit in all four rates at once.
+
+use std::time::{Duration, Instant};
+
+use crate::error::{check_step, Error, Result};
+use crate::memory::{decay, Rates};
+use crate::small;
+
+/// Accuracy of the memory's kernels: far below what the trapezoidal steps leave.
+const MEMORY_TOLERANCE: f64 = 1e-10;
+/// Sweeps of the friction solve; two hubs need one where the stages are apart and a few where they are not.
+const FRICTION_SWEEPS: usize = 60;
+
+/// Orders, coefficients and friction of one stage, by the paper's names.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Stage {
+    /// Orders in the hub's equation: β on the deflection, γ on the hub, μ on the deflection; in [0, 2).
+    pub hub_orders: [f64; 3],
+    /// a, b, d, g of the hub's equation.
+    pub hub: [f64; 4],
+    /// Orders in the deflection's equation: β, γ, μ; in [0, 2).
+    pub deflection_orders: [f64; 3],
+    /// a, b, d, g of the deflection's equation.
+    pub deflection: [f64; 4],
+    /// Coulomb friction of the hub as a current \[A\].
+    pub coulomb: f64,
+}
+
+/// Both stages and how they are joined.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parameters {
+    /// Stage 1 and stage 2.
+    pub stages: [Stage; 2],
+    /// κ: 0 stages apart, 1 stage 2 on link 1.
+    pub coupling: f64,
+    /// J₂₁/J₁₂.
+    pub inertia_ratio: f64,
+}
+
+/// A derivative of one angle and what it contributes to the four accelerations.
+#[derive(Debug, Clone)]
+struct Operator {
+    signal: usize,
+    order: f64,
+    into: [f64; 4],
+    /// On the states of the past; empty for orders 0 and 1.
+    weights: Vec<f64>,
+    /// On the rate at the start and at the end of the substep.
+    before: f64,
+    now: f64,
+}
+
+/// The arm's state and its substep.
+#[derive(Debug, Clone)]
+pub struct Arm {
+    substep: f64,
+    substeps: usize,
+    operators: Vec<Operator>,
+    /// Accelerations per ampere of both motors.
+    input: [[f64; 2]; 4],
+    coulomb: [f64; 2],
+    /// (1 − h/2·C)⁻¹ with C the accelerations per rate at the end of the substep.
+    solve: [[f64; 4]; 4],
+    implicit: [[f64; 4]; 4],
+    keep: Vec<f64>,
+    first: Vec<f64>,
+    last: Vec<f64>,
+    past: [Vec<f64>; 4],
+    rate: [f64; 4],
+    angle: [f64; 4],
+    linear: [f64; 4],
+    friction: [f64; 2],
+}
+
+impl Arm {
+    /// An arm at rest, stepped `step` s at a time in substeps of at most `longest_substep`, for `horizon` s.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for an order outside [0, 2), a negative friction or coupling, a step that is not positive;
+    /// [`Error::NotFinite`] for a coefficient.
+    pub fn new(parameters: &Parameters, step: f64, longest_substep: f64, horizon: f64) -> Result<Self> {
+        check_step(step)?;
+        check_step(longest_substep)?;
+        #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+        let substeps = (step / longest_substep - 1e-9).ceil().max(1.0) as usize;
+        #[allow(clippy::cast_precision_loss)]
+        let h = step / substeps as f64;
+        let (mut operators, input) = accelerations(parameters)?;
+        let rates = Rates::new(h, horizon.max(2.0 * step), MEMORY_TOLERANCE)?;
+        for operator in &mut operators {
+            operator.prepare(h, &rates);
+        }
+        let mut implicit = [[0.0; 4]; 4];
+        for operator in &operators {
+            for (row, c) in implicit.iter_mut().zip(operator.into) {
+                row[operator.signal] += c * operator.now;
+            }
+        }
+        let matrix: Vec<f64> =
+            (0..16).map(|i| f64::from(u8::from(i / 4 == i % 4)) - h / 2.0 * implicit[i / 4][i % 4]).collect();
+        let inverse = small::inverse(&matrix, 4)?;
+        let mut solve = [[0.0; 4]; 4];
+        for (i, value) in inverse.iter().enumerate() {
+            solve[i / 4][i % 4] = *value;
+        }
+        let steps: Vec<(f64, f64, f64)> = rates.rates().iter().map(|s| decay(s * h)).collect();
+        let count = steps.len();
+        Ok(Self {
+            substep: h,
+            substeps,
+            operators,
+            input,
+            coulomb: [parameters.stages[0].coulomb, parameters.stages[1].coulomb],
+            solve,
+            implicit,
+            keep: steps.iter().map(|s| s.0).collect(),
+            first: steps.iter().map(|s| h * s.1).collect(),
+            last: steps.iter().map(|s| h * s.2).collect(),
+            past: std::array::from_fn(|_| vec![0.0; count]),
+            rate: [0.0; 4],
+            angle: [0.0; 4],
+            linear: [0.0; 4],
+            friction: [0.0; 2],
+        })
+    }
+
+    /// θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\].
+    #[must_use]
+    pub fn angles(&self) -> [f64; 4] {
+        self.angle
+    }
+
+    /// Their rates \[rad/s\].
+    #[must_use]
+    pub fn rates(&self) -> [f64; 4] {
+        self.rate
+    }
+
+    /// How many numbers hold the past.
+    #[must_use]
+    pub fn memory(&self) -> usize {
+        self.past.iter().map(Vec::len).sum()
+    }
+
+    /// One sample under held motor currents \[A\]. Constant time.
+    pub fn advance(&mut self, current: [f64; 2]) {
+        for _ in 0..self.substeps {
+            self.substep(current);
+        }
+    }
+
+    fn substep(&mut self, current: [f64; 2]) {
+        let h = self.substep;
+        let mut history = [0.0; 4];
+        for operator in &self.operators {
+            let s = operator.signal;
+            let mut value = operator.before * self.rate[s];
+            if operator.order == 0.0 {
+                value += self.angle[s];
+            }
+            value += operator.weights.iter().zip(&self.past[s]).map(|(w, z)| w * z).sum::<f64>();
+            for (sum, c) in history.iter_mut().zip(operator.into) {
+                *sum += c * value;
+            }
+        }
+        let mut right = [0.0; 4];
+        for (i, value) in right.iter_mut().enumerate() {
+            let driven: f64 = self.input[i].iter().zip(current).map(|(b, u)| b * u).sum();
+            *value = self.rate[i] + h / 2.0 * (self.linear[i] + history[i]) + h * driven;
+        }
+        let mut rate = times(&self.solve, &right);
+        if self.coulomb != [0.0; 2] {
+            self.rub(&mut rate);
+        }
+        let implicit = times(&self.implicit, &rate);
+        for i in 0..4 {
+            self.linear[i] = history[i] + implicit[i];
+            self.angle[i] += h / 2.0 * (self.rate[i] + rate[i]);
+            let (before, after) = (self.rate[i], rate[i]);
+            for (((z, keep), first), last) in self.past[i].iter_mut().zip(&self.keep).zip(&self.first).zip(&self.last) {
+                *z = *z * keep + first * before + last * after;
+            }
+        }
+        self.rate = rate;
+    }
+
+    /// Coulomb friction: the currents within ±coulomb that stop the hubs, or as much of them as there is.
+    fn rub(&mut self, rate: &mut [f64; 4]) {
+        let h = self.substep;
+        // Rates per ampere of friction; column k is the response to motor k.
+        let columns: [[f64; 4]; 2] =
+            std::array::from_fn(|k| times(&self.solve, &std::array::from_fn(|i| h * self.input[i][k])));
+        let free = *rate;
+        let mut friction = self.friction;
+        for _ in 0..FRICTION_SWEEPS {
+            let mut change = 0.0_f64;
+            for k in 0..2 {
+                let hub = 2 * k;
+                let speed = free[hub] - columns[0][hub] * friction[0] - columns[1][hub] * friction[1];
+                let next = (friction[k] + speed / columns[k][hub]).clamp(-self.coulomb[k], self.coulomb[k]);
+                change = change.max((next - friction[k]).abs());
+                friction[k] = next;
+            }
+            if change < 1e-15 {
+                break;
+            }
+        }
+        self.friction = friction;
+        for i in 0..4 {
+            rate[i] = free[i] - columns[0][i] * friction[0] - columns[1][i] * friction[1];
+        }
+        for k in 0..2 {
+            // A hub held by friction stands still exactly, and its encoder with it.
+            if friction[k].abs() < self.coulomb[k] {
+                rate[2 * k] = 0.0;
+            }
+        }
+    }
+}
+
+fn times(matrix: &[[f64; 4]; 4], vector: &[f64; 4]) -> [f64; 4] {
+    std::array::from_fn(|i| matrix[i].iter().zip(vector).map(|(a, b)| a * b).sum())
+}
+
+impl Operator {
+    fn prepare(&mut self, h: f64, rates: &Rates) {
+        if self.order == 0.0 {
+            (self.before, self.now) = (h / 2.0, h / 2.0);
+        } else if self.order == 1.0 {
+            (self.before, self.now) = (0.0, 1.0);
+        } else if self.order < 1.0 {
+            // I^q of a rate that is linear over the last substep, exactly; older parts through the exponentials.
+            let q = 1.0 - self.order;
+            let scale = libm::pow(h, q) / libm::tgamma(q + 2.0);
+            (self.before, self.now) = (q * scale, scale);
+            self.weights = decayed(rates, q, h);
+        } else {
+            let q = 2.0 - self.order;
+            let scale = libm::pow(h, q - 1.0) / libm::tgamma(q + 1.0);
+            // ∫ e^{−s(t−τ)} θ″ dτ = θ′(t) − s z(t).
+            let weights = decayed(rates, q, h);
+            self.before = weights.iter().sum::<f64>() - scale;
+            self.now = scale;
+            self.weights = weights.iter().zip(rates.rates()).map(|(w, s)| -w * s).collect();
+        }
+    }
+}
+
+/// Weights of the kernel at lags beyond a substep.
+fn decayed(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
+    rates.weights(q).iter().zip(rates.rates()).map(|(w, s)| w * libm::exp(-s * h)).collect()
+}
+
+/// The four accelerations as derivatives of the angles and as motor currents.
+fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4])> {
+    let (k, ratio) = (parameters.coupling, parameters.inertia_ratio);
+    let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
+        name: name.into(),
+        value,
+        range: range.into(),
+        remedy: "correct the arm's parameters".into(),
+    };
+    if !(0.0..=1.0).contains(&k) {
+        return Err(outside("coupling", k, "[0, 1]"));
+    }
+    if !(ratio >= 0.0 && ratio.is_finite()) {
+        return Err(outside("inertia ratio", ratio, "[0, ∞)"));
+    }
+    let mut operators: Vec<Operator> = Vec::new();
+    let mut add = |signal: usize, order: f64, row: usize, c: f64| {
+        if c == 0.0 {
+            return;
+        }
+        #[allow(clippy::float_cmp)]
+        let known = operators.iter().position(|o| o.signal == signal && o.order == order);
+        let at = known.unwrap_or_else(|| {
+            let (into, weights) = ([0.0; 4], Vec::new());
+            operators.push(Operator { signal, order, into, weights, before: 0.0, now: 0.0 });
+            operators.len() - 1
+        });
+        operators[at].into[row] += c;
+    };
+    let mut input = [[0.0; 2]; 4];
+    for (j, stage) in parameters.stages.iter().enumerate() {
+        if !(stage.coulomb >= 0.0 && stage.coulomb.is_finite()) {
+            return Err(outside("Coulomb friction", stage.coulomb, "[0, ∞) A"));
+        }
+        let (hub, link) = (2 * j, 2 * j + 1);
+        for (row, orders, c) in [(hub, stage.hub_orders, stage.hub), (link, stage.deflection_orders, stage.deflection)]
+        {
+            crate::error::check_finite("coefficients of the arm", &c)?;
+            if let Some(&bad) = orders.iter().find(|o| !(0.0..2.0).contains(*o)) {
+                return Err(outside("order of the arm", bad, "[0, 2)"));
+            }
+            let signals = [link, hub, link];
+            for t in 0..3 {
+                add(signals[t], orders[t], row, c[t]);
+                // Link 1 carries stage 2: what accelerates φ accelerates the base of hub 2 the other way.
+                if j == 0 {
+                    add(signals[t], orders[t], 2, -k * c[t]);
+                }
+            }
+            input[row][j] += c[3];
+            if j == 0 {
+                input[2][0] -= k * c[3];
+            }
+        }
+        if j == 1 {
+            // Motor 2 and its friction pull on link 1, and through φ on hub 2 itself.
+            let (gamma, b, g) = (stage.hub_orders[1], stage.hub[1], stage.hub[3]);
+            add(hub, gamma, 1, -k * ratio * b);
+            add(hub, gamma, 2, k * k * ratio * b);
+            input[1][1] -= k * ratio * g;
+            input[2][1] += k * k * ratio * g;
+        }
+    }
+    Ok((operators, input))
+}
+
+/// What the arm's sensors and converters make of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sensors {
+    /// Deflection per volt of strain gauge \[rad/V\].
+    pub strain_scale: [f64; 2],
+    /// Volts of the gauges at rest.
+    pub strain_bias: [f64; 2],
+    /// Standard deviation of the noise on strain 1, 2 and current sense 1, 2 \[V\].
+    pub noise: [f64; 4],
+    /// Offset of the current sense \[V\].
+    pub sense_bias: [f64; 2],
+    /// Current per volt of the sense \[A/V\].
+    pub sense_scale: f64,
+    /// Current per volt of the command \[A/V\].
+    pub command_scale: f64,
+    /// Hub angle per count \[rad\].
+    pub encoder_scale: [f64; 2],
+    /// Volts from end to end of the converters' range are twice this.
+    pub range: f64,
+    /// Bits of the converters; 0 for none.
+    pub bits: u32,
+    /// Largest current of the amplifiers \[A\].
+    pub current_limit: [f64; 2],
+    /// Hub angle at which a limit switch opens \[rad\].
+    pub travel: [f64; 2],
+}
+
+/// What goes wrong on purpose, from a sample on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Injection {
+    /// The encoder stops counting.
+    DeadEncoder {
+        /// Stage, from 0.
+        stage: usize,
+        /// First sample.
+        from: u64,
+    },
+    /// The gauge's amplifier sits at its rail.
+    SaturatedGauge {
+        /// Stage, from 0.
+        stage: usize,
+        /// First sample.
+        from: u64,
+    },
+    /// A limit switch opens.
+    LimitSwitch {
+        /// Line, from 0.
+        line: usize,
+        /// First sample.
+        from: u64,
+    },
+    /// The link bends by this much more \[rad\].
+    Deflection {
+        /// Stage, from 0.
+        stage: usize,
+        /// First sample.
+        from: u64,
+        /// Angle \[rad\].
+        angle: f64,
+    },
+    /// The loop is late by this much at one sample \[s\], on the virtual clock.
+    Late {
+        /// Sample.
+        at: u64,
+        /// Delay \[s\].
+        seconds: f64,
+    },
+    /// The board hands over no samples any more.
+    LostSamples {
+        /// First sample.
+        from: u64,
+    },
+}
+
+/// One reading of all channels at one instant.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Reading {
+    /// Strain 1, 2, current sense 1, 2 \[V\].
+    pub analog: [f64; 4],
+    /// Encoder counts.
+    pub counts: [i32; 2],
+    /// Limit switches; 0 is tripped.
+    pub switches: [i8; 4],
+}
+
+/// The arm behind its converters.
+#[derive(Debug, Clone)]
+pub struct Plant {
+    /// The arm itself.
+    pub arm: Arm,
+    sensors: Sensors,
+    current: [f64; 2],
+    frozen: [Option<i32>; 2],
+    injections: Vec<Injection>,
+    sample: u64,
+}
+
+impl Plant {
+    /// An arm at rest with no current.
+    #[must_use]
+    pub fn new(arm: Arm, sensors: Sensors) -> Self {
+        Self { arm, sensors, current: [0.0; 2], frozen: [None; 2], injections: Vec::new(), sample: 0 }
+    }
+
+    /// Adds something that goes wrong.
+    pub fn inject(&mut self, injection: Injection) {
+        self.injections.push(injection);
+    }
+
+    /// Number of the sample that [`Self::read`] reads next.
+    #[must_use]
+    pub fn sample(&self) -> u64 {
+        self.sample
+    }
+
+    /// All channels now; `noise` is standard normal, for strain 1, 2 and sense 1, 2.
+    pub fn read(&mut self, noise: [f64; 4]) -> Reading {
+        let s = &self.sensors;
+        let angles = self.arm.angles();
+        let mut bend = [angles[1], angles[3]];
+        let mut analog = [0.0; 4];
+        let mut switches = [1_i8; 4];
+        let mut rail = [false; 2];
+        for injection in &self.injections {
+            match *injection {
+                Injection::SaturatedGauge { stage, from } => rail[stage] |= self.sample >= from,
+                Injection::LimitSwitch { line, from } if self.sample >= from => switches[line] = 0,
+                Injection::Deflection { stage, from, angle } if self.sample >= from => bend[stage] += angle,
+                _ => {}
+            }
+        }
+        for j in 0..2 {
+            let strain = s.strain_bias[j] - bend[j] / s.strain_scale[j] + s.noise[j] * noise[j];
+            analog[j] = s.convert(if rail[j] { s.range } else { strain });
+            let sense = s.sense_bias[j] - self.current[j] / s.sense_scale + s.noise[2 + j] * noise[2 + j];
+            analog[2 + j] = s.convert(sense);
+            for (line, beyond) in [(2 * j, -angles[2 * j]), (2 * j + 1, angles[2 * j])] {
+                if beyond > s.travel[j] {
+                    switches[line] = 0;
+                }
+            }
+        }
+        #[allow(clippy::cast_possible_truncation)]
+        let mut counts: [i32; 2] = std::array::from_fn(|j| (angles[2 * j] / s.encoder_scale[j]).floor() as i32);
+        for injection in &self.injections {
+            if let Injection::DeadEncoder { stage, from } = *injection {
+                if self.sample >= from {
+                    counts[stage] = *self.frozen[stage].get_or_insert(counts[stage]);
+                }
+            }
+        }
+        Reading { analog, counts, switches }
+    }
+
+    /// Whether the board still hands over samples.
+    #[must_use]
+    pub fn sampling(&self) -> bool {
+        !self.injections.iter().any(|i| matches!(i, Injection::LostSamples { from } if self.sample >= *from))
+    }
+
+    /// The injected delay at this sample \[s\].
+    #[must_use]
+    pub fn delay(&self) -> f64 {
+        let late = |i: &Injection| match *i {
+            Injection::Late { at, seconds } if at == self.sample => seconds,
+            _ => 0.0,
+        };
+        self.injections.iter().map(late).sum()
+    }
+
+    /// One sample under these volts at the amplifiers' inputs; disabled amplifiers give no current.
+    pub fn advance(&mut self, volts: [f64; 2], enabled: bool) {
+        let s = &self.sensors;
+        for ((current, volts), limit) in self.current.iter_mut().zip(volts).zip(s.current_limit) {
+            let asked = -s.convert(volts) * s.command_scale;
+            *current = if enabled { asked.clamp(-limit, limit) } else { 0.0 };
+        }
+        self.arm.advance(self.current);
+        self.sample += 1;
+    }
+}
+
+impl Sensors {
+    /// Clips to the converters' range and rounds to their steps; what is not a number becomes 0 V.
+    fn convert(&self, volts: f64) -> f64 {
+        if !volts.is_finite() {
+            return 0.0;
+        }
+        if self.bits == 0 {
+            return volts;
+        }
+        let codes = libm::ldexp(1.0, i32::try_from(self.bits).unwrap_or(16));
+        let step = 2.0 * self.range / codes;
+        (volts / step).round().clamp(-codes / 2.0, codes / 2.0 - 1.0) * step
+    }
+}
+
+/// Deadlines of a loop in real time, counted from its start.
+#[derive(Debug)]
+pub struct Pace {
+    start: Instant,
+    step: f64,
+    samples: u64,
+}
+
+/// The system's sleep ends late by some tens of microseconds; the rest is waited out awake.
+const AWAKE: Duration = Duration::from_micros(120);
+
+impl Pace {
+    /// Starts now.
+    #[must_use]
+    pub fn new(step: f64) -> Self {
+        Self { start: Instant::now(), step, samples: 0 }
+    }
+
+    /// Waits for the next sample instant; how late it is when it returns \[s\].
+    pub fn wait(&mut self) -> f64 {
+        #[allow(clippy::cast_precision_loss)]
+        let due = self.start + Duration::from_secs_f64(self.step * self.samples as f64);
+        self.samples += 1;
+        loop {
+            let now = Instant::now();
+            match due.checked_duration_since(now) {
+                None => return now.duration_since(due).as_secs_f64(),
+                Some(left) if left > AWAKE => std::thread::sleep(left - AWAKE),
+                Some(_) => std::hint::spin_loop(),
+            }
+        }
+    }
+}

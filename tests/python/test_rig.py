@@ -1,0 +1,256 @@
+"""The rig: the simulated arm against the series solution, its sensors, inputs, limits, ways out, and files."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm import _core, rig
+from ftlm.rig.rig import CURRENT_LIMIT, ENCODER_SCALE, STRAIN_SCALE
+
+
+@pytest.fixture(scope="module")
+def square():
+    return rig.record(input="square", duration=4.0, seed=3)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The arm
+
+
+def integral_oracle(x, order, step):
+    """I^q of a signal that is linear between its samples, by the product trapezoidal sum over its whole past."""
+    return ftlm.fractional_integral(x, order, step=step, rule="trapezoidal")
+
+
+@pytest.mark.parametrize("order", [0.02, 0.25, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize(("tolerance", "allowed"), [(1e-6, 1e-6), (1e-10, 1e-10), (1e-14, 3e-13)])
+def test_memory_in_bounded_space_is_the_integral_over_the_whole_past(order, tolerance, allowed):
+    rng = np.random.default_rng(5)
+    x = np.cumsum(rng.standard_normal(4000)) * 0.1
+    x[0] = 0.0
+    found, states = _core.fractional_memory(x, order, 0.002, tolerance)
+    truth = integral_oracle(x, order, 0.002)
+    assert np.abs(found - truth).max() <= allowed * np.abs(truth).max()
+    assert states < 160
+
+
+@pytest.mark.parametrize("name", ["A", "A2"])
+def test_linear_arm_is_the_series_solution(name, plant, drive):
+    truth = plant(name).simulate(drive(name), tolerance=1e-7)
+    stage = 1 if name == "A" else 2
+    current = truth[f"I{stage}"]
+    arm = rig.ArmParameters.of("linear").arm(truth.step, 30.0)
+    states = np.zeros((truth.length, 4))
+    for k, value in enumerate(current):
+        states[k] = arm.angles
+        arm.advance([-value / 0.5, -value / 0.5], True)
+    hub, deflection = states[:, 2 * stage - 2], states[:, 2 * stage - 1]
+    for values, output, allowed in ((hub, f"theta{stage}1", 3e-6), (deflection, f"theta{stage}2", 2e-5)):
+        assert np.abs(values - truth[output]).max() < allowed * truth[output].std(), output
+
+
+def test_friction_holds_a_hub_below_its_limit_and_slows_it_above():
+    parameters = rig.ArmParameters.of("effective")
+    arm = parameters.arm(0.002, 10.0)
+    for _ in range(500):
+        arm.advance([-0.9 * parameters.stage1.coulomb / 0.5, 0.0], True)
+    assert arm.angles[0] == 0.0
+    assert arm.angles[2] == 0.0
+    arms = [p.arm(0.002, 10.0) for p in (parameters, rig.ArmParameters.of("linear"))]
+    for _ in range(250):
+        for arm in arms:
+            arm.advance([-0.3 / 0.5, 0.0], True)
+    assert 0.3 * arms[1].angles[0] < arms[0].angles[0] < 0.9 * arms[1].angles[0]
+
+
+def test_stage_2_feels_link_1_only_where_they_are_coupled():
+    def bend(coupling):
+        given = rig.ArmParameters(
+            **{**rig.ArmParameters.of("effective").__dict__, "coupling": coupling, "travel": (9.0, 9.0)}
+        )
+        arm = given.arm(0.002, 10.0)
+        peak = 0.0
+        for _ in range(500):
+            arm.advance([-0.6, 0.0], True)
+            peak = max(peak, abs(arm.angles[3]))
+        return peak
+
+    assert bend(0.0) == 0.0
+    assert bend(1.0) > 1e-3
+
+
+def test_sensors_count_convert_and_clip():
+    arm = rig.ArmParameters.of("effective").arm(0.002, 10.0)
+    analog, counts, switches = arm.read([0.0] * 4)
+    step = 20.0 / 2**16
+    assert np.abs(np.array(analog) / step - np.round(np.array(analog) / step)).max() < 1e-9
+    assert counts == [0, 0]
+    assert switches == [1, 1, 1, 1]
+    clipped, _, _ = arm.read([1e9, -1e9, 1e9, -1e9])
+    assert clipped == [10.0 - step, -10.0, 10.0 - step, -10.0]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Records
+
+
+def test_a_record_says_everything_and_loads_bit_for_bit(tmp_path):
+    path = tmp_path / "square.csv"
+    run = rig.record(input="square", amplitude=0.3, period=2, duration=2, seed=7, out=path)
+    loaded = ftlm.load(path)
+    assert loaded.inputs == ("I1", "I2")
+    assert loaded.outputs == ("theta11", "theta12", "theta21", "theta22", "I1_measured", "I2_measured")
+    assert all(np.array_equal(loaded[n], run[n]) for n in run.signals)
+    assert loaded.units == run.units
+    assert loaded.about == run.about
+    about = loaded.about
+    assert (about["rig"], about["seed"], about["faults"], about["missed_deadlines"]) == ("virtual rig", 7, [], 0)
+    assert about["parameters"]["stage1"]["a"] == 628.89
+    assert about["input"]["shape"] == "square"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["square.csv"]
+    assert json.loads(path.read_text(encoding="utf-8").split("\n")[0].removeprefix("# ftlm-run 1 "))["about"] == about
+
+
+def test_equal_seeds_give_equal_runs(square):
+    again = rig.record(input="square", duration=4.0, seed=3)
+    other = rig.record(input="square", duration=4.0, seed=4)
+    assert all(np.array_equal(again[n], square[n]) for n in square.signals)
+    assert not np.array_equal(other["theta12"], square["theta12"])
+    assert np.array_equal(other["I1"], square["I1"])
+
+
+def test_angles_come_in_counts_and_volts(square):
+    for name, lsb in (("theta11", ENCODER_SCALE[0]), ("theta21", ENCODER_SCALE[1])):
+        counts = square[name] / lsb
+        assert np.abs(counts - np.round(counts)).max() < 1e-6
+    volts = square["theta12"] / STRAIN_SCALE[0] / (20.0 / 2**16)
+    steps = np.diff(np.unique(np.round(volts, 3)))
+    assert np.abs(steps - np.round(steps)).max() < 0.01
+    assert square["I1"].std() == pytest.approx(0.3, rel=0.01)
+    assert (square["I1_measured"] - square["I1"]).std() < 0.2
+
+
+@pytest.mark.parametrize(
+    ("shape", "options"),
+    [
+        ("square", {}),
+        ("sine", {"amplitude": 0.5}),
+        ("chirp", {"band": (0.2, 10.0)}),
+        ("multisine", {"period": 2.0, "band": (0.5, 10.0)}),
+        ("prbs", {"period": 0.2}),
+        ("doublet", {"period": 1.0}),
+        ("square", {"ramp": 1.0}),
+    ],
+)
+def test_every_input_keeps_its_amplitude_and_ends_at_zero(shape, options):
+    given = rig.Excitation(shape, **{"amplitude": 0.3, **options})
+    found = given.commands(500.0, 4.0)
+    assert found.shape == (2001, 2)
+    assert (found[-1] == 0.0).all()
+    assert np.abs(found).max() <= given.amplitude + 1e-12
+    assert np.abs(found).max() > 0.9 * given.amplitude
+    if options.get("ramp"):
+        assert np.abs(found[:50]).max() < 0.1 * given.amplitude
+    if shape in ("prbs", "multisine"):
+        assert abs(np.corrcoef(found.T)[0, 1]) < 0.6
+    else:
+        assert np.array_equal(found[:, 0], found[:, 1])
+
+
+def test_a_csv_input_is_held_and_padded_with_zeros(tmp_path):
+    path = tmp_path / "currents.csv"
+    path.write_text("t_s,I1,I2\n0,0.1,0\n0.5,0.2,-0.1\n1.0,-0.1,0\n", encoding="utf-8")
+    found = rig.Excitation("csv", file=path).commands(100.0, 2.0)
+    assert found[[0, 49, 50, 99, 100, 149], 0].tolist() == [0.1, 0.1, 0.2, 0.2, -0.1, -0.1]
+    assert found[75, 1] == -0.1
+    assert (found[150:] == 0.0).all()
+
+
+def test_parameters_come_from_a_toml_file(tmp_path):
+    path = tmp_path / "arm.toml"
+    path.write_text(
+        'base = "linear"\ncoupling = 0.5\nstrain_noise = [0.01, 0.02]\n[stage1]\na = 600.0\ncoulomb = 0.05\n',
+        encoding="utf-8",
+    )
+    found = rig.ArmParameters.of(path)
+    assert (found.coupling, found.stage1.a, found.stage1.coulomb, found.stage1.b) == (0.5, 600.0, 0.05, -62.956)
+    assert found.strain_noise == (0.01, 0.02)
+    run = rig.record(duration=0.5, parameters=path)
+    assert run.about["parameters"]["name"] == "arm.toml"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("colour = 3", "'colour' in the file is not known"),
+        ("[stage1]\nq = 1.0", "'q' in stage1 is not known"),
+        ("strain_noise = 0.1", "not a pair of numbers"),
+        ("[stage2]\na = true", "not a number"),
+        ("bits = 99", "whole number from 0 to 24"),
+        ("strain_noise = [-0.1, 0.1]", "must not be negative"),
+        ('base = "other"', "base = 'other' is not known"),
+        ("coupling = 7.0", "outside [0, 1]"),
+        ("[stage1]\ngamma = 1.9", "outside [0, 2)"),
+    ],
+)
+def test_parameters_that_cannot_be_used_are_refused(tmp_path, text, words):
+    path = tmp_path / "arm.toml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ftlm.ModelError) as refused:
+        rig.record(duration=0.5, parameters=path)
+    assert words in str(refused.value)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Bad input: refused before anything moves
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"amplitude": 0.95}, "over the limit of 0.94 A"),
+        ({"amplitude": (0.3, 1.3)}, "motor 2 is over the limit of 1.2 A"),
+        ({"amplitude": math.nan}, "not a current"),
+        ({"duration": 0}, "not a time above 0"),
+        ({"duration": 1e4}, "no run is longer than 600 s"),
+        ({"duration": 40}, "over the limit of 30 s; raise limit="),
+        ({"duration": 40, "limit": 700}, "outside (0, 600]"),
+        ({"rate": 20000.0}, "cannot be done by this board"),
+        ({"rate": 0}, "not a positive number"),
+        ({"duration": 0.001}, "fewer than three samples"),
+        ({"input": "triangle"}, "'triangle' is not known"),
+        ({"period": 0.0}, "not a time of at least two samples"),
+        ({"input": "chirp", "band": (5.0, 1.0)}, "not two rising frequencies"),
+        ({"input": "csv"}, "needs a file"),
+        ({"ramp": 20.0}, "outside [0, 10] s"),
+        ({"watchdog": 0.0}, "would leave the motors running"),
+        ({"watchdog": 5.0}, "outside [0.01, 1]"),
+        ({"rig": "q9"}, "'q9' is not known"),
+        ({"parameters": "effectiv"}, "did you mean 'effective'?"),
+        ({"seed": -1}, "whole number"),
+        ({"sensor_filter": "none"}, "'stock' or None"),
+    ],
+)
+def test_what_cannot_be_done_is_refused(options, words, tmp_path):
+    with pytest.raises(ftlm.ModelError) as refused:
+        rig.record(**options, out=tmp_path / "x.csv")
+    assert words in str(refused.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_csv_input_with_nan_or_too_much_current_is_refused(tmp_path):
+    bad, large = tmp_path / "bad.csv", tmp_path / "large.csv"
+    bad.write_text("t_s,I1,I2\n0,0.1,0\n0.5,nan,0\n1.0,0,0\n", encoding="utf-8")
+    large.write_text("t_s,I1,I2\n0,0.1,0\n0.5,0.2,1.3\n1.0,0,0\n", encoding="utf-8")
+    with pytest.raises(ftlm.DataError, match="NaN, first at row 1, 1 in all"):
+        rig.record(input="csv", file=bad, duration=1.0)
+    with pytest.raises(ftlm.ModelError, match=r"motor 2 is 1\.3 A at 0\.5 s"):
+        rig.record(input="csv", file=large, duration=1.0)
+
+
+def test_the_limits_of_the_arm_are_those_of_its_channels():
+    assert CURRENT_LIMIT == (0.94, 1.2)
+    assert pytest.approx((1.53398e-5, 3.06796e-5), rel=1e-5) == ENCODER_SCALE
