@@ -10,7 +10,7 @@ from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, M
 from ftlm.files import load
 from ftlm.flexible_link import PARAMETERS, LinkParameters, flexible_link, link_model, order_law
 from ftlm.identification import Identification, Trace, identify, multi_innovation_trace
-from ftlm.models import Equation, Model, Order, SensorFilter, Structure, Term, equation, load_model
+from ftlm.models import Equation, Estimate, Model, Order, SensorFilter, Structure, Term, equation, load_model
 from ftlm.operators import (
     block_pulse_matrix,
     fractional_derivative,
@@ -33,6 +33,7 @@ __all__ = [
     "CorrelationTest",
     "DataError",
     "Equation",
+    "Estimate",
     "FtlmError",
     "Identification",
     "InformationCriteria",

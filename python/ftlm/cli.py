@@ -89,6 +89,14 @@ class Laws(StrEnum):
     orders = "orders"
 
 
+class Tool(StrEnum):
+    """Tools that models are written for."""
+
+    control = "control"
+    matlab = "matlab"
+    json = "json"
+
+
 class Rows(StrEnum):
     """Coordinates of the rows of the recursion."""
 
@@ -219,8 +227,10 @@ def numbers(option: str, given: list[str] | None) -> dict[str, float]:
     return found
 
 
-def interval(text: str | None) -> tuple[float | None, float | None] | None:
-    """FROM:TO in seconds, either end optional.
+def interval(
+    text: str | None, option: str = "--slice", example: str = "1.1:19.5"
+) -> tuple[float | None, float | None] | None:
+    """FROM:TO, either end optional.
 
     Raises
     ------
@@ -235,7 +245,7 @@ def interval(text: str | None) -> tuple[float | None, float | None] | None:
             raise ValueError
         start, stop = (float(p) if p.strip() else None for p in parts)
     except ValueError:
-        raise ModelError(f"--slice {text!r} is no FROM:TO in seconds, such as 1.1:19.5") from None
+        raise ModelError(f"{option} {text!r} is no FROM:TO, such as {example}") from None
     return start, stop
 
 
@@ -685,6 +695,37 @@ def simulate(
         print(json.dumps({"written": out, "rows": found.length, "outputs": list(found.outputs)}, ensure_ascii=False))
     else:
         print(f"{found.length} rows of {', '.join(found.outputs)} written to {out}")
+
+
+@app.command()
+@guarded
+def export(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="A saved model.")],
+    to: Annotated[Tool, typer.Option("--to", help="control: Python script; matlab: script for FOMCON; json.")],
+    band: Annotated[
+        str | None, typer.Option("--band", metavar="LOW:HIGH", help="Frequencies [rad/s] that control needs.")
+    ] = None,
+    order: Annotated[int, typer.Option("--order", help="Order of Oustaloup's filter, for control.")] = 5,
+    out: Out = None,
+    force: Force = False,
+) -> None:
+    """Write a saved model for another tool, to a file or to standard output."""
+    from ftlm.exports import export_text  # noqa: PLC0415
+    from ftlm.models import write_atomically  # noqa: PLC0415
+
+    check_writable([out], force=force)
+    limits = None
+    if band is not None:
+        low, high = interval(band, "--band", "0.1:100") or (None, None)
+        if low is None or high is None:
+            raise ModelError(f"--band {band!r} lacks an end; write LOW:HIGH in rad/s, such as 0.1:100")
+        limits = (low, high)
+    text = export_text(ftlm.load_model(model), to.value, band=limits, order=order)
+    if out is None:
+        print(text, end="")
+    else:
+        write_atomically(out, text.encode(), force=force)
+        print(f"written: {out}")
 
 
 @app.command()

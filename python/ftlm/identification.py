@@ -11,7 +11,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.checks import whole_number
 from ftlm.errors import DataError, InternalError, ModelError
-from ftlm.models import Model, Structure, numeric
+from ftlm.models import Estimate, Model, Structure, numeric
 from ftlm.order_search import (
     Lattice,
     SearchResult,
@@ -152,6 +152,23 @@ class Identification:
         found = compare(self.model, others)
         words = [*found.warnings, *validation_warnings(self.comparison, found), *discretisation(self.model, found)]
         return replace(found, warnings=tuple(dict.fromkeys(words)))
+
+    def to_frame(self) -> Any:
+        """Orders and coefficients as a pandas frame: value, standard error, 95 % interval, stated value by name."""
+        from ftlm.exports import to_frame  # noqa: PLC0415 — pandas is not always there
+
+        values = {**self.orders, **({} if self.joint is None else self.joint.coefficients), **self.coefficients}
+        errors, intervals = self.standard_errors, self.intervals
+        none = (math.nan, math.nan)
+        rows = [
+            {
+                "parameter": n, "value": v, "standard_error": errors.get(n, math.nan),
+                "low": intervals.get(n, none)[0], "high": intervals.get(n, none)[1],
+                "stated": self.model.structure.reference.get(n, math.nan),
+            }
+            for n, v in values.items()
+        ]  # fmt: skip
+        return to_frame(rows, ["parameter"])
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -325,9 +342,48 @@ def identify(
     tests, criteria = _judged(model, found, len(orders) + len(coefficients))
     warnings += [] if tests is None else residual_warnings(tests)
     used = {**settings.to_dict(), "m": pulses, "initial": initial}
+    model = _kept_with(model, method, found, comparison, criteria, warnings)
     return Identification(
         model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)), residuals=tests, information=criteria
     )
+
+
+def _kept_with(
+    model: Model,
+    method: str,
+    runs: Sequence[Run],
+    comparison: Comparison,
+    criteria: InformationCriteria | None,
+    warnings: Sequence[str],
+    joint: JointFit | None = None,
+    problem: FreeProblem | None = None,
+) -> Model:
+    """The model with what is known about its identification, for its file."""
+    values = {**model.orders, **model.coefficients}
+    errors: dict[str, float | None] = {}
+    covariance = None
+    if joint is not None and problem is not None:
+        values = {**joint.orders, **joint.coefficients, **model.coefficients}
+        errors = {n: _finite(v) for n, v in joint.standard_errors.items()}
+        moved = problem.number_jacobian(list(joint.orders.values()), list(joint.coefficients.values()))
+        spread = moved @ joint.covariance @ moved.T
+        if np.all(np.isfinite(spread)):
+            covariance = tuple(tuple(row) for row in spread.tolist())
+    estimate = Estimate(
+        method=method,
+        runs=tuple(r.name for r in runs),
+        values={n: float(v) for n, v in values.items()},
+        standard_errors=errors,
+        covariance=covariance,
+        fit={n: _finite(f) for n, f in comparison.fit_percent.items()},
+        information={} if criteria is None else {n: _finite(getattr(criteria, n)) for n in ("aic", "aicc", "bic")},
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
+    return replace(model, estimate=estimate)
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
 def _judged(model: Model, runs: Sequence[Run], parameters: int) -> tuple[Residuals | None, InformationCriteria | None]:
@@ -370,6 +426,7 @@ def _identify_output_error(
     tests, criteria = _judged(model, runs, len(joint.names))
     # That they are coloured is said already, with what it means for the intervals.
     warnings += [] if tests is None else [w for w in residual_warnings(tests, floor=ROUNDING) if "not white" not in w]
+    model = _kept_with(model, "output-error", runs, comparison, criteria, warnings, joint, problem)
     return Identification(
         model, "output-error", comparison, {}, used, tuple(dict.fromkeys(warnings)), joint, tests, criteria
     )

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import msgspec
 
@@ -22,12 +22,20 @@ from ftlm.errors import DataError, ModelError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    import numpy as np
+    from numpy.typing import ArrayLike, NDArray
+
+    from ftlm.frequency import Stability
     from ftlm.residuals import Residuals
     from ftlm.runs import Run
     from ftlm.validation import Comparison
 
+    Floats = NDArray[np.float64]
+    Complex = NDArray[np.complex128]
+
 __all__ = [
     "Equation",
+    "Estimate",
     "Model",
     "Order",
     "SensorFilter",
@@ -41,7 +49,7 @@ __all__ = [
 MAX_ORDER = 3.0
 #: Largest model file read: a model is a few kilobytes.
 MAX_MODEL_BYTES = 1 << 20
-SCHEMA = 1
+SCHEMA = 2
 NAME = r"[^\W\d]\w*"
 Initial: TypeAlias = Literal["auto", "rest", "caputo"] | tuple[float, ...]
 #: What a person writes for the values of an order, see :func:`parse_values`.
@@ -839,6 +847,38 @@ def _narrowed(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilt
 # ------------------------------------------------------------------------------------------------ models
 
 
+class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is known about how a model was identified, kept with it so that a report needs no other file.
+
+    Parameters
+    ----------
+    method
+        Estimator.
+    runs
+        Names of the runs.
+    values, standard_errors
+        Orders and coefficients by name as they were estimated, and their standard errors where there are any.
+    covariance
+        Of every number of the model in the order of its equations (alpha, then order and coefficient of each term);
+        None where the estimator gives none. It may be singular: laws tie numbers.
+    fit
+        Fit of the free run on these runs in percent, by output.
+    information
+        Information criteria, where known.
+    warnings
+        What makes the model doubtful, in words.
+    """
+
+    method: str
+    runs: tuple[str, ...]
+    values: dict[str, float]
+    standard_errors: dict[str, float | None] = {}
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    fit: dict[str, float | None] = {}
+    information: dict[str, float | None] = {}
+    warnings: tuple[str, ...] = ()
+
+
 class _TermFile(msgspec.Struct, forbid_unknown_fields=True):
     signal: str
     order: float
@@ -866,6 +906,7 @@ class _ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     orders: dict[str, float]
     m: int | None
     about: dict[str, str | float | int | bool | None]
+    estimate: Estimate | None = None
 
 
 @dataclass(frozen=True)
@@ -884,6 +925,8 @@ class Model:
         Number of block pulses on which the model was identified and is compared by default.
     about
         How the model came to be, for people.
+    estimate
+        Standard errors, covariance and warnings of the identification; None for a model that was written down.
     """
 
     structure: Structure
@@ -891,6 +934,7 @@ class Model:
     units: Mapping[str, str] = field(default_factory=dict)
     m: int | None = None
     about: Mapping[str, str | float | int | bool | None] = field(default_factory=dict)
+    estimate: Estimate | None = None
 
     def __post_init__(self) -> None:
         if self.m is not None and not 1 <= (whole_number(self.m) or 0) < 1 << 62:
@@ -943,6 +987,43 @@ class Model:
 
         return resid(self, runs, lags=lags)
 
+    def frequency_response(self, w: ArrayLike, *, coupling: str = "simulated", sensor: bool = True) -> Complex:
+        """Exact response at angular frequencies [rad/s], shape (outputs, inputs, W).
+
+        See :func:`ftlm.frequency.frequency_response`.
+        """
+        from ftlm.frequency import frequency_response  # noqa: PLC0415 — reads models
+
+        return frequency_response(self, w, coupling=coupling, sensor=sensor)
+
+    def step_response(self, time: ArrayLike, *, tolerance: float = 1e-6) -> Floats:
+        """Response to unit steps, shape (outputs, inputs, N); see :func:`ftlm.frequency.step_response`."""
+        from ftlm.frequency import step_response  # noqa: PLC0415 — reads models
+
+        return step_response(self, time, tolerance=tolerance)
+
+    def stability(self, *, coupling: str = "simulated") -> Stability:
+        """Whether the model is stable, and why not; see :func:`ftlm.frequency.stability`."""
+        from ftlm.frequency import stability  # noqa: PLC0415 — reads models
+
+        return stability(self, coupling=coupling)
+
+    def is_stable(self, *, coupling: str = "simulated") -> bool:
+        """Whether bounded inputs give bounded outputs; an integrator is not stable in this sense."""
+        return self.stability(coupling=coupling).stable
+
+    def poles(self, *, coupling: str = "simulated") -> Complex:
+        """Poles of a model whose orders have a common base; see :func:`ftlm.frequency.poles`."""
+        from ftlm.frequency import poles  # noqa: PLC0415 — reads models
+
+        return poles(self, coupling=coupling)
+
+    def to_control(self, *, band: tuple[float, float], order: int = 5) -> Any:
+        """A python-control system by Oustaloup's approximation; see :func:`ftlm.exports.to_control`."""
+        from ftlm.exports import to_control  # noqa: PLC0415 — reads models
+
+        return to_control(self, band=band, order=order)
+
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the model as JSON, atomically.
 
@@ -967,7 +1048,7 @@ class Model:
         initial = s.initial if isinstance(s.initial, str) else list(s.initial)
         return _ModelFile(
             "ftlm-model", SCHEMA, s.name, equations, s.coupling, dict(s.delay), initial, s.sensor_filter,
-            dict(self.units), dict(self.orders), self.m, dict(self.about),
+            dict(self.units), dict(self.orders), self.m, dict(self.about), self.estimate,
         )  # fmt: skip
 
     def __str__(self) -> str:
@@ -1025,9 +1106,19 @@ def load_model(path: str | os.PathLike[str]) -> Model:
             equations=tuple(_equation_of(e) for e in read.equations), coupling=read.coupling, delay=read.delay,
             initial=check_initial(read.initial), sensor_filter=read.sensor_filter, name=read.name,
         )  # fmt: skip
-        return Model(structure, read.orders, read.units, read.m, read.about)
+        _check_estimate(read)
+        return Model(structure, read.orders, read.units, read.m, read.about, read.estimate)
     except ModelError as error:
         raise DataError(f"{file} holds no usable model: {error}") from error
+
+
+def _check_estimate(read: _ModelFile) -> None:
+    if read.estimate is None or read.estimate.covariance is None:
+        return
+    count = sum(1 + 2 * len(e.terms) for e in read.equations)
+    rows = read.estimate.covariance
+    if len(rows) != count or any(len(row) != count for row in rows):
+        raise ModelError(f"its covariance is not of {count} by {count} numbers, as its equations need")
 
 
 def _equation_of(item: _EquationFile) -> Equation:

@@ -196,6 +196,13 @@ class SearchResult:
         """Score of the best model."""
         return self.table[0].score
 
+    def to_frame(self) -> Any:
+        """The ranked table as a pandas frame, by rank."""
+        from ftlm.exports import to_frame  # noqa: PLC0415 — pandas is not always there
+
+        rows = [{"rank": r.rank, "score": r.score, **r.orders, **r.coefficients} for r in self.table]
+        return to_frame(rows, ["rank"])
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {

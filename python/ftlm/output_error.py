@@ -213,6 +213,32 @@ class FreeProblem:
             out[name] = sign * float(np.prod([free[f] for f in factors]))
         return out
 
+    def number_jacobian(self, orders: Sequence[float], coefficients: Sequence[float]) -> Floats:
+        """Derivatives of a model's numbers (rows) with respect to free orders, then free coefficients (columns).
+
+        Rows are, equation by equation, alpha, then order and coefficient of each term.
+        """
+        free = dict(zip(self.coefficients, coefficients, strict=True))
+        count = len(self.orders)
+        rows = []
+
+        def of_order(order: Order) -> Floats:
+            weights = dict(order.weights)
+            return np.array([weights.get(n, 0.0) for n in self.orders] + [0.0] * len(free))
+
+        for item in self.structure.equations:
+            rows.append(of_order(item.order))
+            for term in item.terms:
+                row = np.zeros(count + len(free))
+                if isinstance(term.coefficient, str):
+                    sign, factors = self.products.get(term.coefficient, (1.0, (term.coefficient,)))
+                    for k, name in enumerate(factors):
+                        others = [free[f] for j, f in enumerate(factors) if j != k]
+                        row[count + list(free).index(name)] += term.factor * sign * math.prod(others)
+                rows += [of_order(term.order), row]
+        found: Floats = np.stack(rows)
+        return found
+
     def free_from(self, estimated: Mapping[str, float]) -> list[float]:
         """Free coefficients from freely estimated ones; ratios as the median of what the equations say, above 1."""
         out = []

@@ -135,6 +135,18 @@ class Comparison:
         """Fit of the free run in percent, by output."""
         return {name: figures.fit for name, figures in self.output_error.items()}
 
+    def to_frame(self) -> Any:
+        """Both errors of every run as a pandas frame, by run, output and kind of error."""
+        from ftlm.exports import to_frame  # noqa: PLC0415 — pandas is not always there
+
+        rows = [
+            {"run": run, "output": name, "of": kind, "error": f.error, "rmse": f.rmse, "nr": f.nr, "fit": f.fit}
+            for run, equation, output in self.per_run
+            for kind, figures in (("equation error", equation), ("output error", output))
+            for name, f in figures.items()
+        ]
+        return to_frame(rows, ["run", "output", "of"])
+
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {

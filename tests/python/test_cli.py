@@ -130,6 +130,22 @@ def test_residual_tests_of_a_saved_model_have_an_exit_code(folder: Path) -> None
     assert ftlm_command("resid", "true.json", "noisy.csv", "--lags", "9999", cwd=folder).returncode == 3
 
 
+def test_export_writes_for_other_tools_and_overwrites_nothing(folder: Path) -> None:
+    ftlm.Model(ftlm.equation("D^1.5 y = -2.0 D^0.5 y - 4.0 y + 3.0 u")).save(folder / "out.json", force=True)
+    matlab = ftlm_command("export", "out.json", "--to", "matlab", cwd=folder)
+    assert matlab.returncode == 0, matlab.stderr
+    assert "fotf(G_y_u.a" in matlab.stdout
+    assert json.loads(ftlm_command("export", "out.json", "--to", "json", cwd=folder).stdout)["outputs"] == ["y"]
+    written = ftlm_command("export", "out.json", "--to", "control", "--band", "0.1:100", "-o", "sys.py", cwd=folder)
+    assert written.returncode == 0, written.stderr
+    assert "control.ss(" in (folder / "sys.py").read_text()
+    again = ftlm_command("export", "out.json", "--to", "json", "-o", "sys.py", cwd=folder)
+    assert (again.returncode, "exists" in again.stderr) == (3, True)
+    for band in ([], ["--band", "3"], ["--band", "1:"], ["--band", "5:1"]):
+        refused = ftlm_command("export", "out.json", "--to", "control", *band, cwd=folder)
+        assert refused.returncode == 2, band
+
+
 def test_inspect_and_doctor_speak(folder: Path) -> None:
     inspected = ftlm_command("inspect", "square.csv", cwd=folder)
     assert inspected.returncode == 0

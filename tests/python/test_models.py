@@ -246,14 +246,16 @@ COEFFICIENTS = st.one_of(NAMES, st.floats(-1e6, 1e6, allow_nan=False).filter(boo
 def equations(draw):
     """Equations as the parser makes them: a factor beside a name, a number alone."""
     output, other = "out", draw(st.sampled_from(["u", "v_1", "θ2"]))
-    alpha = draw(st.one_of(st.just(ftlm.Order(2.0)), st.builds(lambda n: ftlm.Order(0.0, ((f"o{n}", 1.0),)), NAMES)))
+    alpha = draw(
+        st.one_of(st.just(ftlm.Order(2.0)), st.builds(lambda n: ftlm.Order(0.0, ((f"order_{n}", 1.0),)), NAMES))
+    )
     terms = []
     for k in range(draw(st.integers(1, 4))):
         signal = draw(st.sampled_from([output, other]))
         order = draw(
             st.one_of(
                 st.floats(0, 1.9).map(lambda x: ftlm.Order(round(x, 9) + 0.0)),
-                st.builds(lambda c, n: ftlm.Order(round(c, 9) + 0.0, ((f"o{n}", 2.0),)), NUMBERS, NAMES),
+                st.builds(lambda c, n: ftlm.Order(round(c, 9) + 0.0, ((f"order_{n}", 2.0),)), NUMBERS, NAMES),
             )
         )
         coefficient = draw(COEFFICIENTS)
@@ -624,6 +626,17 @@ def altered(change):
     return json.dumps(document)
 
 
+def test_a_file_of_the_first_schema_is_read(tmp_path):
+    def first(document):
+        document.update(schema=1)
+        del document["estimate"]
+
+    path = tmp_path / "old.json"
+    path.write_text(altered(first), encoding="utf-8")
+    assert ftlm.load_model(path).equations == full_model().equations
+    assert ftlm.load_model(path).estimate is None
+
+
 HOSTILE = {
     "empty": "",
     "no JSON": "not a model",
@@ -643,8 +656,11 @@ HOSTILE = {
     "another format": altered(lambda d: d.update(format="other")),
     "text for a number": altered(lambda d: d["equations"][0].update(order="2")),
     "number beyond range": altered(lambda d: d).replace("1.9", "1e999"),
+    "a covariance of another size": altered(
+        lambda d: d.update(estimate={"method": "x", "runs": [], "values": {}, "covariance": [[1.0]]})
+    ),
     "NaN": altered(lambda d: d["equations"][0].update(order=math.nan)),
-    "later schema": altered(lambda d: d.update(schema=2)),
+    "later schema": altered(lambda d: d.update(schema=3)),
     "schema 0": altered(lambda d: d.update(schema=0)),
     "schema in text": altered(lambda d: d.update(schema="1")),
     "alpha out of range": altered(lambda d: d["equations"][0].update(order=9.0)),
@@ -682,7 +698,7 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
         ftlm.load_model(path)
     message = str(refused.value)
     assert message.startswith(str(path))
-    expected = {"too large": "1048577 bytes", "later schema": "schema 2, this version reads up to 1; upgrade ftlm"}
+    expected = {"too large": "1048577 bytes", "later schema": "schema 3, this version reads up to 2; upgrade ftlm"}
     assert expected.get(kind, "") in message
 
 

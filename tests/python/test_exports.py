@@ -1,0 +1,182 @@
+"""Models in other tools: python-control within its stated error, MATLAB and JSON text, frames; names stay inert."""
+
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm import exports
+from ftlm.demo import demo_plant
+
+control = pytest.importorskip("control")
+ONE = "D^1.6 y = -3 D^0.6 y - 8 y + 5 u"
+
+
+def model(text, **options):
+    return ftlm.Model(ftlm.equation(text, **options))
+
+
+def test_oustaloups_filter_is_a_power_within_its_band():
+    w = np.geomspace(1, 100, 50)
+    roots, residues, gain = exports.oustaloup(0.4, (1e-3, 1e5), 10)
+    found = gain + np.sum(residues[:, None] / (1j * w + roots[:, None]), axis=0)
+    np.testing.assert_allclose(found, (1j * w) ** 0.4, rtol=2e-3)
+
+
+@pytest.mark.parametrize("text", [ONE, "D^2 y = -0.5 D y - 4 y + 3 u", "D^0.5 y = -y + 2 u + 0.5 D^0.5 u"])
+def test_the_approximation_is_as_good_as_it_says(text):
+    found = exports.approximate(model(text), band=(0.1, 100), order=7)
+    w = np.geomspace(0.1, 100, 333)
+    ratio = (found.frequency_response(w) / model(text).frequency_response(w))[0, 0]
+    pair = ("y", "u")
+    assert np.max(np.abs(20 * np.log10(np.abs(ratio)))) <= found.gain_error[pair] * 1.02 + 1e-6
+    assert np.max(np.abs(np.degrees(np.angle(ratio)))) <= found.phase_error[pair] * 1.02 + 1e-6
+    assert found.gain_error[pair] < 0.05
+    assert found.phase_error[pair] < 0.5
+    assert found.stable
+    assert found.warnings == ()
+
+
+def test_more_poles_come_closer():
+    errors = [exports.approximate(model(ONE), band=(0.1, 100), order=n).gain_error["y", "u"] for n in (2, 4, 6)]
+    assert errors[0] > 4 * errors[1] > 4 * errors[2]
+
+
+def test_whole_orders_are_exact():
+    found = exports.approximate(model("D^3 y = -6 D^2 y - 11 D y - 6 y + 2 D u"), band=(0.01, 100))
+    assert found.states <= 6
+    assert max(found.gain_error.values()) < 1e-9
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_the_arm_keeps_its_shape(stage):
+    found = exports.approximate(demo_plant(stage), band=(0.5, 60), order=7)
+    assert max(found.gain_error.values()) < 0.5
+    assert max(found.phase_error.values()) < 3
+    assert found.outputs == demo_plant(stage).outputs
+
+
+def test_python_control_simulates_the_model():
+    one = model(ONE, delay={"u": 0.2})
+    # Within 10 rad/s Padé's approximation of the delay is exact to the eye.
+    system = one.to_control(band=(0.01, 10), order=7)
+    assert isinstance(system, control.StateSpace)
+    assert system.input_labels == ["u"]
+    assert system.output_labels == ["y"]
+    assert system.approximation.phase_error["y", "u"] < 1
+    exact = model(ONE).to_control(band=(0.01, 1000), order=7)
+    t = np.arange(0, 6, 0.01)
+    found = control.step_response(exact, t).outputs
+    np.testing.assert_allclose(found, model(ONE).step_response(t)[0, 0], atol=2e-3)
+    delayed = control.step_response(system, t).outputs
+    np.testing.assert_allclose(delayed[100:], one.step_response(t)[0, 0][100:], atol=5e-3)
+
+
+def test_a_poor_approximation_warns_about_margins():
+    with pytest.warns(UserWarning, match="a gain or phase margin smaller than that means nothing"):
+        system = model(ONE).to_control(band=(1e-4, 1e4), order=1)
+    assert system.approximation.warnings
+    assert "warning" in str(system.approximation)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"band": (0, 1)}, "is no interval"), ({"band": (2, 1)}, "is no interval"), ({"band": 3}, "no pair"),
+        ({"band": (1, np.inf)}, "is no interval"), ({"band": (1, 2, 3)}, "no pair"),
+        ({"band": (1, 2), "order": 0}, "no whole number from 1 to 50"),
+        ({"band": (1, 2), "order": 51}, "no whole number from 1 to 50"),
+    ],
+)  # fmt: skip
+def test_bands_and_orders_that_are_none_are_refused(options, words):
+    with pytest.raises(ftlm.ModelError, match=words):
+        model(ONE).to_control(**options)
+
+
+def test_without_python_control_the_way_out_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "control", None)
+    with pytest.raises(ftlm.ModelError, match=r"pip install 'ftlm\[control\]'"):
+        model(ONE).to_control(band=(1, 10))
+
+
+# ------------------------------------------------------------------------------------------------ text
+
+
+def test_json_holds_the_quotients():
+    one = model("D^1.5 y = -2 D^0.5 y - 4 y + 3 D^0.2 u", delay={"u": 0.1})
+    document = json.loads(exports.json_text(one))
+    assert document["denominator"]["y"] == [[1.0, 1.5], [2.0, 0.5], [4.0, 0.0]]
+    assert document["numerator"]["y"]["u"] == [[3.0, 0.2]]
+    assert document["delay_s"] == {"u": 0.1}
+
+
+def test_matlab_text_holds_the_quotients():
+    text = exports.matlab_text(demo_plant(1))
+    found = dict(re.findall(r"^(\w+\.\w+) = \[?([^\];]*)\]?;$", text, re.MULTILINE))
+    w = np.array([0.7, 5.0])
+    s = 1j * w
+    exact = demo_plant(1).frequency_response(w)
+    for i, output in enumerate(("theta11", "theta12")):
+        read = {k: [float(v) for v in found[f"G_{output}_I1.{k}"].split()] for k in ("b", "nb", "a", "na")}
+        top = sum(c * s**p for c, p in zip(read["b"], read["nb"], strict=True))
+        bottom = sum(c * s**p for c, p in zip(read["a"], read["na"], strict=True))
+        np.testing.assert_allclose(top / bottom, exact[i, 0], rtol=1e-9)
+    assert "fotf(G_theta11_I1.a, G_theta11_I1.na, G_theta11_I1.b, G_theta11_I1.nb, G_theta11_I1.delay)" in text
+
+
+def test_the_python_script_runs_without_ftlm(tmp_path):
+    script = exports.control_text(model(ONE), band=(0.1, 100)) + "print(abs(system(2j)))\n"
+    ran = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert "import ftlm" not in script
+    assert float(ran.stdout) == pytest.approx(abs(model(ONE).frequency_response([2.0])[0, 0, 0]), rel=5e-3)
+
+
+def test_hostile_names_stay_in_comments():
+    from dataclasses import replace
+
+    name = "x\nimport os; os.abort()\r\u2028system('rm')\n% \x1b[31m"
+    hostile = ftlm.Model(replace(ftlm.equation(ONE), name=name))
+    for mark, text in (("%", exports.matlab_text(hostile)), ("#", exports.control_text(hostile, band=(1, 10)))):
+        for line in text.splitlines():
+            if "abort" in line or "rm')" in line:
+                assert line.startswith(mark) or "name='x_import_os" in line, line
+        assert "\x1b" not in text
+    assert json.loads(exports.json_text(hostile))["name"] == name
+
+
+def test_other_tools_and_a_missing_band_are_refused():
+    with pytest.raises(ftlm.ModelError, match="give the band of frequencies"):
+        exports.export_text(model(ONE), "control")
+    with pytest.raises(ftlm.ModelError, match="use 'control', 'matlab' or 'json'"):
+        exports.export_text(model(ONE), "excel")
+
+
+# ------------------------------------------------------------------------------------------------ frames
+
+
+def test_results_become_frames(small_run, with_noise):
+    run = with_noise(small_run, 0.01, 1)
+    words = "D^alpha y = a D^0.6 y + c y + b u"
+    fit = ftlm.identify(run, ftlm.equation(words))
+    frame = fit.to_frame()
+    assert list(frame.index) == ["alpha", "a", "c", "b"]
+    assert frame.loc["alpha", "value"] == fit.orders["alpha"]
+    assert frame.loc["a", "low"] == fit.intervals["a"][0]
+    errors = fit.comparison.to_frame()
+    assert errors.loc[(run.name, "y", "output error"), "fit"] == fit.fit_percent["y"]
+    search = ftlm.identify(run, ftlm.equation(words, orders={"alpha": "1.4:1.8:0.1"}), method="least-squares")
+    table = search.searches["y"].to_frame()
+    assert table.iloc[0]["alpha"] == search.orders["alpha"]
+    assert table.index[0] == search.searches["y"].table[0].rank
+
+
+def test_without_pandas_the_way_out_is_named(small_model, small_run, monkeypatch):
+    found = small_model.compare(small_run)
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(ftlm.ModelError, match="pip install pandas"):
+        found.to_frame()
