@@ -736,6 +736,7 @@ def doctor(as_json: Json = False) -> None:
 
     from ftlm import _core  # noqa: PLC0415
     from ftlm.order_search import available_threads  # noqa: PLC0415
+    from ftlm.rig.quanser import driver_state  # noqa: PLC0415
 
     def installed(package: str) -> str | None:
         try:
@@ -761,19 +762,6 @@ def doctor(as_json: Json = False) -> None:
         print(f"{name:<12}{value if value is not None else 'not installed'}")
     if found["scipy"] is None:
         print("scipy is needed for .mat files: pip install 'ftlm[mat]'")
-
-
-def driver_state() -> str:
-    """Whether the vendor's Python package for the Q8-USB board can be loaded, in words."""
-    try:
-        from importlib import import_module  # noqa: PLC0415
-
-        import_module("quanser.hardware")
-    except ImportError:
-        return "not found: the vendor's Python package (quanser.hardware) is not installed"
-    except OSError as error:
-        return f"found without its library (hil): {error}"
-    return "found"
 
 
 def main() -> None:

@@ -368,6 +368,7 @@ def record(
     if sensor_filter not in (None, "stock"):
         raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or None")
     board, told = _board(rig, parameters, seed, paced=paced, horizon=limit, card=card)
+    paced = paced or board.hardware or bool(getattr(board, "paced", False))
     if board.hardware and not arm:
         raise ModelError(
             f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so with "
@@ -380,7 +381,7 @@ def record(
     if target is not None:
         _check_target(target, force=force)
     about: dict[str, Any] = {
-        "rig": board.name, "seed": seed, "rate": rate, "duration": duration, "paced": paced or board.hardware,
+        "rig": board.name, "seed": seed, "rate": rate, "duration": duration, "paced": paced,
         "watchdog": watchdog, "sensor_filter": sensor_filter, "input": excitation.to_dict(), **told,
     }  # fmt: skip
     link = Rig(
@@ -393,7 +394,7 @@ def record(
     ended: BaseException | None = None
     try:
         with link:
-            recorder.follow(link, commands, _ROWS_PACED if paced or board.hardware else _ROWS_FAST)
+            recorder.follow(link, commands, _ROWS_PACED if paced else _ROWS_FAST)
     except RigFault as error:
         ended = error
         faults.append(str(error))
@@ -516,8 +517,12 @@ def _board(
         found = ArmParameters.of(parameters)
         board = VirtualBoard(found, seed=seed, paced=paced, horizon=horizon)
         return board, {"parameters": found.to_dict()}
+    if rig == "q8":
+        from ftlm.rig.quanser import QuanserBoard  # noqa: PLC0415 — the driver is only needed where a board is
+
+        return QuanserBoard(card=card), {"card": card}
     if isinstance(rig, str):
-        raise ModelError(f"rig = {rig!r} is not known; use 'virtual'")
+        raise ModelError(f"rig = {rig!r} is not known; use 'virtual' or 'q8'")
     found_parameters = getattr(rig, "parameters", None)
     told = {"parameters": found_parameters.to_dict()} if isinstance(found_parameters, ArmParameters) else {}
     return rig, told

@@ -275,8 +275,9 @@ class Rig:
                 self._handler = None
 
     def _check(self) -> None:
-        if self.guard.fault is not None:
-            raise RigFault(f"{self.board.name}: {self.guard.fault}")
+        fault = self.guard.fault
+        if fault is not None:
+            raise RigFault(fault if fault.startswith(self.board.name) else f"{self.board.name}: {fault}")
 
     def run(self, commands: Floats) -> None:
         """Runs commands, shape (n, 2) [A]; rows wait in :meth:`take`.
