@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 __all__ = [
     "SIMD",
     "Guard",
+    "Streaming",
     "VirtualArm",
     "__version__",
     "block_pulse_kernel",
@@ -246,6 +247,23 @@ class Guard:
     def bias(self) -> list[float]: ...
     @property
     def missed(self) -> int: ...
+
+@final
+class Streaming:
+    def __new__(
+        cls,
+        step: float,
+        longest: int,
+        inputs: Sequence[bool],
+        equations: Sequence[tuple[_Structure, Sequence[float | None]]],
+        length: int,
+        prior_covariance: float,
+    ) -> Streaming: ...
+    def push(self, samples: _Floats) -> None: ...
+    @property
+    def coefficients(self) -> list[list[float]]: ...
+    @property
+    def pulses(self) -> int: ...
 
 @final
 class VirtualArm:

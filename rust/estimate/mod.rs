@@ -4,3 +4,4 @@ pub mod instrumental_variables;
 pub mod least_squares;
 pub mod multi_innovation;
 pub mod output_error;
+pub mod streaming;

@@ -10,6 +10,7 @@ use crate::equation::AffineOrder;
 use crate::error::{check_finite, check_length, Error};
 use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
+use crate::estimate::streaming::Streaming as StreamingFit;
 use crate::estimate::{
     instrumental_variables as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint,
 };
@@ -214,4 +215,49 @@ pub fn output_error<'py>(
         },
     )?;
     Ok(dict)
+}
+
+/// Recursion (44) on a stream of samples; see the module `estimate::streaming` of the core.
+#[pyclass(module = "ftlm._core")]
+pub struct Streaming {
+    inner: StreamingFit,
+}
+
+#[pymethods]
+impl Streaming {
+    #[new]
+    #[allow(clippy::needless_pass_by_value)]
+    fn new(
+        step: f64,
+        longest: usize,
+        inputs: Vec<bool>,
+        equations: Vec<(StructureArg, Vec<Option<f64>>)>,
+        length: usize,
+        prior_covariance: f64,
+    ) -> PyResult<Self> {
+        Innovation { length, prior_covariance, rows: Rows::Time }.check()?;
+        let equations = equations
+            .into_iter()
+            .map(|(equation, fixed)| Ok((structure(equation, inputs.len(), &inputs)?, fixed)))
+            .collect::<PyResult<Vec<_>>>()?;
+        Ok(Self { inner: StreamingFit::new(step, longest, &inputs, &equations, length, prior_covariance)? })
+    }
+
+    /// Takes samples, shape (n, signals).
+    #[allow(clippy::needless_pass_by_value)]
+    fn push(&mut self, py: Python<'_>, samples: PyReadonlyArray2<'_, f64>) -> PyResult<()> {
+        let samples = rows(&samples);
+        let inner = &mut self.inner;
+        detached(py, || samples.iter().try_for_each(|sample| inner.push(sample)))
+    }
+
+    #[getter]
+    fn coefficients(&self) -> Vec<Vec<f64>> {
+        self.inner.coefficients()
+    }
+
+    #[getter]
+    fn pulses(&self) -> usize {
+        self.inner.pulses()
+    }
 }

@@ -24,7 +24,9 @@ mod _core {
     };
 
     #[pymodule_export]
-    use super::estimate::{instrumental_variables, least_squares, multi_innovation, output_error, projected};
+    use super::estimate::{
+        instrumental_variables, least_squares, multi_innovation, output_error, projected, Streaming,
+    };
 
     #[pymodule_export]
     use super::simulate::{

@@ -8,6 +8,7 @@ import pytest
 
 import ftlm
 from ftlm import _core, rig
+from ftlm.cli import app
 from ftlm.rig.rig import CURRENT_LIMIT, ENCODER_SCALE, STRAIN_SCALE
 
 
@@ -254,3 +255,70 @@ def test_a_csv_input_with_nan_or_too_much_current_is_refused(tmp_path):
 def test_the_limits_of_the_arm_are_those_of_its_channels():
     assert CURRENT_LIMIT == (0.94, 1.2)
     assert pytest.approx((1.53398e-5, 3.06796e-5), rel=1e-5) == ENCODER_SCALE
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# From the command line
+
+
+def command(*words):
+    with pytest.raises(SystemExit) as ended:
+        app([str(w) for w in words], standalone_mode=True)
+    return ended.value.code
+
+
+def test_record_identify_compare(tmp_path, capsys):
+    square, sine, model = tmp_path / "square.csv", tmp_path / "sine.csv", tmp_path / "stage1.json"
+    assert command("record", "--input", "square", "--amplitude", 0.3, "--period", 2, "--duration", 5, "-o", square) == 0
+    assert command("record", "--input", "sine", "--amplitude", 0.5, "--duration", 5, "-o", sine) == 0
+    assert command("identify", square, "--structure", "flexible-link:1", "--laws", "orders", "-o", model) == 0
+    assert command("compare", model, sine, "--min-fit", 60) == 0
+    out = capsys.readouterr().out
+    assert f"written to {square}" in out
+    assert "theta12" in out
+
+
+def test_live_estimates_are_shown(tmp_path, capsys):
+    path = tmp_path / "run.csv"
+    assert (
+        command(
+            *("record", "--parameters", "linear", "--duration", 2, "--live", "flexible-link:2", "--k0", 1e8),
+            *("-o", path, "--json"),
+        )
+        == 0
+    )  # fmt: skip
+    shown = capsys.readouterr()
+    told = json.loads(shown.out)
+    assert told["rows"] == 1001
+    assert f"a3 = {told['about']['live']['coefficients']['a3']:.6g}" in shown.err
+    assert "1.00 s: a3 = " in shown.err
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["--amplitude", "0.95"], 2, "over the limit of 0.94 A"),
+        (["--amplitude", "x"], 2, "is not 1 or 2 numbers"),
+        (["--duration", "10000"], 2, "no run is longer than 600 s"),
+        (["--rig", "q9"], 2, "'q9' is not known"),
+        (["--rig", "q8"], 2, "--arm"),
+        (["--input", "csv", "--file", "none.csv"], 3, "does not exist"),
+        (["--live", "flexible-link:3"], 2, "flexible-link:2"),
+        (["--live", "D^alpha y = b I1"], 2, "are free"),
+    ],
+)
+def test_what_the_command_refuses(tmp_path, capsys, words, code, said):
+    path = tmp_path / "run.csv"
+    assert command("record", *words, "-o", path) == code
+    assert said in capsys.readouterr().err
+    assert not path.exists()
+
+
+def test_a_file_that_is_there_is_kept(tmp_path, capsys):
+    path = tmp_path / "run.csv"
+    path.write_text("mine", encoding="utf-8")
+    assert command("record", "--duration", 1, "-o", path) == 3
+    assert "exists" in capsys.readouterr().err
+    assert path.read_text(encoding="utf-8") == "mine"
+    assert command("record", "--duration", 1, "-o", path, "--force") == 0
+    assert ftlm.load(path).length == 501

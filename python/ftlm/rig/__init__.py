@@ -3,6 +3,7 @@
 from ftlm.rig.experiment import SHAPES, Excitation, record
 from ftlm.rig.rig import Board, Limits, Rig
 from ftlm.rig.virtual import INJECTIONS, ArmParameters, StageParameters, VirtualBoard
+from ftlm.streaming import Streaming
 
 __all__ = [
     "INJECTIONS",
@@ -13,6 +14,7 @@ __all__ = [
     "Limits",
     "Rig",
     "StageParameters",
+    "Streaming",
     "VirtualBoard",
     "record",
 ]

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from ftlm.errors import ModelError
 
 if TYPE_CHECKING:
+    from ftlm.progress import Progress
     from ftlm.runs import Run
+    from ftlm.streaming import Streaming
 
 __all__ = ["record"]
 
@@ -43,6 +46,15 @@ def record(
     watchdog: Annotated[float, typer.Option("--watchdog", help="Time after which the motors are stopped [s].")] = 0.1,
     arm: Annotated[bool, typer.Option("--arm", help="Real hardware: yes, the arm may move.")] = False,
     card: Annotated[str, typer.Option("--card", help="Which Q8-USB board.")] = "0",
+    live: Annotated[
+        str | None,
+        typer.Option("--live", metavar="STRUCTURE", help="Identify meanwhile: flexible-link:1, :2, an equation."),
+    ] = None,
+    orders: Annotated[
+        list[str] | None, typer.Option("--order", metavar="NAME=VALUE", help="Orders of --live; default the arm's own.")
+    ] = None,
+    p: Annotated[int, typer.Option("--p", help="Innovation length of --live.")] = 7,
+    k0: Annotated[float, typer.Option("--k0", help="Prior covariance of --live.")] = 1.0,
     force: Annotated[bool, typer.Option("--force", help="Overwrite files.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Results as JSON.")] = False,
 ) -> None:
@@ -53,12 +65,15 @@ def record(
     currents = _floats("--amplitude", amplitude, (1, 2))
     low, high = _floats("--band", band, (2,))
 
+    stream = None if live is None else _stream(live, orders, rig, parameters, rate, limit, p, k0)
+
     def recorded(progress: Progress) -> Run:
+        shown = _Shown(stream, rate, progress)
         return experiment.record(
             rig, input=shape, amplitude=(currents[0], currents[-1]), period=period,
             band=(low, high), ramp=ramp, file=file, duration=duration, limit=limit, rate=rate, seed=seed,
             parameters=parameters, paced=paced, sensor_filter="stock" if stock_filter else None, watchdog=watchdog,
-            arm=arm, card=card, out=out, force=force, progress=progress,
+            arm=arm, card=card, out=out, force=force, live=stream, progress=shown,
         )  # fmt: skip
 
     try:
@@ -67,6 +82,8 @@ def record(
     except KeyboardInterrupt:
         print(f"ftlm: stopped by Ctrl-C; the motors are at 0 V, what was recorded is in {out}", file=sys.stderr)
         raise typer.Exit(130) from None
+    if stream is not None:
+        print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
     if as_json:
         told = {"written": out, "rows": run.length, "step": run.step, "about": run.about}
         print(json.dumps(told, indent=1, ensure_ascii=False))
@@ -75,6 +92,52 @@ def record(
     missed = run.about["missed_deadlines"]
     if missed:
         print(f"ftlm: {missed} deadlines were missed", file=sys.stderr)
+
+
+class _Shown:
+    """Shows the live estimate once a second of the run, and the progress.
+
+    Parameters
+    ----------
+    stream, rate, progress
+        What is shown, samples per second, and the bar.
+    """
+
+    def __init__(self, stream: Streaming | None, rate: float, progress: Progress) -> None:
+        self._stream, self._rate, self._progress, self._next = stream, rate, progress, 1.0
+
+    def __call__(self, done: int, total: int) -> None:
+        self._progress(done, total)
+        seconds = done / self._rate
+        if self._stream is not None and seconds >= self._next:
+            print(f"{seconds:7.2f} s: {self._stream}", file=sys.stderr, flush=True)
+            self._next = math.floor(seconds) + 1.0
+
+
+def _stream(
+    text: str, orders: list[str] | None, rig: str, parameters: str, rate: float, limit: float, p: int, k0: float
+) -> Streaming:
+    from ftlm.cli import numbers  # noqa: PLC0415 — the command line imports this file
+    from ftlm.flexible_link import flexible_link  # noqa: PLC0415
+    from ftlm.models import equation  # noqa: PLC0415
+    from ftlm.rig.virtual import ArmParameters  # noqa: PLC0415
+    from ftlm.streaming import Streaming  # noqa: PLC0415
+
+    free = numbers("--order", orders)
+    if text.startswith("flexible-link:"):
+        stages: dict[str, Literal[1, 2]] = {"1": 1, "2": 2}
+        stage = stages.get(text.removeprefix("flexible-link:"))
+        if stage is None:
+            raise ModelError(f"--live {text!r} is not known; use flexible-link:1, flexible-link:2 or an equation")
+        structure = flexible_link(stage=stage, laws=("orders",), coupling="measured")
+        if rig == "virtual":
+            arm = ArmParameters.of(parameters)
+            free = (arm.stage1 if stage == 1 else arm.stage2).orders(stage) | free
+    else:
+        structure = equation(text)
+    return Streaming(
+        structure.with_orders(free), step=1.0 / rate, longest=limit + 1.0, innovation_length=p, prior_covariance=k0
+    )
 
 
 def _floats(option: str, text: str, counts: tuple[int, ...]) -> list[float]:

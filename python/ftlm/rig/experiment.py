@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ftlm.errors import DataError, ModelError, RigFault
+from ftlm.errors import DataError, FtlmError, ModelError, RigFault
 from ftlm.files import load
 from ftlm.rig.rig import COLUMNS, CURRENT_LIMIT, LONGEST, Limits, Rig
 from ftlm.rig.virtual import ArmParameters, VirtualBoard
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from ftlm.rig.rig import Board, Floats
+    from ftlm.streaming import Streaming
 
 __all__ = ["SHAPES", "Excitation", "record"]
 
@@ -294,6 +295,7 @@ def record(
     name: str | None = None,
     out: str | os.PathLike[str] | None = None,
     force: bool = False,
+    live: Streaming | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Run:
     """Drive both motors of a rig and record currents and angles.
@@ -344,8 +346,10 @@ def record(
         csv file to write.
     force : bool
         Whether to overwrite it.
+    live : Streaming, optional
+        Identification that takes every sample while the run is recorded; the run's `about` says its last estimate.
     progress : callable, optional
-        Called with rows recorded and rows in all.
+        Called with rows recorded and rows in all, after `live` has taken them.
 
     Returns
     -------
@@ -388,8 +392,10 @@ def record(
         board, rate=rate, watchdog=watchdog, limit=limit, limits=Limits(),
         sensor_filter=STOCK_FILTER if sensor_filter else None,
     )  # fmt: skip
+    for signal in () if live is None else live.signals:
+        _column(signal)
     partial = Partial(target, name, 1.0 / rate, about)
-    recorder = _Recorder(partial, len(commands), progress)
+    recorder = _Recorder(partial, len(commands), progress, live)
     faults: list[str] = []
     ended: BaseException | None = None
     try:
@@ -406,6 +412,8 @@ def record(
         raise
     faults += [t for t in link.troubles if t not in faults]
     about |= {"missed_deadlines": link.guard.missed, "faults": faults}
+    if live is not None:
+        about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.trouble}
     try:
         run = recorder.finish(name, about, faults, 1.0 / rate)
     except BaseException:
@@ -455,8 +463,13 @@ def _saved(
 class _Recorder:
     """Takes rows from a rig, to disk and to memory."""
 
-    def __init__(self, partial: Partial, rows: int, progress: Callable[[int, int], None] | None) -> None:
+    def __init__(
+        self, partial: Partial, rows: int, progress: Callable[[int, int], None] | None, live: Streaming | None
+    ) -> None:
         self.partial = partial
+        self.live = live
+        self.trouble: str | None = None
+        self.columns = [] if live is None else [_column(name) for name in live.signals]
         self.blocks: list[Floats] = []
         self.rows, self.done = rows, 0
         self.progress = progress
@@ -474,6 +487,12 @@ class _Recorder:
         self.blocks.append(rows)
         self.done += len(rows)
         self.partial.write(rows)
+        if self.live is not None and self.trouble is None:
+            try:
+                self.live.push(rows[:, self.columns])
+            except FtlmError as error:
+                # An estimate that fails is no reason to stop a run that can be identified afterwards.
+                self.trouble = str(error)
         if self.progress is not None:
             self.progress(self.done, self.rows)
 
@@ -488,6 +507,12 @@ class _Recorder:
             step=step, time=None, inputs={n: data[n] for n in INPUTS}, outputs={n: data[n] for n in COLUMNS[2:]},
             units=UNITS, intersample=None, name=name, resample=None, window=None, facts=facts, about=about,
         )  # fmt: skip
+
+
+def _column(name: str) -> int:
+    if name not in COLUMNS:
+        raise ModelError(f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(COLUMNS)}")
+    return COLUMNS.index(name)
 
 
 def _check_times(duration: float, limit: float, rate: float, seed: int) -> None:

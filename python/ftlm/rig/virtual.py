@@ -68,10 +68,15 @@ class StageParameters:
     mu: float
     coulomb: float = 0.0
 
+    def orders(self, stage: int) -> dict[str, float]:
+        """The five free orders, by the law's names."""
+        h, k = 2 * stage - 1, 2 * stage
+        return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
+
     def equations(self, stage: int) -> dict[str, Any]:
         """Orders and coefficients of both equations, as the core takes them."""
         h, k = 2 * stage - 1, 2 * stage
-        free = {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
+        free = self.orders(stage)
         law = {name: order.at(free) for name, order in order_law(1 if stage == 1 else 2).items()}
         return {
             "hub_orders": [law[f"{n}{h}"] for n in ("beta", "gamma", "mu")],
