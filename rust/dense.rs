@@ -71,3 +71,14 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share
         basis.push(column);
     }
 }
+
+/// Inner products of every left with every right column (all of one length), row-major left × right. O(left·right·m).
+#[must_use]
+pub fn inner_products(left: &[&[f64]], right: &[&[f64]]) -> Vec<f64> {
+    let m = left.first().map_or(0, |c| c.len());
+    let x = Mat::from_fn(m, left.len(), |i, j| left[j][i]);
+    let y = Mat::from_fn(m, right.len(), |i, j| right[j][i]);
+    let mut product = Mat::<f64>::zeros(right.len(), left.len());
+    matmul(product.as_mut(), Accum::Replace, y.transpose(), x.as_ref(), 1.0, Par::Seq);
+    product.col_iter().flat_map(|column| column.iter().copied().collect::<Vec<_>>()).collect()
+}

@@ -71,9 +71,9 @@ pub enum Error {
         why: String,
     },
     /// A lattice too large to search.
-    #[error("the lattice holds {count} candidates, more than the limit of {limit}; take a larger step, narrower intervals or fixed orders")]
+    #[error("the lattice holds up to {count} candidates, more than the limit of {limit}; take a larger step, narrower intervals or fixed orders")]
     LatticeTooLarge {
-        /// Number of candidates.
+        /// Number of candidates, or of the tuples of its axes where they were not gone through.
         count: u128,
         /// Largest number searched.
         limit: u128,

@@ -28,6 +28,7 @@ pub mod series;
 
 pub mod dense;
 pub mod fft;
+pub mod lanes;
 
 pub mod equation;
 pub mod regressors;

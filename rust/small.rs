@@ -3,6 +3,7 @@
 use nalgebra::{DMatrix, DVector};
 
 use crate::error::{Error, Result};
+use crate::lanes::Lanes;
 
 /// A pivot of a correlation matrix below this marks a regressor that rounding cannot tell from the others:
 /// the Gram matrix of m = 2048 products carries about 1e−13.
@@ -64,84 +65,98 @@ pub fn scaled_inverse(matrix: &[f64], k: usize) -> Result<Vec<f64>> {
     Ok(out)
 }
 
-/// Which regressors a solve kept.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Rank {
-    /// All.
-    Full,
-    /// These optional ones were dropped as combinations of the ones before them.
-    Dropped(Vec<usize>),
+/// Position of element (i, j), j ≤ i, of a symmetric matrix kept by its lower rows.
+#[inline(always)]
+#[must_use]
+pub const fn packed(i: usize, j: usize) -> usize {
+    i * (i + 1) / 2 + j
 }
 
-/// Solves the symmetric positive system `gram x = rhs` (row-major k × k) by a scaled Cholesky factor, in place.
+/// Solves L symmetric positive systems of k unknowns side by side, in place, by the factor L D Lᵀ.
 ///
-/// The first `needed` unknowns must be independent; later ones that are combinations of those before them are dropped
-/// (their unknown is 0). `gram` and `rhs` are overwritten, `rhs` with the solution. O(k³).
-///
-/// # Errors
-/// [`Error::Singular`] with the first dependent one of the needed unknowns.
-pub fn solve_gram(gram: &mut [f64], rhs: &mut [f64], needed: usize, scale: &mut Vec<f64>) -> Result<Rank> {
-    let k = rhs.len();
-    scale.clear();
-    scale.extend((0..k).map(|i| {
-        let d = gram[i * k + i];
-        if d > 0.0 && d.is_finite() {
-            1.0 / d.sqrt()
-        } else {
-            0.0
-        }
-    }));
-    for i in 0..k {
-        for j in 0..=i {
-            gram[i * k + j] *= scale[i] * scale[j];
-        }
-        rhs[i] *= scale[i];
+/// `gram` holds the lower rows ([`packed`]) of correlation matrices: their diagonals are 1, or 0 for a column that is
+/// not there. `rhs` is overwritten with the solutions. The first `needed` unknowns must be independent: the returned
+/// flags say where they are not. Later ones that are combinations of those before them are dropped: their unknown is 0.
+/// O(k³). The operations of a lane do not depend on the others, nor on L.
+#[inline(always)]
+pub fn solve_lanes<const L: usize>(gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
+    // The usual sizes get loops of known length.
+    match rhs.len() {
+        1 => solve_sized(1, gram, rhs, needed),
+        2 => solve_sized(2, gram, rhs, needed),
+        3 => solve_sized(3, gram, rhs, needed),
+        4 => solve_sized(4, gram, rhs, needed),
+        5 => solve_sized(5, gram, rhs, needed),
+        k => solve_sized(k, gram, rhs, needed),
     }
-    let mut dropped = Vec::new();
+}
+
+#[inline(always)]
+fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes<L>], needed: usize) -> [bool; L] {
+    let (gram, rhs) = (&mut gram[..packed(k, 0)], &mut rhs[..k]);
+    let mut singular = [false; L];
     for i in 0..k {
+        let mut pivot = gram[packed(i, i)];
         for j in 0..i {
-            let mut sum = gram[i * k + j];
+            // Row i of L D, then of L.
+            let mut sum = gram[packed(i, j)];
             for l in 0..j {
-                sum -= gram[i * k + l] * gram[j * k + l];
+                let (a, b) = (gram[packed(i, l)], gram[packed(j, l)]);
+                for n in 0..L {
+                    sum[n] -= a[n] * b[n];
+                }
             }
-            // A dropped unknown has a zero row, and its reciprocal pivot is stored as zero.
-            gram[i * k + j] = sum * gram[j * k + j];
+            gram[packed(i, j)] = sum;
         }
-        let mut pivot = gram[i * k + i];
-        for l in 0..i {
-            pivot -= gram[i * k + l] * gram[i * k + l];
-        }
-        if pivot.is_nan() || pivot <= PIVOT_FLOOR {
-            if i < needed {
-                return Err(Error::Singular { index: i, count: k });
+        for j in 0..i {
+            let (u, inverse) = (gram[packed(i, j)], gram[packed(j, j)]);
+            let row = &mut gram[packed(i, j)];
+            for n in 0..L {
+                row[n] = u[n] * inverse[n];
+                pivot[n] -= u[n] * row[n];
             }
-            dropped.push(i);
-            for l in 0..=i {
-                gram[i * k + l] = 0.0;
+        }
+        let mut inverse = [0.0; L];
+        let mut all = true;
+        for n in 0..L {
+            let fits = pivot[n] > PIVOT_FLOOR;
+            inverse[n] = if fits { 1.0 / pivot[n] } else { 0.0 };
+            all &= fits;
+            singular[n] |= !fits && i < needed;
+        }
+        gram[packed(i, i)] = inverse;
+        let mut value = rhs[i];
+        for j in 0..i {
+            let (row, z) = (gram[packed(i, j)], rhs[j]);
+            for n in 0..L {
+                value[n] -= row[n] * z[n];
             }
-            continue;
         }
-        gram[i * k + i] = 1.0 / pivot.sqrt();
-    }
-    for i in 0..k {
-        for l in 0..i {
-            rhs[i] -= gram[i * k + l] * rhs[l];
+        rhs[i] = value;
+        if !all {
+            for n in (0..L).filter(|&n| inverse[n] == 0.0) {
+                (0..i).for_each(|j| gram[packed(i, j)][n] = 0.0);
+                rhs[i][n] = 0.0;
+            }
         }
-        rhs[i] *= gram[i * k + i];
     }
     for i in (0..k).rev() {
-        for l in i + 1..k {
-            rhs[i] -= gram[l * k + i] * rhs[l];
+        let mut value = rhs[i];
+        for n in 0..L {
+            value[n] *= gram[packed(i, i)][n];
         }
-        rhs[i] *= gram[i * k + i];
+        for j in i + 1..k {
+            let (row, x) = (gram[packed(j, i)], rhs[j]);
+            for n in 0..L {
+                value[n] -= row[n] * x[n];
+            }
+        }
+        rhs[i] = value;
     }
-    for (x, s) in rhs.iter_mut().zip(scale.iter()) {
-        *x *= s;
-    }
-    Ok(if dropped.is_empty() { Rank::Full } else { Rank::Dropped(dropped) })
+    singular
 }
 
-/// Solution of a symmetric positive definite system by nalgebra's Cholesky factor: the oracle of [`solve_gram`].
+/// Solution of a symmetric positive definite system by nalgebra's Cholesky factor: the oracle of [`solve_lanes`].
 #[must_use]
 pub fn solve_gram_oracle(gram: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
     let k = rhs.len();

@@ -75,7 +75,7 @@ _Monomial: TypeAlias = tuple[float, Sequence[tuple[int, int]]]
 _FreeEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine, _Monomial]]]
 #: (record, pulses a sample interval, samples of each output as rows, filter of simulated outputs, weights of outputs)
 _Experiment: TypeAlias = tuple[_Record, int, _Floats, tuple[_Floats, Sequence[bool]] | None, Sequence[float]]
-_Progress: TypeAlias = Callable[[int, int], object]
+_Progress: TypeAlias = Callable[[int, int, int], object]
 
 #: (coefficients, initial terms per record, their exponents, dropped (record, position) pairs)
 _Estimate: TypeAlias = tuple[list[float], list[list[float]], list[float], list[tuple[int, int]]]

@@ -19,7 +19,7 @@ PATIENCE = 1.0
 
 
 class Progress:
-    """Context manager whose instances are called with (done, total).
+    """Context manager whose instances are called with (done, total), or (done, total, pruned).
 
     Parameters
     ----------
@@ -39,8 +39,8 @@ class Progress:
     def __enter__(self) -> Progress:
         return self
 
-    def __call__(self, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` candidates are dealt with."""
+    def __call__(self, done: int, total: int, pruned: int | None = None) -> None:
+        """Show that ``done`` of ``total`` candidates are dealt with, ``pruned`` of them before their end."""
         if self._quiet or time.monotonic() - self._start < PATIENCE or total == 0:
             return
         if self._bar is None:
@@ -52,15 +52,17 @@ class Progress:
                 BarColumn(),
                 TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
                 TextColumn("{task.fields[rate]:,.0f}/s"),
+                TextColumn("{task.fields[pruned]}"),
                 TimeRemainingColumn(),
                 console=Console(stderr=True),
                 transient=True,
             )
             self._bar.start()
-            self._task = self._bar.add_task(self._label, total=total, rate=0.0)
+            self._task = self._bar.add_task(self._label, total=total, rate=0.0, pruned="")
         if self._task is not None:
             rate = done / max(time.monotonic() - self._start, 1e-9)
-            self._bar.update(self._task, completed=done, total=total, rate=rate)
+            share = "" if pruned is None else f"{100 * pruned / max(done, 1):.1f} % pruned"
+            self._bar.update(self._task, completed=done, total=total, rate=rate, pruned=share)
         if done >= total:
             # The next search of the same job starts a bar of its own.
             self._stop()

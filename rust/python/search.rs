@@ -39,9 +39,7 @@ fn watched<T: Send>(
                 let look = Python::attach(|py| {
                     py.check_signals()?;
                     if let Some(progress) = progress {
-                        let (done, total) =
-                            (control.done.load(Ordering::Relaxed), control.total.load(Ordering::Relaxed));
-                        progress.call1(py, (done, total))?;
+                        progress.call1(py, state(&control))?;
                     }
                     Ok::<_, PyErr>(())
                 });
@@ -60,9 +58,15 @@ fn watched<T: Send>(
         })
     })?;
     if let Some(progress) = progress {
-        progress.call1(py, (control.done.load(Ordering::Relaxed), control.total.load(Ordering::Relaxed)))?;
+        progress.call1(py, state(&control))?;
     }
     Ok(result)
+}
+
+/// Candidates done, in all, and left before the end of the record.
+fn state(control: &Control) -> (u64, u64, u64) {
+    let read = |x: &std::sync::atomic::AtomicU64| x.load(Ordering::Relaxed);
+    (read(&control.done), read(&control.total), read(&control.pruned))
 }
 
 /// (criterion, norm, p or 0 for least squares, K₀, Haar rows, keep, threads, early stopping).
@@ -103,6 +107,7 @@ fn counted<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>
     dict.set_item("candidates", counts.candidates)?;
     dict.set_item("kept", counts.kept)?;
     dict.set_item("beaten", counts.beaten)?;
+    dict.set_item("bound", counts.bounded)?;
     dict.set_item("stopped early", counts.stopped)?;
     dict.set_item("singular", counts.singular)?;
     dict.set_item("diverged", counts.diverged)?;

@@ -1,6 +1,7 @@
-//! Exhaustive order searches: enumerate ([`lattice`]), evaluate in parallel ([`run`]), join the equations of a stage
-//! under its order law ([`stage`]).
+//! Exhaustive order searches: generate by index ([`lattice`]), exclude by a proved bound ([`bound`]), evaluate in
+//! parallel ([`run`]), join the equations of a stage under its order law ([`stage`]).
 
+pub mod bound;
 pub mod lattice;
 pub mod run;
 pub mod stage;

@@ -1,8 +1,9 @@
 //! Evaluates the candidates of an order search: in parallel, ordered, stoppable, every one accounted for.
 //!
-//! Candidates are visited in rounds. Within a round each is measured against the worst score kept *before* the round
-//! and left as soon as its partial sum passes it: such a candidate cannot be among the kept ones, so the table is that
-//! of brute force, ties by index, for any number of threads, and so are the counts.
+//! Candidates stream by in rounds. All of a round get coefficients, several side by side, and those that a proved lower
+//! bound excludes are done; the others are followed, likely ones first, each until its partial sum passes the worst
+//! score kept. That score is looked at between rounds only: what is left out cannot be among the kept ones, so the table
+//! is that of brute force, ties by index, for any number of threads, and so are the counts.
 
 use std::collections::HashSet;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -15,15 +16,25 @@ use crate::equation::{grains, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_length, Error, Result};
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::haar;
+use crate::lanes::{self, Lanes, WIDTH};
 use crate::regressors::{Bank, Index, Key, Record};
-use crate::search::lattice::Lattice;
+use crate::search::bound::{self, Bound};
+use crate::search::lattice::{Cursor, Lattice};
 use crate::series::{Division, BLOCK};
-use crate::small::{self, Rank};
+use crate::small::{packed, solve_lanes};
 
-/// First round: small, so that a good score is known early; rounds double from here.
-const FIRST_ROUND: u64 = 256;
-/// Largest round: long enough to keep threads busy, short enough that the kept scores stay fresh.
-const LAST_ROUND: u64 = 16_384;
+/// Candidates screened in one round: their bounds take 6 MB, and one look at the kept scores serves them all.
+const ROUND: u64 = 1 << 18;
+/// Candidates that a thread screens at a time.
+const CHUNK: u64 = 512;
+/// First and largest number of candidates followed between two looks at the kept scores.
+const FOLLOWED: (usize, usize) = (256, 16_384);
+/// Candidates tried beforehand, spread over the lattice: they choose the test vectors and give the first good score.
+const SCOUTS: u64 = 2048;
+/// Test vectors that a search works with.
+const VECTORS: usize = 16;
+/// Transforms that following one candidate is worth; making test vectors must stay below a fraction of all that.
+const TRANSFORMS: u64 = 6;
 /// Failures listed one by one; the rest are only counted.
 const LISTED: usize = 100;
 /// Most threads a search starts.
@@ -71,7 +82,8 @@ pub struct Options {
     pub keep: usize,
     /// Threads.
     pub threads: usize,
-    /// Whether to leave a candidate as soon as it cannot be kept; `false` is brute force, the oracle.
+    /// Whether to leave a candidate as soon as it cannot be kept, by bound or partial sum; `false` is brute force, the
+    /// oracle.
     pub early_stopping: bool,
 }
 
@@ -84,6 +96,8 @@ pub struct Control {
     pub done: AtomicU64,
     /// Candidates in all, once known.
     pub total: AtomicU64,
+    /// Candidates among those done that were left before the end of the record.
+    pub pruned: AtomicU64,
 }
 
 /// Why a candidate has no score.
@@ -108,7 +122,7 @@ pub struct Row {
     pub initial: Vec<Vec<f64>>,
 }
 
-/// What became of the candidates: `kept + beaten + stopped + singular + diverged = candidates`.
+/// What became of the candidates: `kept + beaten + bounded + stopped + singular + diverged = candidates`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Counts {
     /// All.
@@ -117,7 +131,9 @@ pub struct Counts {
     pub kept: u64,
     /// Evaluated to the end and not kept.
     pub beaten: u64,
-    /// Left before the end because they could no longer be kept.
+    /// Excluded by a lower bound of their score, without a run.
+    pub bounded: u64,
+    /// Left before the end because their partial sum could no longer be kept.
     pub stopped: u64,
     /// Without coefficients.
     pub singular: u64,
@@ -140,6 +156,8 @@ pub struct Outcome {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) enum Verdict {
     Score(f64),
+    /// Not run: this lower bound is above the limit.
+    Bounded(f64),
     /// Left at this partial sum, above the limit.
     Stopped(f64),
     Failed(Failure),
@@ -150,24 +168,108 @@ pub(crate) struct Problem {
     index: Index,
     banks: Vec<Bank>,
     targets: Vec<Vec<f64>>,
-    /// Per record, over the bank's columns and the target, (K+1)² row-major, weighted as the estimator asks.
-    grams: Vec<Vec<f64>>,
+    terms: Normal,
+    /// Per record, for its initial terms; empty at rest.
+    parts: Vec<Normal>,
+    /// Where the equation error in squares ranks: its own Gram matrix, without weights and prior.
+    plain: Option<Plain>,
+    bound: Option<Bound>,
     fixed: Vec<Option<f64>>,
+    /// Terms whose coefficients are estimated.
+    free: Vec<usize>,
     options: Options,
     samples: usize,
 }
 
+/// Normal equations over a bank's columns, weighted as the estimator asks, scaled to a diagonal of ones.
+struct Normal {
+    width: usize,
+    /// Correlation matrix, row-major width × width; rows of columns that vanish are 0.
+    correlation: Vec<f64>,
+    rhs: Vec<f64>,
+    /// Size of each column, and its inverse or 0.
+    size: Vec<f64>,
+    inverse: Vec<f64>,
+}
+
+impl Normal {
+    /// From a Gram matrix over columns and target, (width + 1)² row-major, and what the prior adds to its diagonal.
+    fn new(gram: &[f64], width: usize, prior: f64) -> Self {
+        let stride = width + 1;
+        let diagonal = |p: usize| gram[p * stride + p] + prior;
+        let size: Vec<f64> = (0..width)
+            .map(|p| if diagonal(p) > 0.0 && diagonal(p).is_finite() { diagonal(p).sqrt() } else { 0.0 })
+            .collect();
+        let inverse: Vec<f64> = size.iter().map(|&s| if s > 0.0 { 1.0 / s } else { 0.0 }).collect();
+        let mut correlation = vec![0.0; width * width];
+        for p in 0..width {
+            for q in (0..width).filter(|&q| inverse[p] > 0.0 && inverse[q] > 0.0) {
+                correlation[p * width + q] = if p == q { 1.0 } else { gram[p * stride + q] * inverse[p] * inverse[q] };
+            }
+        }
+        let rhs = (0..width).map(|p| gram[p * stride + width] * inverse[p]).collect();
+        Self { width, correlation, rhs, size, inverse }
+    }
+}
+
+/// Gram matrix of columns and target summed over records, and the norms on its diagonal.
+struct Plain {
+    stride: usize,
+    gram: Vec<f64>,
+    norms: Vec<f64>,
+    /// What rounding may add to a squared sum, per unit of the squared sum of norms.
+    unit: f64,
+}
+
+/// Memory of a solve of L candidates side by side.
+struct Solve<const L: usize> {
+    gram: Vec<Lanes<L>>,
+    /// Right-hand side, then the scaled solution.
+    rhs: Vec<Lanes<L>>,
+    coefficients: Vec<Lanes<L>>,
+    /// Coefficients of the initial terms, record by record.
+    initial: Vec<Lanes<L>>,
+}
+
+impl<const L: usize> Solve<L> {
+    fn new() -> Self {
+        Self { gram: Vec::new(), rhs: Vec::new(), coefficients: Vec::new(), initial: Vec::new() }
+    }
+}
+
+/// Memory of a screening of L candidates side by side.
+struct Screen<const L: usize> {
+    solve: Solve<L>,
+    positions: Vec<[usize; L]>,
+    initial: Vec<usize>,
+    /// One candidate's columns, coefficients and initial terms.
+    terms: Vec<usize>,
+    coefficients: Vec<f64>,
+    weights: Vec<f64>,
+}
+
+impl<const L: usize> Screen<L> {
+    fn new(width: usize) -> Self {
+        Self {
+            solve: Solve::new(),
+            positions: vec![[0; L]; width],
+            initial: Vec::new(),
+            terms: vec![0; width],
+            coefficients: vec![0.0; width],
+            weights: Vec::new(),
+        }
+    }
+}
+
 /// Memory of one thread.
 pub(crate) struct Scratch {
-    gram: Vec<f64>,
-    rhs: Vec<f64>,
-    scale: Vec<f64>,
+    one: Solve<1>,
     divisor: Vec<f64>,
     block: Vec<f64>,
     division: Option<Division>,
-    /// Coefficients of the last candidate's terms.
+    /// Coefficients of the last candidate's terms, and of its initial terms by record.
     pub(crate) coefficients: Vec<f64>,
-    tuples: Vec<usize>,
+    weights: Vec<f64>,
     positions: Vec<usize>,
     initial: Vec<usize>,
 }
@@ -175,14 +277,12 @@ pub(crate) struct Scratch {
 impl Scratch {
     pub(crate) fn new() -> Self {
         Self {
-            gram: Vec::new(),
-            rhs: Vec::new(),
-            scale: Vec::new(),
+            one: Solve::new(),
             divisor: Vec::new(),
             block: vec![0.0; BLOCK],
             division: None,
             coefficients: Vec::new(),
-            tuples: Vec::new(),
+            weights: Vec::new(),
             positions: Vec::new(),
             initial: Vec::new(),
         }
@@ -214,13 +314,71 @@ impl Problem {
         }
         let banks = records.iter().map(|r| Bank::new(&index, r, output)).collect::<Result<Vec<_>>>()?;
         let targets: Vec<Vec<f64>> = records.iter().map(|r| r.signal(output).to_vec()).collect();
-        let grams = banks
-            .iter()
-            .zip(&targets)
-            .map(|(bank, target)| weighted_gram(bank, target, options.estimator))
-            .collect::<Result<Vec<_>>>()?;
         let samples = records.iter().map(Record::m).sum();
-        Ok(Self { index, banks, targets, grams, fixed: fixed.to_vec(), options: options.clone(), samples })
+        let width = index.keys().len();
+        let squares = (width + 1) * (width + 1);
+        let (mut sum, mut unweighted) = (vec![0.0; squares], Vec::new());
+        let prior = match options.estimator {
+            Estimator::LeastSquares => 0.0,
+            Estimator::MultiInnovation(innovation) => 1.0 / innovation.prior_covariance,
+        };
+        let plain = options.early_stopping
+            && options.criterion == Criterion::EquationError
+            && options.norm == Norm::L2
+            && options.initial == Initial::Rest;
+        if plain {
+            unweighted = vec![0.0; squares];
+        }
+        let mut parts = Vec::new();
+        for (bank, target) in banks.iter().zip(&targets) {
+            let mut gram = plain_gram(bank, target);
+            unweighted.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
+            if let Estimator::MultiInnovation(innovation) = options.estimator {
+                weigh(&mut gram, bank, target, innovation)?;
+            }
+            sum.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
+            if options.initial != Initial::Rest {
+                parts.push(Normal::new(&gram, width, prior));
+            }
+        }
+        #[allow(clippy::cast_precision_loss)]
+        let plain = plain.then(|| Plain {
+            stride: width + 1,
+            norms: (0..=width).map(|p| unweighted[p * (width + 2)].max(0.0).sqrt()).collect(),
+            gram: unweighted,
+            unit: 4.0 * f64::EPSILON * samples as f64,
+        });
+        Ok(Self {
+            index,
+            banks,
+            targets,
+            terms: Normal::new(&sum, width, prior),
+            parts,
+            plain,
+            bound: None,
+            fixed: fixed.to_vec(),
+            free: (0..fixed.len()).filter(|&k| fixed[k].is_none()).collect(),
+            options: options.clone(),
+            samples,
+        })
+    }
+
+    /// Makes test vectors for about this many candidates, as far as they pay; on the current thread pool.
+    pub(crate) fn with_bound(mut self, candidates: u64) -> Self {
+        if self.options.early_stopping && self.plain.is_none() {
+            let output_error = self.options.criterion == Criterion::OutputError;
+            let own = (0..self.index.keys().len()).filter(|&p| !self.banks[0].kernel(p).is_empty()).count() as u64;
+            // Two transforms for each own column and test vector; the products cost as much as a transform or so.
+            let each = 2 * own + 4;
+            #[allow(clippy::cast_possible_truncation)]
+            let groups =
+                (candidates * TRANSFORMS / 4 / (each * WIDTH as u64)).min((bound::POOL / WIDTH) as u64) as usize;
+            if groups > 0 {
+                self.bound =
+                    Some(Bound::new(&self.banks, &self.targets, self.options.norm, output_error, groups * WIDTH));
+            }
+        }
+        self
     }
 
     /// Position of I^{α−ν} s in the banks.
@@ -242,21 +400,37 @@ impl Problem {
     }
 
     /// Evaluates a structure given the positions of its terms; leaves its coefficients in the scratch.
+    ///
+    /// `bounded` tells whether the bound, where there is one, is asked first.
     pub(crate) fn evaluate(
         &self,
         positions: &[usize],
         initial: &[usize],
         limit: f64,
+        bounded: bool,
         scratch: &mut Scratch,
         control: &Control,
     ) -> Verdict {
-        if self.solve(positions, initial, scratch).is_err() {
+        let sources: Vec<[usize; 1]> = positions.iter().map(|&p| [p]).collect();
+        let [singular] = self.solve(&sources, initial, &mut scratch.one);
+        if singular {
             return Verdict::Failed(Failure::Singular);
         }
+        scratch.coefficients.clear();
+        scratch.coefficients.extend(scratch.one.coefficients.iter().map(|c| c[0]));
+        scratch.weights.clear();
+        scratch.weights.extend(scratch.one.initial.iter().map(|c| c[0]));
+        if let (true, Some(bound)) = (bounded && limit < f64::INFINITY, &self.bound) {
+            let (weights, n) = (&scratch.weights, initial.len());
+            let columns = |r: usize| (positions, &scratch.coefficients[..], initial, &weights[r * n..(r + 1) * n]);
+            let (lowest, _) = lanes::widest(|| bound.evaluate(limit, columns));
+            if lowest > limit {
+                return Verdict::Bounded(lowest);
+            }
+        }
         let mut raw = 0.0;
-        let free = self.fixed.iter().filter(|f| f.is_none()).count();
         for r in 0..self.banks.len() {
-            let first = free + r * initial.len();
+            let first = r * initial.len();
             let verdict = match self.options.criterion {
                 Criterion::EquationError => self.residuals(r, positions, initial, first, limit, raw, scratch),
                 Criterion::OutputError => self.march(r, positions, initial, first, limit, raw, scratch, control),
@@ -269,51 +443,77 @@ impl Problem {
         Verdict::Score(raw)
     }
 
-    /// Coefficients from the Gram matrices, into `scratch.coefficients` and, initial terms, `scratch.rhs`.
-    fn solve(&self, positions: &[usize], initial: &[usize], scratch: &mut Scratch) -> Result<Rank> {
-        let Scratch { gram, rhs, scale, coefficients, .. } = scratch;
-        let free = self.fixed.iter().filter(|f| f.is_none()).count();
-        let k = free + initial.len() * self.banks.len();
+    /// Coefficients of L candidates from the normal equations; flags those that are singular.
+    ///
+    /// `positions` gives the column of each term per candidate; the initial terms are those of all.
+    #[inline(always)]
+    fn solve<const L: usize>(&self, positions: &[[usize; L]], initial: &[usize], solve: &mut Solve<L>) -> [bool; L] {
+        let normal = &self.terms;
+        let (free, width) = (self.free.len(), normal.width);
+        let k = free + initial.len() * self.parts.len();
+        let zero = [0.0; L];
+        let Solve { gram, rhs, coefficients, initial: weights } = solve;
         gram.clear();
-        gram.resize(k * k, 0.0);
+        gram.resize(packed(k, 0), zero);
         rhs.clear();
-        rhs.resize(k, 0.0);
-        let terms = || positions.iter().zip(&self.fixed).filter(|(_, f)| f.is_none()).map(|(&p, _)| p);
-        for (r, (bank, g)) in self.banks.iter().zip(&self.grams).enumerate() {
-            let width = bank.len() + 1;
-            let first = free + r * initial.len();
-            let columns = || terms().enumerate().chain(initial.iter().enumerate().map(|(i, &p)| (first + i, p)));
-            for (a, p) in columns() {
-                let row = &g[p * width..(p + 1) * width];
-                for (b, q) in columns() {
-                    gram[a * k + b] += row[q];
+        rhs.resize(k, zero);
+        for (a, &ta) in self.free.iter().enumerate() {
+            let rows = &positions[ta];
+            for (b, &tb) in self.free[..=a].iter().enumerate() {
+                gram[packed(a, b)] = gather(rows, &positions[tb], |p, q| normal.correlation[p * width + q]);
+            }
+            rhs[a] = gather(rows, rows, |p, _| normal.rhs[p]);
+            for (columns, fixed) in positions.iter().zip(&self.fixed) {
+                if let Some(value) = *fixed {
+                    let known =
+                        gather(rows, columns, |p, q| value * normal.size[q] * normal.correlation[p * width + q]);
+                    (0..L).for_each(|n| rhs[a][n] -= known[n]);
                 }
-                rhs[a] += row[bank.len()];
-                for (&q, fixed) in positions.iter().zip(&self.fixed) {
-                    if let Some(value) = fixed {
-                        rhs[a] -= value * row[q];
+            }
+        }
+        for (r, part) in self.parts.iter().enumerate() {
+            for (i, &e) in initial.iter().enumerate() {
+                let a = free + r * initial.len() + i;
+                // This record's share of a term's column, against the size that the column has on all.
+                let share = |p: usize| part.correlation[e * width + p] * part.size[p] * normal.inverse[p];
+                for (b, &tb) in self.free.iter().enumerate() {
+                    gram[packed(a, b)] = gather(&positions[tb], &positions[tb], |p, _| share(p));
+                }
+                for (j, &f) in initial[..=i].iter().enumerate() {
+                    gram[packed(a, free + r * initial.len() + j)] = [part.correlation[e * width + f]; L];
+                }
+                rhs[a] = [part.rhs[e]; L];
+                for (columns, fixed) in positions.iter().zip(&self.fixed) {
+                    if let Some(value) = *fixed {
+                        let known =
+                            gather(columns, columns, |q, _| value * part.size[q] * part.correlation[e * width + q]);
+                        (0..L).for_each(|n| rhs[a][n] -= known[n]);
                     }
                 }
             }
         }
-        if let Estimator::MultiInnovation(innovation) = self.options.estimator {
-            for a in 0..k {
-                gram[a * k + a] += 1.0 / innovation.prior_covariance;
-            }
-        }
-        let rank = small::solve_gram(gram, rhs, free, scale)?;
+        let singular = solve_lanes(gram, rhs, free);
         coefficients.clear();
         let mut next = 0;
-        for fixed in &self.fixed {
-            coefficients.push(match fixed {
-                Some(value) => *value,
+        for (columns, fixed) in positions.iter().zip(&self.fixed) {
+            coefficients.push(match *fixed {
+                Some(value) => [value; L],
                 None => {
+                    let scale = gather(columns, columns, |p, _| normal.inverse[p]);
+                    let x = rhs[next];
                     next += 1;
-                    rhs[next - 1]
+                    std::array::from_fn(|n| x[n] * scale[n])
                 }
             });
         }
-        Ok(rank)
+        weights.clear();
+        for (r, part) in self.parts.iter().enumerate() {
+            for (i, &e) in initial.iter().enumerate() {
+                let x = rhs[free + r * initial.len() + i];
+                weights.push(std::array::from_fn(|n| x[n] * part.inverse[e]));
+            }
+        }
+        singular
     }
 
     /// Adds |e| or e² of a block to a partial sum.
@@ -346,7 +546,7 @@ impl Problem {
                 block.iter_mut().zip(&bank.column(p)[lo..hi]).for_each(|(b, v)| *b += c * v);
             }
             for (i, &p) in initial.iter().enumerate() {
-                let c = scratch.rhs[first + i];
+                let c = scratch.weights[first + i];
                 block.iter_mut().zip(&bank.column(p)[lo..hi]).for_each(|(b, v)| *b += c * v);
             }
             raw = self.add(raw, &target[lo..hi], block);
@@ -376,7 +576,7 @@ impl Problem {
         let bank = &self.banks[r];
         let target = &self.targets[r];
         let m = target.len();
-        let Scratch { rhs, divisor, block, division, coefficients, .. } = scratch;
+        let Scratch { weights, divisor, block, division, coefficients, .. } = scratch;
         // Records may differ in length; a division is kept for one.
         let division = match division {
             Some(d) if d.terms() == m => {
@@ -414,7 +614,7 @@ impl Problem {
                 }
             }
             for (i, &p) in initial.iter().enumerate() {
-                let c = rhs[first + i];
+                let c = weights[first + i];
                 block.iter_mut().zip(&bank.column(p)[lo..hi]).for_each(|(b, v)| *b += c * v);
             }
             division.add(0, lo, block);
@@ -442,14 +642,11 @@ impl Problem {
     }
 
     fn row(&self, index: u64, raw: f64, initial: usize, scratch: &Scratch) -> Row {
-        let free = self.fixed.iter().filter(|f| f.is_none()).count();
         Row {
             index,
             score: raw,
             coefficients: scratch.coefficients.clone(),
-            initial: (0..self.banks.len())
-                .map(|r| scratch.rhs[free + r * initial..free + (r + 1) * initial].to_vec())
-                .collect(),
+            initial: (0..self.banks.len()).map(|r| scratch.weights[r * initial..(r + 1) * initial].to_vec()).collect(),
         }
     }
 
@@ -466,7 +663,7 @@ impl Problem {
             .collect::<Result<Vec<_>>>()?;
         let mut initial = Vec::new();
         self.initial_positions(structure, &mut initial);
-        let verdict = self.evaluate(&positions, &initial, limit, scratch, control);
+        let verdict = self.evaluate(&positions, &initial, limit, true, scratch, control);
         let raw = if let Verdict::Score(raw) = verdict { raw } else { f64::INFINITY };
         let row = match verdict {
             Verdict::Failed(Failure::Singular) => {
@@ -482,21 +679,34 @@ fn out_of_range(name: &str, value: f64, range: &str, remedy: &str) -> Error {
     Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() }
 }
 
-/// Gram matrix of a bank's columns and the target; with multi-innovation weights p on all rows but the last p − 1.
-#[allow(clippy::cast_precision_loss)]
-fn weighted_gram(bank: &Bank, target: &[f64], estimator: Estimator) -> Result<Vec<f64>> {
-    let width = bank.len() + 1;
+/// Elements for L candidates; read once where all of them stand at the same columns.
+#[inline(always)]
+fn gather<const L: usize>(rows: &[usize; L], columns: &[usize; L], read: impl Fn(usize, usize) -> f64) -> Lanes<L> {
+    let same = |x: &[usize; L]| x.iter().all(|&p| p == x[0]);
+    if L > 1 && same(rows) && same(columns) {
+        return [read(rows[0], columns[0]); L];
+    }
+    std::array::from_fn(|n| read(rows[n], columns[n]))
+}
+
+/// Gram matrix of a bank's columns and the target, (columns + 1)² row-major.
+fn plain_gram(bank: &Bank, target: &[f64]) -> Vec<f64> {
     let mut columns: Vec<&[f64]> = (0..bank.len()).map(|i| bank.column(i)).collect();
     columns.push(target);
+    dense::gram(&columns)
+}
+
+/// Gives a Gram matrix multi-innovation weights: p on all rows but the last p − 1.
+#[allow(clippy::cast_precision_loss)]
+fn weigh(gram: &mut [f64], bank: &Bank, target: &[f64], innovation: Innovation) -> Result<()> {
+    let width = bank.len() + 1;
     // Φ is orthogonal: the unweighted Gram matrix is the same in Haar coordinates.
-    let mut gram = dense::gram(&columns);
-    let Estimator::MultiInnovation(innovation) = estimator else { return Ok(gram) };
     let m = target.len();
     let tail = innovation.length.min(m) - 1;
     gram.iter_mut().for_each(|g| *g *= innovation.length.min(m) as f64);
     let mut rows = vec![vec![0.0; width]; tail];
-    for (j, column) in columns.iter().enumerate() {
-        let mut values = column.to_vec();
+    for j in 0..width {
+        let mut values = if j < bank.len() { bank.column(j) } else { target }.to_vec();
         if innovation.rows == Rows::Haar {
             haar::transform(&mut values)?;
         }
@@ -513,7 +723,7 @@ fn weighted_gram(bank: &Bank, target: &[f64], estimator: Estimator) -> Result<Ve
             }
         }
     }
-    Ok(gram)
+    Ok(())
 }
 
 /// Adds all regressors that structures of this α with these term orders need.
@@ -582,6 +792,12 @@ impl Scratches {
     }
 }
 
+/// An order of visiting that spreads any first part of it over the whole range.
+#[allow(clippy::cast_precision_loss)]
+fn spread(index: u64) -> f64 {
+    (index as f64 * 0.618_033_988_75).fract()
+}
+
 /// Visits 0 … count−1 once each, spread over the whole range from the start.
 fn visit(count: u64) -> impl Fn(u64) -> u64 {
     // The golden section spreads any prefix evenly; the next stride coprime with the count visits all.
@@ -605,6 +821,328 @@ fn gcd(a: u64, b: u64) -> u64 {
     }
 }
 
+/// The kept rows so far.
+struct Kept {
+    rows: Vec<Row>,
+    keep: usize,
+    /// No candidate above this raw score can be kept.
+    limit: f64,
+}
+
+impl Kept {
+    fn new(keep: usize, limit: f64) -> Self {
+        Self { rows: Vec::new(), keep, limit }
+    }
+
+    /// Takes rows in and lowers the limit where `stopping` allows it.
+    fn take(&mut self, rows: impl Iterator<Item = Row>, stopping: bool) {
+        self.rows.extend(rows);
+        trim(&mut self.rows, self.keep);
+        if stopping && self.rows.len() == self.keep {
+            self.limit = self.limit.min(self.rows[self.keep - 1].score);
+        }
+    }
+}
+
+/// A candidate that its bound has not excluded.
+#[derive(Debug, Clone, Copy)]
+struct Open {
+    index: u64,
+    bound: f64,
+    /// A guess at its score, by which visits are ordered.
+    guess: f64,
+}
+
+/// One search over a lattice.
+struct Hunt<'a> {
+    problem: Problem,
+    lattice: &'a Lattice,
+    /// Column of each value of each term, per block of the lattice.
+    tables: Vec<Vec<Vec<usize>>>,
+    options: &'a Options,
+    control: &'a Control,
+    pool: &'a rayon::ThreadPool,
+    scratches: Scratches,
+    counts: Counts,
+    failures: Vec<(u64, Failure)>,
+}
+
+impl Hunt<'_> {
+    fn check_stop(&self) -> Result<()> {
+        if self.control.stop.load(Ordering::Relaxed) {
+            Err(Error::Interrupted)
+        } else {
+            Ok(())
+        }
+    }
+
+    fn done(&self, count: u64, pruned: u64) {
+        self.control.done.fetch_add(count, Ordering::Relaxed);
+        self.control.pruned.fetch_add(pruned, Ordering::Relaxed);
+    }
+
+    fn positions(&self, cursor: &Cursor<'_>, positions: &mut [usize]) {
+        let table = &self.tables[cursor.block()];
+        cursor.each(|term, digit| positions[term] = table[term][digit]);
+    }
+
+    fn initial(&self, cursor: &Cursor<'_>, initial: &mut Vec<usize>) {
+        if self.options.initial != Initial::Rest {
+            self.problem.initial_positions(&cursor.structure(), initial);
+        }
+    }
+
+    /// Screens candidates `lo … hi − 1` against a limit: the open ones, and the singular ones.
+    #[inline(always)]
+    fn screen(&self, lo: u64, hi: u64, limit: f64) -> (Vec<Open>, Vec<u64>) {
+        let (mut open, mut singular) = (Vec::new(), Vec::new());
+        let mut cursor = Cursor::at(self.lattice, lo);
+        let mut index = lo;
+        let width = self.lattice.width();
+        // Candidates differ in their Caputo terms, so they cannot share a layout.
+        if self.options.initial != Initial::Caputo {
+            let mut screen = Screen::<WIDTH>::new(width);
+            while index + WIDTH as u64 <= hi {
+                self.screen_some(&mut cursor, index, limit, &mut screen, &mut open, &mut singular);
+                index += WIDTH as u64;
+            }
+        }
+        let mut screen = Screen::<1>::new(width);
+        while index < hi {
+            self.screen_some(&mut cursor, index, limit, &mut screen, &mut open, &mut singular);
+            index += 1;
+        }
+        (open, singular)
+    }
+
+    #[inline(always)]
+    fn screen_some<const L: usize>(
+        &self,
+        cursor: &mut Cursor<'_>,
+        index: u64,
+        limit: f64,
+        screen: &mut Screen<L>,
+        open: &mut Vec<Open>,
+        singular: &mut Vec<u64>,
+    ) {
+        let Screen { solve, positions, initial, terms, coefficients, weights } = screen;
+        self.initial(cursor, initial);
+        #[allow(clippy::needless_range_loop)] // lane n of every term
+        for n in 0..L {
+            let table = &self.tables[cursor.block()];
+            cursor.each(|term, digit| positions[term][n] = table[term][digit]);
+            cursor.advance();
+        }
+        let failed = self.problem.solve(positions, initial, solve);
+        let squares = self.problem.plain.as_ref().map(|plain| plain.error(positions, &solve.coefficients));
+        for n in 0..L {
+            let index = index + n as u64;
+            if failed[n] {
+                singular.push(index);
+                continue;
+            }
+            let (bound, guess) = match (&squares, &self.problem.bound) {
+                (Some((least, guess)), _) => (least[n], guess[n]),
+                (None, Some(bound)) => {
+                    terms.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p[n]);
+                    coefficients.iter_mut().zip(&solve.coefficients).for_each(|(c, x)| *c = x[n]);
+                    weights.clear();
+                    weights.extend(solve.initial.iter().map(|x| x[n]));
+                    let e = initial.len();
+                    bound.evaluate(limit, |r| {
+                        (&terms[..], &coefficients[..], &initial[..], &weights[r * e..(r + 1) * e])
+                    })
+                }
+                (None, None) => (0.0, spread(index)),
+            };
+            // Written so that a bound that is not a number excludes nothing.
+            if bound > limit {
+                continue;
+            }
+            open.push(Open { index, bound, guess });
+        }
+    }
+
+    /// Follows open candidates in this order; what is learnt goes to `kept`, and to the counts if `counted`.
+    fn follow(&mut self, open: &[Open], kept: &mut Kept, counted: bool) -> Result<()> {
+        let (mut start, mut size) = (0, FOLLOWED.0);
+        while start < open.len() {
+            let end = open.len().min(start + size);
+            let limit = kept.limit;
+            let this = &*self;
+            let visit = |candidate: &Open| {
+                if this.control.stop.load(Ordering::Relaxed) {
+                    return None;
+                }
+                if candidate.bound > limit {
+                    return Some((candidate.index, Verdict::Bounded(candidate.bound), None));
+                }
+                this.scratches.with(|scratch| {
+                    let mut positions = std::mem::take(&mut scratch.positions);
+                    let mut initial = std::mem::take(&mut scratch.initial);
+                    let cursor = Cursor::at(this.lattice, candidate.index);
+                    positions.clear();
+                    positions.resize(this.lattice.width(), 0);
+                    this.positions(&cursor, &mut positions);
+                    this.initial(&cursor, &mut initial);
+                    let verdict = this.problem.evaluate(&positions, &initial, limit, false, scratch, this.control);
+                    let row = match verdict {
+                        Verdict::Score(raw) if raw <= limit => {
+                            Some(this.problem.row(candidate.index, raw, initial.len(), scratch))
+                        }
+                        _ => None,
+                    };
+                    scratch.positions = positions;
+                    scratch.initial = initial;
+                    if counted {
+                        this.done(1, u64::from(matches!(verdict, Verdict::Stopped(_))));
+                    }
+                    Some((candidate.index, verdict, row))
+                })
+            };
+            let results: Vec<_> =
+                self.pool.install(|| open[start..end].par_iter().with_min_len(4).map(visit).collect());
+            self.check_stop()?;
+            let mut rows = Vec::new();
+            for (index, verdict, row) in results.into_iter().flatten() {
+                if counted {
+                    self.count(index, verdict);
+                }
+                rows.extend(row);
+            }
+            kept.take(rows.into_iter(), self.options.early_stopping);
+            start = end;
+            size = (2 * size).min(FOLLOWED.1);
+        }
+        Ok(())
+    }
+
+    fn count(&mut self, index: u64, verdict: Verdict) {
+        match verdict {
+            Verdict::Score(_) => self.counts.beaten += 1,
+            Verdict::Bounded(_) => {
+                self.counts.bounded += 1;
+                self.done(1, 1);
+            }
+            Verdict::Stopped(_) => self.counts.stopped += 1,
+            Verdict::Failed(failure) => {
+                match failure {
+                    Failure::Singular => self.counts.singular += 1,
+                    Failure::Diverged => self.counts.diverged += 1,
+                }
+                self.failures.push((index, failure));
+            }
+        }
+    }
+
+    /// Tries some candidates all over the lattice: the first limit, and the test vectors that exclude most.
+    fn scout(&mut self) -> Result<f64> {
+        let count = self.lattice.count();
+        let order = visit(count);
+        let indices: Vec<u64> = (0..count.min(SCOUTS)).map(order).collect();
+        let this = &*self;
+        let found: Vec<Option<(Open, Vec<f64>)>> = self.pool.install(|| {
+            indices
+                .par_iter()
+                .map(|&index| {
+                    let cursor = Cursor::at(this.lattice, index);
+                    let mut positions = vec![0; this.lattice.width()];
+                    let mut initial = Vec::new();
+                    this.positions(&cursor, &mut positions);
+                    this.initial(&cursor, &mut initial);
+                    let sources: Vec<[usize; 1]> = positions.iter().map(|&p| [p]).collect();
+                    let mut solve = Solve::<1>::new();
+                    let [failed] = this.problem.solve(&sources, &initial, &mut solve);
+                    if failed {
+                        return None;
+                    }
+                    let coefficients: Vec<f64> = solve.coefficients.iter().map(|c| c[0]).collect();
+                    let weights: Vec<f64> = solve.initial.iter().map(|c| c[0]).collect();
+                    let columns = |r: usize| {
+                        let e = initial.len();
+                        (&positions[..], &coefficients[..], &initial[..], &weights[r * e..(r + 1) * e])
+                    };
+                    let (mut each, mut guess) = (Vec::new(), 0.0);
+                    if let Some(bound) = &this.problem.bound {
+                        each = vec![0.0; bound.len()];
+                        bound.each(columns, &mut each);
+                        guess = bound.evaluate(f64::INFINITY, columns).1;
+                    } else if let Some(plain) = &this.problem.plain {
+                        guess = plain.error(&sources, &solve.coefficients).1[0];
+                    }
+                    Some((Open { index, bound: 0.0, guess }, each))
+                })
+                .collect()
+        });
+        self.check_stop()?;
+        let found: Vec<(Open, Vec<f64>)> = found.into_iter().flatten().collect();
+        let mut likely: Vec<Open> = found.iter().map(|(open, _)| *open).collect();
+        by_guess(&mut likely);
+        likely.truncate(4 * self.options.keep.max(16));
+        let mut kept = Kept::new(self.options.keep, f64::INFINITY);
+        self.follow(&likely, &mut kept, false)?;
+        let limit = kept.limit;
+        if let Some(bound) = self.problem.bound.take() {
+            let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
+            let which = choose(&each, bound.len(), limit);
+            self.problem.bound = Some(bound.chosen(&which));
+        }
+        Ok(limit)
+    }
+}
+
+impl Plain {
+    /// Lower bounds of the squared equation error of L candidates, rounding allowed for, and its values.
+    #[inline(always)]
+    fn error<const L: usize>(&self, positions: &[[usize; L]], coefficients: &[Lanes<L>]) -> (Lanes<L>, Lanes<L>) {
+        let (stride, target) = (self.stride, self.stride - 1);
+        let mut sum = [self.gram[target * stride + target]; L];
+        let mut size = [self.norms[target]; L];
+        for (i, (rows, c)) in positions.iter().zip(coefficients).enumerate() {
+            let norms = gather(rows, rows, |p, _| self.norms[p]);
+            // c·(c·G_ii + 2 Σ_{j<i} c_j G_ij − 2 b_i)
+            let mut inner = gather(rows, rows, |p, _| self.gram[p * stride + target]);
+            for (columns, d) in positions[..i].iter().zip(coefficients) {
+                let g = gather(rows, columns, |p, q| self.gram[p * stride + q]);
+                (0..L).for_each(|n| inner[n] -= d[n] * g[n]);
+            }
+            let diagonal = gather(rows, rows, |p, _| self.gram[p * stride + p]);
+            for n in 0..L {
+                sum[n] += c[n] * (c[n] * diagonal[n] - 2.0 * inner[n]);
+                size[n] += c[n].abs() * norms[n];
+            }
+        }
+        let least = std::array::from_fn(|n| sum[n] - self.unit * size[n] * size[n]);
+        (least, sum)
+    }
+}
+
+/// Sorts by guess, ties by index; what has no order comes last.
+fn by_guess(open: &mut [Open]) {
+    open.sort_unstable_by(|a, b| a.guess.total_cmp(&b.guess).then(a.index.cmp(&b.index)));
+}
+
+/// The test vectors that together exclude most of a sample, those that exclude most by themselves first.
+fn choose(each: &[Vec<f64>], count: usize, limit: f64) -> Vec<usize> {
+    let mut open: Vec<bool> = vec![true; each.len()];
+    let mut chosen: Vec<usize> = Vec::new();
+    // Where one excludes no more than another the smaller threshold tells: how near it comes.
+    let gain = |j: usize, open: &[bool]| -> (usize, f64) {
+        let values = each.iter().zip(open).filter(|(_, open)| **open).map(|(e, _)| e[j]);
+        values.fold((0, 0.0), |(n, sum), v| (n + usize::from(v > limit), sum + v / (v + limit).max(f64::MIN_POSITIVE)))
+    };
+    while chosen.len() < VECTORS.min(count) {
+        let best = (0..count)
+            .filter(|j| !chosen.contains(j))
+            .map(|j| (gain(j, &open), j))
+            .max_by(|a, b| a.0 .0.cmp(&b.0 .0).then(a.0 .1.total_cmp(&b.0 .1)).then(b.1.cmp(&a.1)));
+        let Some((_, j)) = best else { break };
+        each.iter().zip(&mut open).filter(|(e, _)| e[j] > limit).for_each(|(_, open)| *open = false);
+        chosen.push(j);
+    }
+    chosen
+}
+
 /// Searches a lattice over one equation on one or several records.
 ///
 /// `fixed` gives known coefficients. The table is that of brute force for any number of threads.
@@ -618,126 +1156,112 @@ pub fn search(
     options: &Options,
     control: &Control,
 ) -> Result<Outcome> {
-    let width = lattice.structure(0).terms.len();
-    check_length("fixed coefficients", width, fixed.len())?;
-    let output = lattice.output();
+    check_length("fixed coefficients", lattice.width(), fixed.len())?;
     for record in records {
         lattice.structure(0).check(record.len(), |_| true)?;
     }
     let pool = pool(options.threads)?;
     let mut index = Index::default();
     let mut seen = HashSet::new();
-    let signals: Vec<usize> = lattice.structure(0).terms.iter().map(|t| t.signal).collect();
     for block in lattice.blocks() {
         index_alpha(&mut index, block.alpha, &options.initial);
-        for group in &block.groups {
-            let signal = signals[group.terms[0]];
-            for &order in &group.orders {
-                index_orders(&mut index, &mut seen, block.alpha, signal, order, &options.initial);
+        for (group, slice) in lattice.groups().iter().zip(&block.slices) {
+            for (axis, &first) in group.axes.iter().zip(&slice.first) {
+                for &order in &axis[first..] {
+                    index_orders(&mut index, &mut seen, block.alpha, group.signal, order, &options.initial);
+                }
             }
         }
     }
-    let problem = Problem::new(records, output, index, fixed, options)?;
-    // Positions of each group's tuples, so that a candidate costs no look-up.
-    let tables: Vec<Vec<Vec<usize>>> = lattice
+    let problem = Problem::new(records, lattice.output(), index, fixed, options)?;
+    let problem = pool.install(|| problem.with_bound(lattice.count()));
+    let tables = tables(lattice, &problem)?;
+    let count = lattice.count();
+    control.total.store(count, Ordering::Relaxed);
+    let mut hunt = Hunt {
+        problem,
+        lattice,
+        tables,
+        options,
+        control,
+        pool: &pool,
+        scratches: Scratches::new(options.threads),
+        counts: Counts { candidates: count, ..Counts::default() },
+        failures: Vec::new(),
+    };
+    hunt.check_stop()?;
+    let screened = hunt.problem.bound.is_some() || hunt.problem.plain.is_some();
+    let limit = if screened { hunt.scout()? } else { f64::INFINITY };
+    let mut kept = Kept::new(options.keep, limit);
+    for start in (0..count).step_by(ROUND as usize) {
+        let end = count.min(start + ROUND);
+        let limit = kept.limit;
+        let this = &hunt;
+        let parts: Vec<(Vec<Open>, Vec<u64>)> = pool.install(|| {
+            (0..(end - start).div_ceil(CHUNK))
+                .into_par_iter()
+                .map(|chunk| {
+                    let (lo, hi) = (start + chunk * CHUNK, end.min(start + (chunk + 1) * CHUNK));
+                    if this.control.stop.load(Ordering::Relaxed) {
+                        return Default::default();
+                    }
+                    let found = lanes::widest(|| this.screen(lo, hi, limit));
+                    let closed = hi - lo - (found.0.len() + found.1.len()) as u64;
+                    this.done(closed + found.1.len() as u64, closed);
+                    found
+                })
+                .collect()
+        });
+        hunt.check_stop()?;
+        let mut open: Vec<Open> = Vec::new();
+        let singular_before = hunt.counts.singular;
+        for (found, singular) in parts {
+            open.extend(found);
+            hunt.counts.singular += singular.len() as u64;
+            let room = LISTED.saturating_sub(hunt.failures.len());
+            hunt.failures.extend(singular.into_iter().take(room).map(|index| (index, Failure::Singular)));
+        }
+        hunt.counts.bounded += end - start - open.len() as u64 - (hunt.counts.singular - singular_before);
+        by_guess(&mut open);
+        hunt.follow(&open, &mut kept, true)?;
+        hunt.failures.sort_unstable();
+        hunt.failures.truncate(LISTED);
+    }
+    let Hunt { problem, mut counts, failures, .. } = hunt;
+    counts.kept = kept.rows.len() as u64;
+    counts.beaten -= counts.kept;
+    for row in &mut kept.rows {
+        row.score = problem.score(row.score);
+    }
+    Ok(Outcome { rows: kept.rows, counts, failures })
+}
+
+/// The column of every value of every term, per block, so that a candidate costs no look-up.
+fn tables(lattice: &Lattice, problem: &Problem) -> Result<Vec<Vec<Vec<usize>>>> {
+    lattice
         .blocks()
         .iter()
         .map(|block| {
-            block
-                .groups
-                .iter()
-                .map(|group| {
-                    let signal = signals[group.terms[0]];
-                    group.orders.iter().map(|&o| problem.position(signal, block.alpha - o)).collect()
-                })
-                .collect()
-        })
-        .collect::<Result<_>>()?;
-
-    let count = lattice.count();
-    control.total.store(count, Ordering::Relaxed);
-    let order = visit(count);
-    let scratches = Scratches::new(options.threads);
-    let mut kept: Vec<Row> = Vec::new();
-    let mut counts = Counts { candidates: count, ..Counts::default() };
-    let mut failures: Vec<(u64, Failure)> = Vec::new();
-    let (mut start, mut size) = (0, FIRST_ROUND);
-    while start < count {
-        let end = count.min(start + size);
-        let limit = match kept.last() {
-            Some(worst) if options.early_stopping && kept.len() == options.keep => worst.score,
-            _ => f64::INFINITY,
-        };
-        let evaluate = |i: u64| {
-            let index = order(i);
-            scratches.with(|scratch| {
-                let mut tuples = std::mem::take(&mut scratch.tuples);
-                let mut positions = std::mem::take(&mut scratch.positions);
-                let mut initial = std::mem::take(&mut scratch.initial);
-                let block = lattice.locate(index, &mut tuples);
-                positions.clear();
-                positions.resize(width, 0);
-                for ((group, table), &tuple) in lattice.blocks()[block].groups.iter().zip(&tables[block]).zip(&tuples) {
-                    let members = group.terms.len();
-                    for (j, &term) in group.terms.iter().enumerate() {
-                        positions[term] = table[tuple * members + j];
-                    }
-                }
-                if options.initial == Initial::Rest {
-                    initial.clear();
-                } else {
-                    problem.initial_positions(&lattice.structure(index), &mut initial);
-                }
-                let verdict = problem.evaluate(&positions, &initial, limit, scratch, control);
-                let row = match verdict {
-                    Verdict::Score(raw) if raw <= limit => Some(problem.row(index, raw, initial.len(), scratch)),
-                    _ => None,
-                };
-                scratch.tuples = tuples;
-                scratch.positions = positions;
-                scratch.initial = initial;
-                control.done.fetch_add(1, Ordering::Relaxed);
-                (index, verdict, row)
-            })
-        };
-        let results: Vec<_> = pool.install(|| {
-            #[allow(clippy::cast_possible_truncation)]
-            let round = (end - start) as usize;
-            (0..round)
-                .into_par_iter()
-                .with_min_len(4)
-                .map(|i| if control.stop.load(Ordering::Relaxed) { None } else { Some(evaluate(start + i as u64)) })
-                .collect()
-        });
-        if control.stop.load(Ordering::Relaxed) {
-            return Err(Error::Interrupted);
-        }
-        for (index, verdict, row) in results.into_iter().flatten() {
-            match verdict {
-                Verdict::Score(_) => counts.beaten += 1,
-                Verdict::Stopped(_) => counts.stopped += 1,
-                Verdict::Failed(failure) => {
-                    match failure {
-                        Failure::Singular => counts.singular += 1,
-                        Failure::Diverged => counts.diverged += 1,
-                    }
-                    failures.push((index, failure));
+            let mut table = vec![Vec::new(); lattice.width()];
+            for (group, slice) in lattice.groups().iter().zip(&block.slices) {
+                for ((&term, axis), &first) in group.terms.iter().zip(&group.axes).zip(&slice.first) {
+                    table[term] = axis
+                        .iter()
+                        .enumerate()
+                        .map(|(i, &order)| {
+                            // Values out of this α's range are never asked for.
+                            if i < first {
+                                Ok(0)
+                            } else {
+                                problem.position(group.signal, block.alpha - order)
+                            }
+                        })
+                        .collect::<Result<_>>()?;
                 }
             }
-            kept.extend(row);
-        }
-        trim(&mut kept, options.keep);
-        failures.sort_unstable();
-        failures.truncate(LISTED);
-        start = end;
-        size = (2 * size).min(LAST_ROUND);
-    }
-    counts.kept = kept.len() as u64;
-    counts.beaten -= counts.kept;
-    for row in &mut kept {
-        row.score = problem.score(row.score);
-    }
-    Ok(Outcome { rows: kept, counts, failures })
+            Ok(table)
+        })
+        .collect()
 }
 
 /// The best `keep` rows, ties by index.

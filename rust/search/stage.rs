@@ -101,7 +101,7 @@ impl Table<'_> {
                 Verdict::Score(raw) => {
                     Entry { value: self.problem.score(raw) / self.scale, exact: true, failure: None }
                 }
-                Verdict::Stopped(raw) => {
+                Verdict::Bounded(raw) | Verdict::Stopped(raw) => {
                     Entry { value: self.problem.score(raw) / self.scale, exact: false, failure: None }
                 }
                 Verdict::Failed(failure) => Entry { value: f64::INFINITY, exact: true, failure: Some(failure) },

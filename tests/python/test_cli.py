@@ -252,7 +252,7 @@ def test_ctrl_c_ends_a_search_with_130_and_shows_progress_before(folder: Path) -
     process = subprocess.Popen(
         [sys.executable, "-m", "ftlm", "search", "square.csv",
          "--structure", "D^alpha y = a2 D^nu y + a1 D^mu y + a0 D^xi y + b0 u",
-         "--coefficients", "least-squares", "--step", "0.02", "--lattice", "alpha=1.0:2.0:0.02"],
+         "--coefficients", "least-squares", "--step", "0.005", "--lattice", "alpha=1.0:2.0:0.005"],
         cwd=folder, stdout=subprocess.DEVNULL, stderr=slave, env={**os.environ, "TERM": "xterm"},
     )  # fmt: skip
     os.close(slave)

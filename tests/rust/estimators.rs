@@ -5,8 +5,9 @@ use ftlm::equation::{Initial, Structure};
 use ftlm::error::Error;
 use ftlm::estimate::least_squares::{self, Regression};
 use ftlm::estimate::multi_innovation::{closed_form, recursion, Innovation, Rows};
+use ftlm::lanes::{self, WIDTH};
 use ftlm::regressors::{Bank, Index, Key, Record, BANK_LIMIT};
-use ftlm::small::{self, Rank};
+use ftlm::small::{self, packed};
 use ftlm::{haar, series, simulate};
 use proptest::prelude::*;
 
@@ -435,6 +436,23 @@ fn gram(columns: &[Vec<f64>], target: &[f64]) -> (Vec<f64>, Vec<f64>) {
     (gram, columns.iter().map(|c| dot(c, target)).collect())
 }
 
+/// Solves one system through the lanes: scaled to a diagonal of ones, solved, scaled back.
+fn solve_one(gram: &[f64], rhs: &[f64], needed: usize) -> (Vec<f64>, bool) {
+    let k = rhs.len();
+    let scale: Vec<f64> =
+        (0..k).map(|i| if gram[i * k + i] > 0.0 { 1.0 / gram[i * k + i].sqrt() } else { 0.0 }).collect();
+    let mut lower = vec![[0.0]; packed(k, 0)];
+    for i in 0..k {
+        for j in 0..=i {
+            lower[packed(i, j)] =
+                [if scale[i] * scale[j] == 0.0 { 0.0 } else { gram[i * k + j] * scale[i] * scale[j] }];
+        }
+    }
+    let mut x: Vec<[f64; 1]> = rhs.iter().zip(&scale).map(|(b, s)| [b * s]).collect();
+    let [singular] = small::solve_lanes(&mut lower, &mut x, needed);
+    (x.iter().zip(&scale).map(|(x, s)| x[0] * s).collect(), singular)
+}
+
 #[test]
 fn dependent_columns_of_a_gram_matrix() {
     let mut random = Random::new(63);
@@ -444,13 +462,10 @@ fn dependent_columns_of_a_gram_matrix() {
     columns.push(random.signal(40));
     let target = random.signal(40);
     let (g, b) = gram(&columns, &target);
-    let mut scale = Vec::new();
-    // Needed: an error that names it. Optional: dropped, and the rest is solved without it.
-    let found = small::solve_gram(&mut g.clone(), &mut b.clone(), 4, &mut scale);
-    assert_eq!(found, Err(Error::Singular { index: 3, count: 5 }));
-    let (mut gram_used, mut x) = (g, b);
-    let rank = small::solve_gram(&mut gram_used, &mut x, 3, &mut scale).unwrap();
-    assert_eq!(rank, Rank::Dropped(vec![3]));
+    // Needed: flagged. Optional: dropped, and the rest is solved without it.
+    assert!(solve_one(&g, &b, 4).1);
+    let (mut x, singular) = solve_one(&g, &b, 3);
+    assert!(!singular);
     assert_eq!(x[3], 0.0);
     columns.remove(3);
     let (g, b) = gram(&columns, &target);
@@ -458,9 +473,57 @@ fn dependent_columns_of_a_gram_matrix() {
     x.remove(3);
     assert!(relative_distance(&x, &oracle) < 1e-12);
     // NaN counts as dependent, and nothing at all is solved at once.
-    assert!(small::solve_gram(&mut [f64::NAN], &mut [1.0], 1, &mut scale).is_err());
-    assert_eq!(small::solve_gram(&mut [f64::NAN], &mut [1.0], 0, &mut scale), Ok(Rank::Dropped(vec![0])));
-    assert_eq!(small::solve_gram(&mut [], &mut [], 0, &mut scale), Ok(Rank::Full));
+    assert!(solve_one(&[f64::NAN], &[1.0], 1).1);
+    assert_eq!(solve_one(&[f64::NAN], &[1.0], 0), (vec![0.0], false));
+    assert_eq!(solve_one(&[], &[], 0), (vec![], false));
+}
+
+#[test]
+fn lanes_do_not_know_each_other_nor_the_instructions_they_run_on() {
+    let mut random = Random::new(65);
+    for k in 1..9 {
+        let mut systems: Vec<(Vec<f64>, Vec<f64>)> = (0..WIDTH)
+            .map(|_| {
+                let columns: Vec<Vec<f64>> = (0..k).map(|_| random.signal(30)).collect();
+                gram(&columns, &random.signal(30))
+            })
+            .collect();
+        // One lane that is singular from its first unknown on, and one that is no number.
+        systems[2].0.fill(0.0);
+        systems[5].0.fill(f64::NAN);
+        let pack = |lanes: &[usize]| -> (Vec<[f64; WIDTH]>, Vec<[f64; WIDTH]>) {
+            let lower = (0..k)
+                .flat_map(|i| (0..=i).map(move |j| (i, j)))
+                .map(|(i, j)| std::array::from_fn(|n| systems[lanes[n]].0[i * k + j]))
+                .collect();
+            (lower, (0..k).map(|i| std::array::from_fn(|n| systems[lanes[n]].1[i])).collect())
+        };
+        let straight: Vec<usize> = (0..WIDTH).collect();
+        let turned: Vec<usize> = (0..WIDTH).rev().collect();
+        let (mut a, mut x) = pack(&straight);
+        let flags = small::solve_lanes(&mut a, &mut x, k.min(2));
+        let (mut a, mut y) = pack(&straight);
+        let widest = lanes::widest(|| small::solve_lanes(&mut a, &mut y, k.min(2)));
+        let (mut a, mut z) = pack(&turned);
+        let backwards = small::solve_lanes(&mut a, &mut z, k.min(2));
+        assert_eq!(flags, widest);
+        assert!(flags[2] && flags[5] && !flags[0]);
+        for n in 0..WIDTH {
+            assert_eq!(flags[n], backwards[WIDTH - 1 - n]);
+            for i in 0..k {
+                assert_eq!(x[i][n].to_bits(), y[i][n].to_bits());
+                assert_eq!(x[i][n].to_bits(), z[i][WIDTH - 1 - n].to_bits());
+            }
+            let mut one: Vec<[f64; 1]> = (0..k).map(|i| [systems[n].1[i]]).collect();
+            let mut lower: Vec<[f64; 1]> =
+                (0..k).flat_map(|i| (0..=i).map(move |j| (i, j))).map(|(i, j)| [systems[n].0[i * k + j]]).collect();
+            small::solve_lanes(&mut lower, &mut one, k.min(2));
+            assert!((0..k).all(|i| one[i][0].to_bits() == x[i][n].to_bits()));
+        }
+    }
+    let (a, b) = (random.signal(1003), random.signal(1003));
+    assert_eq!(lanes::dot(&a, &b).to_bits(), lanes::widest(|| lanes::dot(&a, &b)).to_bits());
+    check("dot product", (lanes::dot(&a, &b) - a.iter().zip(&b).map(|(x, y)| x * y).sum::<f64>()).abs(), 1e-13);
 }
 
 #[test]
@@ -497,9 +560,10 @@ proptest! {
             })
             .collect();
         let target = random.signal(60);
-        let (mut g, mut b) = gram(&columns, &target);
+        let (g, b) = gram(&columns, &target);
         let oracle = small::solve_gram_oracle(&g, &b).unwrap();
-        prop_assert_eq!(small::solve_gram(&mut g, &mut b, k, &mut Vec::new()), Ok(Rank::Full));
+        let (b, singular) = solve_one(&g, &b, k);
+        prop_assert!(!singular);
         for i in 0..k {
             // Each relative to what its own column's size makes of the target.
             prop_assert!((b[i] - oracle[i]).abs() <= 1e-10 * norm(&target) / norm(&columns[i]));

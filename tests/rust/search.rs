@@ -8,6 +8,7 @@ use ftlm::error::{Error, Kind};
 use ftlm::estimate::least_squares::{self, Estimate};
 use ftlm::estimate::multi_innovation::{closed_form, Innovation, Rows};
 use ftlm::regressors::Record;
+use ftlm::search::bound::lower_bounds;
 use ftlm::search::lattice::{Lattice, TermAxis, MAX_CANDIDATES};
 use ftlm::search::run::{search, Control, Counts, Criterion, Estimator, Failure, Norm, Options, Outcome, MAX_THREADS};
 use ftlm::simulate::{equation_error, respond};
@@ -37,7 +38,7 @@ fn options() -> Options {
 }
 
 fn total(counts: &Counts) -> u64 {
-    counts.kept + counts.beaten + counts.stopped + counts.singular + counts.diverged
+    counts.kept + counts.beaten + counts.bounded + counts.stopped + counts.singular + counts.diverged
 }
 
 // ---------------------------------------------------------------------------------------------------------- lattices
@@ -148,16 +149,22 @@ fn empty_and_oversized_lattices_say_why() {
             matches!(Lattice::new(0, &[1.0, alpha], &[], |_| false), Err(Error::OutOfRange { value, .. }) if value == alpha)
         );
     }
-    // Too many: within one signal, and as a product of signals.
-    let many = range(0.0, 2.0, 0.001);
-    let one =
-        Lattice::new(0, &[2.0], &[axis(1, &many, false), axis(1, &many, false), axis(1, &many, false)], |_| false);
-    let found = one.unwrap_err();
-    assert_eq!(found, Error::LatticeTooLarge { count: 2001 * 2001 * 2001, limit: MAX_CANDIDATES });
-    assert_eq!(found.kind(), Kind::Model);
-    let product =
-        Lattice::new(0, &[2.0], &[axis(1, &many, false), axis(2, &many, false), axis(3, &many, false)], |_| false);
-    assert_eq!(product.unwrap_err(), Error::LatticeTooLarge { count: 2001 * 2001 * 2001, limit: MAX_CANDIDATES });
+    // Too many, within one signal and as a product of signals: refused from the lengths alone, at once.
+    let many = range(0.0, 3.0, 0.0005);
+    for signals in [[1, 1, 1, 1], [1, 1, 2, 2], [1, 2, 3, 4]] {
+        let axes: Vec<TermAxis> = signals.iter().map(|&s| axis(s, &many, true)).collect();
+        let found = Lattice::new(0, &range(0.001, 3.0, 0.001), &axes, |_| false).map(|l| l.count());
+        assert!(matches!(found, Err(Error::LatticeTooLarge { count, limit: MAX_CANDIDATES }) if count > 1 << 50));
+        assert_eq!(found.unwrap_err().kind(), Kind::Model);
+    }
+    // Past the limit only once it is counted.
+    let some = range(0.0, 0.16, 0.001);
+    let mut axes: Vec<TermAxis> = (0..3).map(|_| axis(1, &some, true)).collect();
+    let alphas = range(1.0, 1.5, 0.01);
+    assert_eq!(Lattice::new(0, &alphas, &axes, |_| false).unwrap().count(), 51 * (161 * 160 * 159 / 6));
+    axes.push(axis(2, &range(0.0, 0.6, 0.002), false));
+    let found = Lattice::new(0, &alphas, &axes, |_| false).map(|l| l.count());
+    assert!(matches!(found, Err(Error::LatticeTooLarge { count, .. }) if count < 2 * MAX_CANDIDATES));
     // An equation without terms is its alphas.
     assert_eq!(Lattice::new(0, &[1.0, 2.0], &[], |_| false).unwrap().count(), 2);
 }
@@ -287,7 +294,7 @@ fn naive(problem: &Problem, structure: &Structure) -> Result<(f64, Estimate), Fa
 
 #[test]
 fn early_stopping_and_threads_change_nothing() {
-    let (mut stopped, mut candidates) = (0, 0);
+    let (mut bounded, mut stopped, mut candidates) = (0, 0, 0);
     for seed in 100..140 {
         let problem = random_problem(seed);
         let brute = problem.run(|o| o.early_stopping = false);
@@ -304,11 +311,12 @@ fn early_stopping_and_threads_change_nothing() {
             assert_eq!(problem.run(|o| o.threads = threads), one, "seed {seed}, {threads} threads");
         }
         assert_eq!(problem.run(|o| (o.threads, o.early_stopping) = (3, false)), brute);
+        bounded += one.counts.bounded;
         stopped += one.counts.stopped;
         candidates += one.counts.candidates;
     }
-    println!("{stopped} of {candidates} candidates left early");
-    assert!(stopped > candidates / 5);
+    println!("of {candidates} candidates {bounded} excluded by their bound, {stopped} left early");
+    assert!(stopped + bounded > candidates / 5 && bounded > candidates / 10 && stopped > candidates / 50);
 }
 
 #[test]
@@ -381,7 +389,7 @@ fn a_search_finds_the_truth_among_its_neighbours() {
     check("error at the truth", found.rows[0].score, 1e-6);
     assert!(relative_distance(&found.rows[0].coefficients, &truth().coefficients) < 1e-6);
     assert!(found.rows[1].score > 1e4 * found.rows[0].score);
-    assert!(found.counts.stopped > found.counts.candidates * 9 / 10);
+    assert!(found.counts.bounded + found.counts.stopped > found.counts.candidates * 9 / 10);
 }
 
 #[test]
@@ -510,6 +518,118 @@ fn a_search_ends_when_told_to() {
     });
     assert_eq!(control.total.load(Ordering::Relaxed), 313_845);
     assert!(control.done.load(Ordering::Relaxed) < 313_845);
+}
+
+/// A record and an equation on it, a third of them unstable, some with coefficients fitted and some far off.
+fn random_candidate(random: &mut Random) -> (Record, Equation) {
+    let m = 30 + random.below(300);
+    let step = 10.0_f64.powf(random.uniform(-3.0, 0.0));
+    let record = data(random, m, step, 0.05);
+    let alpha = random.uniform(0.3, 2.5);
+    let mut terms: Vec<(usize, f64, f64)> = Vec::new();
+    for _ in 0..1 + random.below(3) {
+        terms.push((0, random.uniform(0.0, 0.95) * alpha, 0.0));
+    }
+    terms.push((1, random.uniform(0.0, 1.0) * alpha, 0.0));
+    terms.push((2, random.uniform(-0.5, 1.0) * alpha, 0.0));
+    let unstable = random.chance(1.0 / 3.0);
+    for term in &mut terms {
+        let size = 10.0_f64.powf(random.uniform(-1.0, 3.0));
+        term.2 = if term.0 == 0 && !unstable { -size } else { size * if random.chance(0.5) { 1.0 } else { -1.0 } };
+    }
+    let mut made = equation(0, alpha, &terms);
+    if random.chance(0.5) {
+        let fixed = vec![None; terms.len()];
+        if let Ok(fit) = least_squares::fit(std::slice::from_ref(&record), &made.structure, &fixed, &Initial::Rest) {
+            made.coefficients = fit.coefficients;
+        }
+    }
+    (record, made)
+}
+
+#[test]
+fn the_bound_is_tight_where_the_error_is_a_test_vector_would_see() {
+    // A wrong gain under a square wave: the bound must see a good part of the error, or it would exclude nothing.
+    let mut random = Random::new(246);
+    let current: Vec<f64> = (0..1024).map(|k| if k / 100 % 2 == 0 { 0.3 } else { -0.3 }).collect();
+    let rest = record(0.01, vec![vec![0.0; 1024], random.steps(1024, 40), current]);
+    let y = respond(&[truth()], &rest, &[]).unwrap().remove(0);
+    let seen = with_signal(&rest, 0, y);
+    let mut wrong = truth();
+    wrong.coefficients[3] *= 1.5;
+    for norm in [Norm::L1, Norm::L2] {
+        let best = lower_bounds(&seen, &wrong, norm).unwrap().into_iter().fold(0.0, f64::max);
+        let error = raw_error(&seen, &wrong, norm);
+        println!("{norm:?}: bound {best:.4}, error {error:.4}");
+        assert!(best > 0.2 * error && best <= error, "{norm:?}");
+    }
+}
+
+fn raw_error(record: &Record, equation: &Equation, norm: Norm) -> f64 {
+    let y = respond(std::slice::from_ref(equation), record, &[]).unwrap().remove(0);
+    let errors = record.signal(0).iter().zip(y).map(|(a, b)| a - b);
+    errors.map(|e| if norm == Norm::L1 { e.abs() } else { e * e }).sum()
+}
+
+#[test]
+fn the_bound_never_exceeds_the_error() {
+    let mut random = Random::new(247);
+    let (mut unstable, mut closest, mut seen) = (0, [0.0_f64; 2], 0);
+    for _ in 0..1500 {
+        let (record, equation) = random_candidate(&mut random);
+        for (i, norm) in [Norm::L1, Norm::L2].into_iter().enumerate() {
+            let error = raw_error(&record, &equation, norm);
+            unstable += usize::from(error > 1e3 * raw_error(&record, &silent(&equation), norm) || error.is_nan());
+            let bounds = lower_bounds(&record, &equation, norm).unwrap();
+            assert!(bounds.iter().all(|b| *b >= 0.0));
+            for bound in bounds {
+                // A run that leaves floating point has no error to compare with.
+                assert!(bound <= error || !error.is_finite(), "bound {bound:e}, error {error:e}, {equation:?}");
+                if error.is_finite() {
+                    closest[i] = closest[i].max(bound / error);
+                    seen += usize::from(bound > 0.1 * error);
+                }
+            }
+        }
+    }
+    println!("{unstable} unstable, closest {closest:?}, {seen} bounds within a factor of 10");
+    assert!(unstable > 500 && seen > 1000);
+}
+
+/// The equation with nothing on its right-hand side: its error is the measurement.
+fn silent(equation: &Equation) -> Equation {
+    Equation { coefficients: vec![0.0; equation.coefficients.len()], ..equation.clone() }
+}
+
+#[test]
+fn bounds_refuse_what_is_no_equation() {
+    let mut random = Random::new(248);
+    let record = data(&mut random, 50, 0.02, 0.0);
+    let mut short = truth();
+    short.coefficients.pop();
+    assert!(matches!(lower_bounds(&record, &short, Norm::L1), Err(Error::Length { .. })));
+    let missing = equation(0, 1.0, &[(7, 0.0, 1.0)]);
+    assert!(matches!(lower_bounds(&record, &missing, Norm::L1), Err(Error::Structure { .. })));
+}
+
+proptest! {
+    #![proptest_config(cases(60))]
+
+    #[test]
+    fn the_bounded_search_is_brute_force(seed in 10_000u64..1_000_000, keep in 1usize..25, threads in 1usize..9) {
+        let problem = random_problem(seed);
+        let brute = problem.run(|o| (o.early_stopping, o.keep, o.threads) = (false, keep, 1));
+        let found = problem.run(|o| (o.keep, o.threads) = (keep, threads));
+        prop_assert_eq!(brute.counts.bounded + brute.counts.stopped, 0);
+        prop_assert_eq!(found.rows.len(), brute.rows.len());
+        for (a, b) in found.rows.iter().zip(&brute.rows) {
+            prop_assert_eq!(a.index, b.index);
+            prop_assert_eq!(a.score.to_bits(), b.score.to_bits());
+            prop_assert_eq!(bits(&a.coefficients), bits(&b.coefficients));
+            prop_assert_eq!(&a.initial, &b.initial);
+        }
+        prop_assert_eq!(problem.run(|o| (o.keep, o.threads) = (keep, 1)), found);
+    }
 }
 
 proptest! {

@@ -8,7 +8,7 @@ use ftlm::error::Error;
 use ftlm::estimate::least_squares;
 use ftlm::estimate::multi_innovation::{Innovation, Rows};
 use ftlm::regressors::Record;
-use ftlm::search::lattice::{LawEquation, LawLattice, MAX_CANDIDATES};
+use ftlm::search::lattice::{LawEquation, LawLattice, MAX_TUPLES};
 use ftlm::search::run::{Control, Criterion, Estimator, Norm, Options};
 use ftlm::search::stage::{search, StageOutcome};
 use ftlm::simulate::{equation_error, respond};
@@ -99,7 +99,7 @@ fn run(records: &[Record], lattice: &LawLattice, options: &Options) -> StageOutc
     let control = Control::default();
     let found = search(records, lattice, &free(), &scales(records), options, &control).unwrap();
     let counts = found.counts;
-    let sum = counts.kept + counts.beaten + counts.stopped + counts.singular + counts.diverged;
+    let sum = counts.kept + counts.beaten + counts.bounded + counts.stopped + counts.singular + counts.diverged;
     assert_eq!(sum, counts.candidates);
     assert_eq!(counts.kept, found.rows.len() as u64);
     assert_eq!(found.distinct.iter().sum::<u64>(), control.total.load(Ordering::Relaxed));
@@ -158,7 +158,7 @@ fn empty_and_oversized_law_lattices_are_refused() {
     }
     let fine: Vec<f64> = (0..100).map(|i| 0.01 * f64::from(i)).collect();
     let found = LawLattice::new(&vec![fine; 5], &two_link(), &INPUTS);
-    assert_eq!(found.err(), Some(Error::LatticeTooLarge { count: 10_000_000_000, limit: MAX_CANDIDATES }));
+    assert_eq!(found.err(), Some(Error::LatticeTooLarge { count: 10_000_000_000, limit: MAX_TUPLES }));
 }
 
 /// Every tuple by the plain way: each equation fitted and run on its own.

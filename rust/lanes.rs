@@ -1,0 +1,34 @@
+//! Vector instructions chosen at run time; the only user of `pulp`.
+//!
+//! Kernels are plain loops over arrays of [`WIDTH`] values that are inlined into [`widest`], where the compiler may use
+//! the widest instructions of the machine at hand. Nothing is contracted to fused multiply-adds and no sum is
+//! reordered, so a kernel gives the same bits whether it runs inside [`widest`] or not.
+
+use pulp::Arch;
+
+/// Values that a kernel works on side by side.
+pub const WIDTH: usize = 8;
+
+/// One value of each of several computations that run side by side.
+pub type Lanes<const L: usize> = [f64; L];
+
+/// Runs `work`, and what is inlined into it, with the widest vector instructions of this machine.
+#[inline(always)]
+pub fn widest<R>(work: impl FnOnce() -> R) -> R {
+    Arch::new().dispatch(work)
+}
+
+/// Σ a·b, summed in [`WIDTH`] lanes that are joined at the end.
+#[inline(always)]
+#[must_use]
+pub fn dot(a: &[f64], b: &[f64]) -> f64 {
+    let mut sums = [0.0; WIDTH];
+    let (a, b) = (a.chunks_exact(WIDTH), b.chunks_exact(WIDTH));
+    let rest: f64 = a.remainder().iter().zip(b.remainder()).map(|(x, y)| x * y).sum();
+    for (a, b) in a.zip(b) {
+        for i in 0..WIDTH {
+            sums[i] += a[i] * b[i];
+        }
+    }
+    sums.iter().sum::<f64>() + rest
+}
