@@ -437,6 +437,11 @@ def _uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
     warnings = []
     if not joint.converged:
         warnings.append("the fit ended before it stood still; its figures are provisional")
+    if not joint.settled:
+        warnings.append(
+            f"at {joint.refinement} pulses a sample the step still moves estimates by over a tenth of their standard "
+            "errors: the model is stiffer than the sampling; sample faster or trust its fast poles less"
+        )
     errors = joint.standard_errors
     for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
         if errors[name] > high - low:

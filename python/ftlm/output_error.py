@@ -52,6 +52,11 @@ STARTS_PER_FILTER = 4
 APART = 0.35
 #: Residual that costs 1 in a coarse fit, as a share of an output's size.
 COARSE_SHARE = 0.01
+#: Evaluations of every coarse fit, then of those that are ahead: one in RUNNERS, but not fewer than FEWEST.
+FIRST_LAP = 15
+SECOND_LAP = 60
+RUNNERS = 3
+FEWEST = 8
 #: Coarse fits that continue on all samples.
 FINALISTS = 3
 #: ... unless their coarse cost exceeds the best one's by this factor.
@@ -60,8 +65,10 @@ CONTENDER = 3.0
 SAME_COST = 1e-3
 #: Weights are settled when no output's residuals differ from their weight by more than this share.
 SETTLED = 0.01
-#: Refinement ends when halving the step moves no estimate by this share of its standard error.
+#: Refinement ends when halving the step moves no estimate, extrapolated to step 0, by this share of its standard error.
 REFINED = 0.1
+#: Discretisation that the first fit on all samples may leave, in standard deviations of the noise.
+NOTICED = 0.3
 #: Finest grid: pulses a sample interval.
 FINEST = 16
 #: Own bounds of orders where the structure gives none.
@@ -87,7 +94,9 @@ class JointFit:
     samples
         Number of residuals.
     refinement
-        Pulses a sample interval.
+        Pulses a sample interval on the finest grid; the estimates are the limit that it and the next coarser one tell.
+    settled
+        Whether halving the step moved no estimate by a tenth of its standard error.
     converged
         Whether neither cost nor parameters moved any more.
     starts
@@ -103,6 +112,7 @@ class JointFit:
     cost: float
     samples: int
     refinement: int
+    settled: bool
     converged: bool
     starts: list[tuple[float, str]]
     residuals: list[dict[str, Floats]]
@@ -576,28 +586,43 @@ def fit_output_error(
     alike = [1.0 / (COARSE_SHARE * size) for size in sizes]
     starts: list[tuple[float, str]] = []
     if start is None:
-        coarse = experiments(alike, thinned=decimation)
+        coarse: list[Any] = []
         attempts = start_attempts(runs, problem, initial, threads)
 
-        def tried(attempt: Attempt) -> Attempt | None:
+        def tried(attempt: Attempt, evaluations: int) -> Attempt | None:
             try:
-                return descend(problem, coarse, signals, initial, attempt, evaluations=60)
+                return descend(problem, coarse, signals, initial, attempt, evaluations=evaluations)
             except FtlmError:
                 # A start whose free run is not finite is no start; if none is left, that is said below.
                 return None
 
-        reached = []
-        with ThreadPoolExecutor(threads) as pool:
-            try:
-                for done, ended in enumerate(pool.map(tried, attempts)):
-                    if ended is not None:
-                        reached.append(ended)
-                    if progress is not None:
-                        progress(done, len(attempts))
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
-        reached.sort(key=lambda a: a.level)
+        def race(runners: list[Attempt], evaluations: int) -> list[Attempt]:
+            ended = []
+            with ThreadPoolExecutor(threads) as pool:
+                try:
+                    for done, attempt in enumerate(pool.map(tried, runners, [evaluations] * len(runners))):
+                        if attempt is not None:
+                            ended.append(attempt)
+                        if progress is not None:
+                            progress(done, len(attempts))
+                except BaseException:
+                    pool.shutdown(cancel_futures=True)
+                    raise
+            return sorted(ended, key=lambda a: a.level)
+
+        def thinned(weights: Sequence[float], every: int) -> list[Any]:
+            return experiments(weights, every, decimation)
+
+        level = 1
+        while True:
+            coarse = thinned(alike, level)
+            reached = race(attempts, FIRST_LAP)
+            if not reached or level >= FINEST or not grid_matters(problem, thinned, alike, initial, reached[0], level):
+                break
+            # The coarse grid has optima of its own: once more from the same starts, on half the step.
+            level *= 2
+        ahead = max(FEWEST, len(reached) // RUNNERS)
+        reached = sorted(race(reached[:ahead], SECOND_LAP) + reached[ahead:], key=lambda a: a.level)
         starts = [(a.level, a.origin) for a in reached]
         kept = distinct(reached)[:FINALISTS]
         finalists = [a for a in kept if a.level <= CONTENDER * kept[0].level]
@@ -613,10 +638,14 @@ def fit_output_error(
             f"no start of {', '.join(structure.outputs)} has a finite free run; "
             "check the signs of the data and the bounds"
         )
-    near = experiments(alike)
+    # Where a step passes faster than the samples see, a grid as coarse as the samples has an optimum of its own.
+    every = 1
+    while every < FINEST and grid_matters(problem, experiments, weights, initial, finalists[0], every):
+        every *= 2
+    near = experiments(alike, every)
     best = min((descend(problem, near, signals, initial, a, evaluations=60) for a in finalists), key=lambda a: a.level)
     best = lowest(problem, near, signals, initial, best, evaluations=120)
-    best = descend(problem, experiments(weights), signals, initial, best, evaluations=120)
+    best = descend(problem, experiments(weights, every), signals, initial, best, evaluations=120)
 
     def weighed(attempt: Attempt, weights: list[float], every: int) -> tuple[Attempt, list[float]]:
         """Descend on a grid until the weights are those of the residuals, pooled over runs."""
@@ -629,32 +658,59 @@ def fit_output_error(
             weights = [w / max(levels[o], 1e-300) for w, o in zip(weights, structure.outputs, strict=True)]
         return attempt, weights
 
-    every = 1
+    def values(attempt: Attempt) -> Floats:
+        return np.array(attempt.orders + attempt.coefficients)
+
     best, weights = weighed(best, weights, every)
-    while refine and every < FINEST:
+    estimate, settled = values(best), not refine
+    while not settled and every < FINEST:
         # On a finer grid residuals may shrink to their noise, so weights follow anew.
-        better, weights = weighed(best, weights, 2 * every)
-        full = experiments(weights, 2 * every)
-        errors = np.sqrt(np.diag(covariance(better, full, structure)))
-        moved = np.abs(np.array(better.orders + better.coefficients) - np.array(best.orders + best.coefficients))
-        best, every = better, 2 * every
-        if np.all(moved <= REFINED * errors):
-            break
+        finer, weights = weighed(best, weights, 2 * every)
+        errors = np.sqrt(np.diag(covariance(finer, experiments(weights, 2 * every), structure)))
+        # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
+        limit = values(finer) + (values(finer) - values(best)) / 3.0
+        settled = bool(np.all(np.abs(limit - estimate) <= REFINED * errors))
+        best, every, estimate = finer, 2 * every, limit
+    low, high = np.array([*problem.bounds, *[(-np.inf, np.inf)] * len(problem.coefficients)]).T
+    estimate = np.clip(estimate, low, high)
     full = experiments(weights, every)
     levels = residual_levels(best, full, structure)
     residuals = split_residuals(best, full, structure)
     return JointFit(
-        orders=dict(zip(problem.orders, best.orders, strict=True)),
-        coefficients=dict(zip(problem.coefficients, best.coefficients, strict=True)),
+        orders=dict(zip(problem.orders, estimate.tolist(), strict=False)),
+        coefficients=dict(zip(problem.coefficients, estimate.tolist()[len(problem.orders) :], strict=True)),
         covariance=covariance(best, full, structure),
         noise={o: levels[o] / w for (o, w) in zip(structure.outputs, weights, strict=True)},
         cost=float(best.found["cost"]),
         samples=len(best.found["residuals"]),
         refinement=every,
+        settled=settled,
         converged=best.found["status"] == "converged",
         starts=starts,
         residuals=residuals,
     )
+
+
+def grid_matters(
+    problem: FreeProblem,
+    experiments: Callable[[Sequence[float], int], list[Any]],
+    weights: Sequence[float],
+    initial: Any,
+    attempt: Attempt,
+    every: int,
+) -> bool:
+    """Whether halving the step moves the simulated samples by a share of their noise that the fit would notice."""
+    signals = problem.structure.signals
+    try:
+        ends = [
+            descend(problem, experiments(weights, e), signals, initial, attempt, evaluations=1).found["residuals"]
+            for e in (every, 2 * every)
+        ]
+    except FtlmError:
+        # Finite on one grid and not on the other: it matters.
+        return True
+    moved: Floats = np.asarray(ends[1]) - np.asarray(ends[0])
+    return bool(np.mean(moved**2) > NOTICED**2)
 
 
 def first_noise(runs: Sequence[Run], structure: Structure) -> dict[str, float]:
