@@ -43,6 +43,7 @@ test-slow: $(VENV)/.built
 bench: $(VENV)/.built
 	cargo bench --bench kernels
 	$(BIN)/python benches/search.py
+	$(BIN)/python benches/rig.py
 
 wheel: $(VENV)/.tools
 	rm -rf wheels

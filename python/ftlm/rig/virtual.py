@@ -117,10 +117,10 @@ class ArmParameters:
     stage2: StageParameters
     coupling: float = 1.0
     inertia_ratio: float = 0.00301955 / 0.170434
-    strain_noise: tuple[float, float] = (0.004, 0.004)
-    current_noise: tuple[float, float] = (0.003, 0.003)
+    strain_noise: tuple[float, float] = (0.015, 0.0134)
+    current_noise: tuple[float, float] = (0.0012, 0.0012)
     strain_bias: tuple[float, float] = (0.12, -0.2)
-    current_bias: tuple[float, float] = (0.005, 0.01)
+    current_bias: tuple[float, float] = (0.006, 0.0105)
     bits: int = 16
     encoder_scale: tuple[float, float] = ENCODER_SCALE
     travel: tuple[float, float] = (math.pi / 2, math.pi / 2)
@@ -228,13 +228,20 @@ _STAGE2 = StageParameters(
     gamma=0.9, beta=0.2, mu=0.8, coulomb=0.1,
 )  # fmt: skip
 #: "effective": the maker's effective parameters with fractional damping, friction, coupling and noise. "linear": the
-#: same two stages apart, without friction, noise and quantisation of the gauges: Plants A and A2.
+#: same two stages apart, without friction, noise and quantisation of the gauges: Plants A and A2. "measured":
+#: stiffness, damping, torque and friction fitted to the spectra of two measured runs of the real arm (docs/rig.md),
+#: whose hubs are heavier and whose first link is softer than the maker's parameters say.
 SETS: dict[str, ArmParameters] = {
     "effective": ArmParameters(_STAGE1, _STAGE2),
     "linear": ArmParameters(
         replace(_STAGE1, coulomb=0.0), replace(_STAGE2, coulomb=0.0), coupling=0.0,
         strain_noise=(0.0, 0.0), current_noise=(0.0, 0.0), strain_bias=(0.0, 0.0), current_bias=(0.0, 0.0), bits=0,
         name="linear",
+    ),
+    "measured": ArmParameters(
+        replace(_STAGE1, a=208.0, b=-29.5, d=2.56, g=51.7, coulomb=0.18),
+        replace(_STAGE2, a=2190.0, b=-641.0, d=18.8, g=547.0, coulomb=0.01),
+        name="measured",
     ),
 }  # fmt: skip
 
