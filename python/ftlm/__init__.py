@@ -80,3 +80,12 @@ __all__ = [
     "search_orders",
     "simulate",
 ]
+
+
+def __getattr__(name: str) -> object:
+    """`ftlm.plot`, imported when it is first asked for: drawing needs more than everything else."""
+    if name == "plot":
+        from importlib import import_module  # noqa: PLC0415
+
+        return import_module("ftlm.plot")
+    raise AttributeError(f"module 'ftlm' has no attribute {name!r}")

@@ -97,6 +97,14 @@ class Tool(StrEnum):
     json = "json"
 
 
+class Drawing(StrEnum):
+    """Figures of a saved model."""
+
+    fit = "fit"
+    residuals = "residuals"
+    bode = "bode"
+
+
 class Rows(StrEnum):
     """Coordinates of the rows of the recursion."""
 
@@ -525,9 +533,7 @@ def identify(
     if out is not None:
         found.model.save(out, force=force)
     if report is not None:
-        from ftlm.report.page import identification_page  # noqa: PLC0415
-
-        identification_page(found, report, validation=others or None, force=force)
+        found.report(report, validation=others or None, force=force)
     show(found, as_json=as_json)
     if others and not as_json:
         print(f"\nvalidation on {', '.join(r.name for r in others)}\n{found.validate(others)}")
@@ -695,6 +701,82 @@ def simulate(
         print(json.dumps({"written": out, "rows": found.length, "outputs": list(found.outputs)}, ensure_ascii=False))
     else:
         print(f"{found.length} rows of {', '.join(found.outputs)} written to {out}")
+
+
+@app.command()
+@guarded
+def report(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="A saved model.")],
+    out: Annotated[str, typer.Option("-o", "--out", metavar="HTML", help="Page to write.")],
+    validation: Annotated[
+        list[str] | None, typer.Option("--validation", metavar="FILE", help="A run that the model has not seen.")
+    ] = None,
+    time: Time = None,
+    sampling: Step = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    units: Units = None,
+    columns: Columns = None,
+    between: Between = None,
+    sliced: Slice = None,
+    resample: Resample = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write the report of a saved model, with validation runs: one page that opens offline."""
+    from ftlm.report.page import model_page  # noqa: PLC0415
+
+    check_writable([out], force=force)
+    loaded = ftlm.load_model(model)
+    options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
+    runs = load_runs(validation, sliced, **options) if validation else None
+    page = model_page(loaded, out, validation=runs, force=force)
+    print(json.dumps({"written": str(page)}, ensure_ascii=False) if as_json else f"written: {page}")
+
+
+@app.command()
+@guarded
+def plot(
+    model: Annotated[str, typer.Argument(metavar="MODEL", help="A saved model.")],
+    out: Annotated[str, typer.Option("-o", "--out", metavar="FILE", help="Figure to write: .png, .pdf or .svg.")],
+    files: Annotated[list[str] | None, typer.Argument(metavar="[RUN]...", help="Runs; bode needs none.")] = None,
+    kind: Annotated[Drawing, typer.Option("--kind", help="What to draw.")] = Drawing.fit,
+    time: Time = None,
+    sampling: Step = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    units: Units = None,
+    columns: Columns = None,
+    between: Between = None,
+    sliced: Slice = None,
+    resample: Resample = None,
+    force: Force = False,
+) -> None:
+    """Draw a saved model for a paper: its fit or residual tests on runs, or its Bode plot."""
+    import io  # noqa: PLC0415
+
+    from ftlm import plot as drawings  # noqa: PLC0415
+    from ftlm.models import write_atomically  # noqa: PLC0415
+
+    check_writable([out], force=force)
+    suffix = Path(out).suffix.removeprefix(".").lower()
+    if suffix not in ("png", "pdf", "svg"):
+        raise ModelError(f"{out} ends in {suffix or 'nothing'!r}; write .png, .pdf or .svg")
+    loaded = ftlm.load_model(model)
+    options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
+    runs = load_runs(files, sliced, **options) if files else []
+    if not runs and kind is not Drawing.bode:
+        raise ModelError(f"--kind {kind.value} needs at least one run; give files")
+    if kind is Drawing.bode:
+        figure = drawings.bode(loaded)
+    elif kind is Drawing.fit:
+        figure = drawings.fit(loaded, runs)
+    else:
+        figure = drawings.residuals(loaded.resid(runs))
+    data = io.BytesIO()
+    figure.savefig(data, format=suffix, dpi=200)
+    write_atomically(out, data.getvalue(), force=force)
+    print(f"written: {out}")
 
 
 @app.command()

@@ -34,7 +34,9 @@ from ftlm.residuals import (
 from ftlm.validation import Comparison, Metrics, as_runs, compare, validation_warnings
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Mapping, Sequence
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -52,6 +54,29 @@ INSEPARABLE = 0.995
 ROUNDING = 3e-5
 #: Two coefficients further apart than this share do not obey the coefficient law.
 LAW_BROKEN = 0.05
+
+
+@dataclass(frozen=True)
+class Task:
+    """What was asked for: from it, reports draw what the result alone does not hold.
+
+    Parameters
+    ----------
+    runs
+        The runs.
+    structure
+        What was identified, its free orders and coefficients still free.
+    lattice
+        Of the order search; None for the default.
+    """
+
+    runs: tuple[Run, ...]
+    structure: Structure
+    lattice: Lattice | None = None
+
+    def lattice_of(self, part: Structure) -> Lattice:
+        """The lattice of one searched part of the structure."""
+        return _lattice_of(self.lattice, part) or Lattice()
 
 
 @dataclass(frozen=True)
@@ -79,6 +104,8 @@ class Identification:
         Residual tests on the runs it was identified from; None where these are too short.
     information
         Information criteria, orders counted as parameters; None where there are no residuals.
+    task
+        The runs and the structure as they were given.
     """
 
     model: Model
@@ -90,6 +117,7 @@ class Identification:
     joint: JointFit | None = None
     residuals: Residuals | None = None
     information: InformationCriteria | None = None
+    task: Task | None = field(default=None, repr=False)
 
     @property
     def orders(self) -> dict[str, float]:
@@ -152,6 +180,39 @@ class Identification:
         found = compare(self.model, others)
         words = [*found.warnings, *validation_warnings(self.comparison, found), *discretisation(self.model, found)]
         return replace(found, warnings=tuple(dict.fromkeys(words)))
+
+    def report(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        validation: Run | Sequence[Run] | None = None,
+        force: bool = False,
+    ) -> Path:
+        """Write everything about this result as one HTML file that opens offline.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        validation
+            Runs that the model was not identified from; without any, the page says that it was not validated.
+        force
+            Overwrite an existing file.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        DataError
+            A validation run that does not fit the model; the file exists and ``force`` is not set, or cannot be
+            written.
+        """
+        from ftlm.report.page import identification_page  # noqa: PLC0415 — pages read results
+
+        return identification_page(self, path, validation=validation, force=force)
 
     def to_frame(self) -> Any:
         """Orders and coefficients as a pandas frame: value, standard error, 95 % interval, stated value by name."""
@@ -344,8 +405,9 @@ def identify(
     used = {**settings.to_dict(), "m": pulses, "initial": initial}
     model = _kept_with(model, method, found, comparison, criteria, warnings)
     return Identification(
-        model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)), residuals=tests, information=criteria
-    )
+        model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)),
+        residuals=tests, information=criteria, task=Task(tuple(found), structure, lattice),
+    )  # fmt: skip
 
 
 def _kept_with(
@@ -428,8 +490,9 @@ def _identify_output_error(
     warnings += [] if tests is None else [w for w in residual_warnings(tests, floor=ROUNDING) if "not white" not in w]
     model = _kept_with(model, "output-error", runs, comparison, criteria, warnings, joint, problem)
     return Identification(
-        model, "output-error", comparison, {}, used, tuple(dict.fromkeys(warnings)), joint, tests, criteria
-    )
+        model, "output-error", comparison, {}, used, tuple(dict.fromkeys(warnings)), joint, tests, criteria,
+        Task(tuple(runs), structure),
+    )  # fmt: skip
 
 
 def _uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-__all__ = ["Comparison", "Metrics", "compare", "metrics", "near_identity", "validation_warnings"]
+__all__ = ["Comparison", "Metrics", "compare", "lost_fits", "metrics", "near_identity", "validation_warnings"]
 
 #: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
 NEAR_IDENTITY = 0.25
@@ -318,13 +318,18 @@ def validation_warnings(own: Comparison, found: Comparison) -> list[str]:
                     f"{other}: its outputs are those of {name}, which the model was identified from; "
                     "it validates nothing"
                 )
+    return warnings + lost_fits({n: f.fit for n, f in own.output_error.items()}, found)
+
+
+def lost_fits(before: Mapping[str, float], found: Comparison) -> list[str]:
+    """Name outputs whose fit on other runs is far below that on the estimation data."""
+    warnings = []
     for other, _, figures in found.per_run:
         for output, f in figures.items():
-            before = own.output_error[output].fit
             # Negated so that a fit that is not a number counts as lost.
-            if np.isfinite(before) and not f.fit >= before - LOST:
+            if np.isfinite(before.get(output, np.nan)) and not f.fit >= before[output] - LOST:
                 warnings.append(
-                    f"{other}: the fit of {output} falls from {before:.3g} % on the estimation data to {f.fit:.3g} %; "
-                    "the model describes the data it was identified from better than the machine"
+                    f"{other}: the fit of {output} falls from {before[output]:.3g} % on the estimation data to "
+                    f"{f.fit:.3g} %; the model describes the data it was identified from better than the machine"
                 )
     return warnings

@@ -146,6 +146,31 @@ def test_export_writes_for_other_tools_and_overwrites_nothing(folder: Path) -> N
         assert refused.returncode == 2, band
 
 
+def test_a_report_of_a_saved_model(folder: Path) -> None:
+    ftlm.Model(ftlm.equation("D^1.5 y = -2.0 D^0.5 y - 4.0 y + 3.0 u")).save(folder / "given.json", force=True)
+    words = ("report", "given.json", "--validation", "sine.csv", "-o", "given.html")
+    ran = ftlm_command(*words, cwd=folder)
+    assert ran.returncode == 0, ran.stderr
+    assert "written: given.html" in ran.stdout
+    text = (folder / "given.html").read_text("utf-8")
+    assert "validation: sine" in text
+    again = ftlm_command(*words, cwd=folder)
+    assert (again.returncode, "--force" in again.stderr) == (3, True)
+    assert ftlm_command(*words, "--force", "--json", cwd=folder).returncode == 0
+    alone = ftlm_command("report", "given.json", "-o", "alone.html", cwd=folder)
+    assert alone.returncode == 0, alone.stderr
+    assert "No validation run was given" in (folder / "alone.html").read_text("utf-8")
+    missing = ftlm_command("report", "given.json", "-o", "nowhere/x.html", cwd=folder)
+    assert (missing.returncode, "is no folder; make it first" in missing.stderr) == (3, True)
+    np.savetxt(folder / "other.csv", np.ones((60, 2)).cumsum(axis=0), delimiter=",", header="t,w", comments="")
+    refused = ftlm_command(
+        "report", "given.json", "--validation", "other.csv", "--time", "t", "-y", "w", "-o", "x.html", cwd=folder
+    )
+    assert refused.returncode == 3
+    assert "has no signal" in refused.stderr
+    assert not (folder / "x.html").exists()
+
+
 def test_inspect_and_doctor_speak(folder: Path) -> None:
     inspected = ftlm_command("inspect", "square.csv", cwd=folder)
     assert inspected.returncode == 0

@@ -1,7 +1,18 @@
 """Reports: one HTML file with tables and charts that opens offline, and the same tables for a terminal."""
 
-from ftlm.report.figures import Figure, comparison_charts, error_chart, line_chart, pulse_times, trace_chart
-from ftlm.report.page import Section, identification_page, write_page
+from ftlm.report.figures import (
+    Figure,
+    bode_charts,
+    comparison_charts,
+    error_chart,
+    heat_map,
+    line_chart,
+    pulse_times,
+    residual_charts,
+    trace_chart,
+)
+from ftlm.report.landscape import Landscape, landscape
+from ftlm.report.page import Section, identification_page, model_page, write_page
 from ftlm.report.tables import (
     Exact,
     PaperRow,
@@ -22,21 +33,27 @@ from ftlm.report.tables import (
 __all__ = [
     "Exact",
     "Figure",
+    "Landscape",
     "PaperRow",
     "Section",
     "Table",
+    "bode_charts",
     "comparison_charts",
     "equation_html",
     "error_chart",
     "errors_table",
+    "heat_map",
     "identification_page",
     "initial_terms_table",
+    "landscape",
     "line_chart",
+    "model_page",
     "paper_row",
     "paper_table",
     "paper_table_text",
     "parameter_table",
     "pulse_times",
+    "residual_charts",
     "search_summary",
     "search_top",
     "settings_table",

@@ -12,6 +12,9 @@ import numpy as np
 from markupsafe import Markup
 
 from ftlm.errors import DataError
+from ftlm.frequency import frequency_response, response_deviation, response_inputs, transfer_functions
+from ftlm.output_error import NORMAL_95
+from ftlm.records import COULOMB
 from ftlm.report.tables import number, symbol
 
 if TYPE_CHECKING:
@@ -20,19 +23,28 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike, NDArray
 
     from ftlm.identification import Trace
+    from ftlm.models import Model
+    from ftlm.report.landscape import Landscape
+    from ftlm.residuals import Residuals
     from ftlm.validation import Comparison
 
     Floats = NDArray[np.float64]
 
 __all__ = [
+    "BodeCurve",
     "Figure",
     "Ticks",
+    "bode_charts",
+    "bode_curves",
     "chart_css",
     "comparison_charts",
     "decimate",
     "error_chart",
+    "heat_map",
     "line_chart",
     "pulse_times",
+    "residual_charts",
+    "response_frequencies",
     "ticks",
     "trace_chart",
 ]
@@ -49,10 +61,15 @@ TINY = 1e-290
 STRAY = 3.0
 #: Coordinates inside the plot are whole tenths of a pixel.
 SUB = 10
+#: Width of charts that stand side by side.
+SMALL = 520
 #: Text at 12 px: width of a letter, height of a line.
 LETTER, LINE = 6.7, 15
 #: Letters of a label beside its line; the legend above the narrow chart has room for more.
 MOST_LETTERS = 22
+
+#: A natural logarithm of a gain in decibels.
+DECIBEL = 20.0 / math.log(10.0)
 
 #: (light, dark, dashes). Vermilion, blue, green, purple after Okabe and Ito, darkened to a contrast of 3:1 on white and
 #: lightened for the dark; dashes tell lines apart without any colour. The first is the neutral line.
@@ -65,6 +82,9 @@ LINES = (
     ("#7a6300", "#e6cb4f", "14 4"),
 )
 NEUTRAL = "measured"
+#: From best to worst, after viridis reversed in lightness: dark is good on white, and every step differs in lightness.
+HEAT = ("#440154", "#472c7a", "#3b518b", "#2c718e", "#21908d", "#27ad81", "#5cc863", "#aadc32", "#fde725")
+NO_SCORE = "#9aa3ad"
 
 
 @dataclass(frozen=True)
@@ -99,11 +119,12 @@ class Figure:
 
 @dataclass(frozen=True)
 class Ticks:
-    """Round numbers on an axis: their values, their labels, and the factor that all labels leave out, such as ×10⁻³."""
+    """Round numbers on an axis: values, labels, and the power of ten that all labels leave out, as ×10⁻³ and as -3."""
 
     values: list[float]
     labels: list[str]
     factor: str = ""
+    power: int = 0
 
 
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -135,7 +156,7 @@ def ticks(low: float, high: float, most: int = 6) -> Ticks:
     shift = 0 if 1e-3 <= largest < 1e5 else 3 * math.floor(math.log10(largest) / 3)
     decimals = max(0, shift - exponent)
     labels = [f"{Decimal(m).scaleb(exponent - shift):.{decimals}f}".replace("-", "−") for m in multiples]
-    return Ticks(values, labels, f"×10{str(shift).translate(_SUPERSCRIPTS)}" if shift else "")
+    return Ticks(values, labels, f"×10{str(shift).translate(_SUPERSCRIPTS)}" if shift else "", shift)
 
 
 def _log_ticks(low: float, high: float, most: int) -> Ticks:
@@ -222,6 +243,22 @@ class _Line:
     y: Floats  # logarithms on a logarithmic axis; not a number where nothing can be drawn
 
 
+@dataclass(frozen=True)
+class _Shade:
+    style: int
+    x: Floats
+    low: Floats
+    high: Floats
+
+
+@dataclass(frozen=True)
+class _How:
+    log_x: bool
+    log_y: bool
+    stems: bool
+    shades: tuple[_Shade, ...]
+
+
 def line_chart(
     x: ArrayLike,
     lines: Sequence[tuple[str, ArrayLike]],
@@ -231,9 +268,12 @@ def line_chart(
     y_label: str,
     width: int = 720,
     height: int = 260,
+    log_x: bool = False,
     log_y: bool = False,
     caption: str = "",
     points: int = POINTS,
+    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (),
+    stems: bool = False,
 ) -> Figure:
     """Chart of one or several lines over a common axis.
 
@@ -242,18 +282,22 @@ def line_chart(
     x
         Shape (N,).
     lines
-        (name, values of shape (N,)). A line whose name begins with "measured" is neutral and lies beneath; the others
-        are coloured and dashed in the order given.
+        (name, values of shape (N,)); a lone line may do without a name. A line whose name begins with "measured" is
+        neutral and lies beneath; the others are coloured and dashed in the order given.
     title, x_label, y_label
         Text, with units.
     width, height
         Of the wide drawing, in pixels; it scales.
-    log_y
-        Logarithmic vertical axis.
+    log_x, log_y
+        Logarithmic axes.
     caption
         Sentence below; what could not be drawn is added to it.
     points
         Most points of a line.
+    bands
+        (low, high) of a shade behind the first lines, in their order; each of shape (N,).
+    stems
+        Draw every value as a stem from 0 instead of a line.
 
     Returns
     -------
@@ -265,27 +309,59 @@ def line_chart(
     DataError
         No line, or a line whose length is not that of x.
     """
-    drawn, notes = _checked(x, lines, x_label, log_y)
-    x_low, x_high = _snapped(*_limits([drawn[0].x[np.isfinite(drawn[0].x)]], 0.0))
-    y_low, y_high, strays = _y_limits(drawn)
+    drawn, notes = _checked(x, lines, x_label, log_x, log_y)
+    x_low, x_high = _limits([drawn[0].x[np.isfinite(drawn[0].x)]], 0.02 if stems else 0.0)
+    if not (log_x or stems):
+        x_low, x_high = _snapped(x_low, x_high)
+    shades = [_shade(drawn[k], low, high, log_y) for k, (low, high) in enumerate(bands[: len(drawn)])]
+    around = [_Line("", 0, b.x, edge) for b in shades for edge in (b.low, b.high)]
+    y_low, y_high, strays = _y_limits(drawn if stems or not around else [*drawn, *_unnamed(around)])
+    if stems:
+        around_zero = [0.0, *(float(np.nanmax(b.high)) for b in shades), *(float(np.nanmin(b.low)) for b in shades)]
+        y_low, y_high = min(y_low, *(1.1 * v for v in around_zero)), max(y_high, *(1.1 * v for v in around_zero))
     notes += [f"{name} leaves the axis ({place})." for name, place in _in_words(strays, log_y)]
     about = f"{y_label} against {x_label}" + ("; logarithmic vertical axis" if log_y else "")
+    about += "; logarithmic horizontal axis" if log_x else ""
     described = f"Line chart. {about}. " + " ".join(_described(line, log_y) for line in drawn)
     frame = (x_low, x_high, y_low, y_high)
     words = _Words(title, described, x_label, y_label)
-    wide = _drawing(drawn, frame, words, size=(width, height), log_y=log_y, points=points, narrow=False)
+    how = _How(log_x, log_y, stems, tuple(shades))
+    wide = _drawing(drawn, frame, words, how, size=(width, height), points=points, narrow=False)
     half = max(4, points // 2)
-    narrow = _drawing(drawn, frame, words, size=(NARROW, 240), log_y=log_y, points=half, narrow=True)
+    narrow = _drawing(drawn, frame, words, how, size=(NARROW, 240), points=half, narrow=True)
     return Figure(title, wide, narrow, " ".join(([caption] if caption else []) + notes))
 
 
+def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
+    """Edges of a band behind a line; where an edge is not finite there is none."""
+    edges = []
+    for edge in (low, high):
+        values = np.array(edge, dtype=np.float64)
+        if values.shape != line.x.shape:
+            raise DataError(f"a band of {line.name!r} has shape {values.shape}, x {line.x.shape}; give one length")
+        if log_y:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                values = np.log10(values)
+        values[~(np.isfinite(values) & (np.abs(values) < HUGE))] = np.nan
+        edges.append(values)
+    return _Shade(line.style, line.x, *edges)
+
+
+def _unnamed(lines: list[_Line]) -> list[_Line]:
+    """Lines that widen an axis and are never told to have left it."""
+    return [_Line(line.name, 1, line.x, line.y) for line in lines if np.isfinite(line.y).any()]
+
+
 def _checked(
-    x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], x_label: str, log_y: bool
+    x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], x_label: str, log_x: bool, log_y: bool
 ) -> tuple[list[_Line], list[str]]:
     """Lines ready to draw, and in words what of them cannot be drawn."""
     if not lines:
         raise DataError("a chart needs at least one line; give (name, values) pairs")
-    across = np.asarray(x, dtype=np.float64)
+    across = np.array(x, dtype=np.float64)
+    if log_x:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            across = np.where(across > 0, np.log10(np.where(across > 0, across, 1.0)), np.nan)
     drawn, notes, coloured = [], [], 0
     for name, values in lines:
         y = np.array(values, dtype=np.float64)
@@ -357,7 +433,7 @@ def _described(line: _Line, log_y: bool) -> str:
         return f"{line.name}: no value that can be drawn."
     ends = [float(np.min(finite)), float(np.max(finite)), float(finite[-1])]
     low, high, last = (number(10.0**v if log_y else v, 4) for v in ends)
-    return f"{line.name}: from {low} to {high}, at the end {last}."
+    return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
 
 
 def _text_width(text: str) -> float:
@@ -372,21 +448,22 @@ def _drawing(
     lines: list[_Line],
     frame: tuple[float, float, float, float],
     words: _Words,
+    how: _How,
     *,
     size: tuple[int, int],
-    log_y: bool,
     points: int,
     narrow: bool,
 ) -> Markup:
     width, height = size
     x_low, x_high, y_low, y_high = frame
-    across = ticks(x_low, x_high, 4 if narrow else 9)
-    upward = _log_ticks(y_low, y_high, 6) if log_y else ticks(y_low, y_high, 5)
-    legend = _legend(lines, width) if narrow else []
+    across = _log_ticks(x_low, x_high, 4 if narrow else 9) if how.log_x else ticks(x_low, x_high, 4 if narrow else 9)
+    upward = _log_ticks(y_low, y_high, 6) if how.log_y else ticks(y_low, y_high, 5)
+    legend = _legend([line for line in lines if line.name], width) if narrow else []
     left = max(30.0, 10 + max(_text_width(t) for t in upward.labels))
-    side = max(_text_width(_short(line.name, MOST_LETTERS)) for line in lines)
+    named = [line for line in lines if line.name]
+    side = max((_text_width(_short(line.name, MOST_LETTERS)) for line in named), default=0.0)
     # Beside the lines: a gap, a swatch, the label.
-    right = 14.0 if narrow else 34 + side
+    right = 14.0 if narrow or not named else 34 + side
     top = 26.0 + (LINE * (legend[-1][2] + 1) + 5 if legend else 0)
     bottom = 40.0
     if narrow:
@@ -395,11 +472,11 @@ def _drawing(
     plot = _Plot(left, top, w, h, frame)
 
     out = [
-        Markup('<svg class="chart {}" role="img" viewBox="0 0 {} {}" width="{}" height="{}">').format(
-            "narrow" if narrow else "wide", width, height, width, height
+        Markup('<svg class="chart {}" role="img" viewBox="0 0 {} {}" width="{}" height="{}"{}>').format(
+            "narrow" if narrow else "wide", width, height, width, height, _zoomable(plot, how, across, upward)
         ),
         Markup("<title>{}</title><desc>{}</desc>").format(words.title, words.described),
-        Markup('<g fill="none" stroke="currentColor" stroke-opacity="0.14">'),
+        Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'),
     ]
     out += [Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>').format(left, float(plot.down(v)), w) for v in upward.values]
     out += [Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>').format(float(plot.across(v)), top, h) for v in across.values]
@@ -408,21 +485,38 @@ def _drawing(
     out.append(axes.format(left, top, h, w))
     # The inner drawing cuts off what leaves the axes and has whole numbers for coordinates.
     out.append(
-        Markup('<svg x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" viewBox="0 0 {:.0f} {:.0f}">').format(
-            left, top, w, h, w * SUB, h * SUB
-        )
+        Markup(
+            '<svg class="plot" preserveAspectRatio="none" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" '
+            'viewBox="0 0 {:.0f} {:.0f}">'
+        ).format(left, top, w, h, w * SUB, h * SUB)
     )
-    for line in sorted(lines, key=lambda item: item.style != 0):
-        d = _path(line, plot, points)
+    for shade in how.shades:
+        d = _outline(shade, plot, points)
         if d:
-            out.append(Markup('<path {} d="{}"/>').format(_stroke(line.style, SUB), d))
+            out.append(
+                Markup('<path class="shade{}" fill="{}" fill-opacity="0.2" d="{}"/>').format(
+                    shade.style, LINES[shade.style][0], d
+                )
+            )
+    if how.stems:
+        zero = float(plot.down(0.0) - plot.top) * SUB
+        out.append(
+            Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {:.0f}h{:.0f}"/>').format(
+                zero, w * SUB
+            )
+        )
+    for line in sorted(lines, key=lambda item: item.style != 0):
+        d = _stem_path(line, plot) if how.stems else _path(line, plot, points)
+        if d:
+            out.append(Markup('<path vector-effect="non-scaling-stroke" {} d="{}"/>').format(_stroke(line.style), d))
     out.append(Markup("</svg>"))
 
-    out.append(Markup('<g font-size="12" fill="currentColor">'))
+    out.append(Markup('<g font-size="12" fill="currentColor"><g class="ticks">'))
     for v, label in zip(upward.values, upward.labels, strict=True):
         out.append(_text(left - 6, float(plot.down(v)) + 4, label, "end"))
     for v, label in zip(across.values, across.labels, strict=True):
         out.append(_text(float(plot.across(v)), top + h + 16, label, "middle"))
+    out.append(Markup("</g>"))
     room = int((width - 8) / LETTER)
     y_text = f"{words.y_label} ({upward.factor})" if upward.factor else words.y_label
     x_text = f"{words.x_label} ({across.factor})" if across.factor else words.x_label
@@ -430,16 +524,50 @@ def _drawing(
     out.append(_text(left + w, top + h + 34, _short(x_text, room), "end"))
     if not any(np.isfinite(line.y).any() for line in lines):
         out.append(_text(left + w / 2, top + h / 2, "no finite value to draw", "middle"))
-    out += _legend_marks(legend, lines) if narrow else _end_labels(lines, plot)
+    if named:
+        out += _legend_marks(legend, named) if narrow else _end_labels(named, plot)
     out.append(Markup("</g></svg>"))
     return Markup("").join(out)
 
 
-def _stroke(style: int, scale: int = 1) -> Markup:
+def _zoomable(plot: _Plot, how: _How, across: Ticks, upward: Ticks) -> Markup:
+    """What the page's script needs to zoom: data at the edges, place of the plot, powers of ten left out of labels."""
+    if how.log_x or how.log_y or how.stems:
+        return Markup("")
+    frame = " ".join(repr(float(v)) for v in plot.frame)
+    place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
+    return Markup(' data-frame="{}" data-plot="{}" data-powers="{} {}"').format(
+        frame, place, across.power, upward.power
+    )
+
+
+def _outline(shade: _Shade, plot: _Plot, points: int) -> str:
+    """Closed path around a band where both its edges are finite."""
+    good = np.flatnonzero(np.isfinite(shade.low) & np.isfinite(shade.high) & np.isfinite(shade.x))
+    if good.size < 2:
+        return ""
+    good = good[:: max(1, good.size // points)]
+    xs = np.rint((plot.across(shade.x[good]) - plot.left) * SUB).astype(np.int64)
+    edges = [np.clip(plot.down(e[good]) - plot.top, -plot.height, 2 * plot.height) for e in (shade.high, shade.low)]
+    top, bottom = (np.rint(e * SUB).astype(np.int64) for e in edges)
+    there = [f"{x} {y}" for x, y in zip(xs.tolist(), top.tolist(), strict=True)]
+    back = [f"{x} {y}" for x, y in zip(xs[::-1].tolist(), bottom[::-1].tolist(), strict=True)]
+    return "M" + "L".join([*there, *back]) + "Z"
+
+
+def _stem_path(line: _Line, plot: _Plot) -> str:
+    kept = np.flatnonzero(np.isfinite(line.y) & np.isfinite(line.x))
+    xs = np.rint((plot.across(line.x[kept]) - plot.left) * SUB).astype(np.int64)
+    ys = np.rint((plot.down(line.y[kept]) - plot.top) * SUB).astype(np.int64)
+    zero = round(float(plot.down(0.0) - plot.top) * SUB)
+    return "".join(f"M{x} {zero}V{y}" for x, y in zip(xs.tolist(), ys.tolist(), strict=True))
+
+
+def _stroke(style: int) -> Markup:
     light, _, dashes = LINES[style]
     # The measured line is wide enough to show on both sides of one that follows it exactly.
-    thickness = (3.4 if style == 0 else 1.5) * scale
-    dashed = " ".join(f"{float(d) * scale:g}" for d in dashes.split())
+    thickness = 3.4 if style == 0 else 1.5
+    dashed = dashes
     dash = Markup(' stroke-dasharray="{}"').format(dashed) if dashed else Markup("")
     # The page's style sheet replaces the colour in the dark; the attribute serves wherever there is no page.
     return Markup(
@@ -519,7 +647,7 @@ def chart_css() -> Markup:
     """Return the rules that give the lines their colours by the page's variables, light and dark."""
     light = "".join(f"--line{i}:{c};" for i, (c, _, _) in enumerate(LINES))
     dark = "".join(f"--line{i}:{c};" for i, (_, c, _) in enumerate(LINES))
-    rules = "".join(f".line{i}{{stroke:var(--line{i})}}" for i in range(len(LINES)))
+    rules = "".join(f".line{i}{{stroke:var(--line{i})}}.shade{i}{{fill:var(--line{i})}}" for i in range(len(LINES)))
     return Markup(
         f":root{{{light}}}@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}{rules}"  # our constants
     )
@@ -631,3 +759,216 @@ def trace_chart(traces: Sequence[tuple[str, Trace]], *, title: str) -> Figure:
 def _with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
     unit = (units or {}).get(name, "")
     return f"{text} [{unit}]" if unit else text
+
+
+# ------------------------------------------------------------------------------------------------ residuals, frequency
+
+
+def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
+    """Autocorrelation and cross-correlations of the residuals of every output, with their 99 % bands.
+
+    Parameters
+    ----------
+    tests
+        From :func:`ftlm.resid`.
+    label
+        What the data were to the model, such as "validation".
+    """
+    figures = []
+    suffix = f", {label}" if label else ""
+    for output, found in tests.outputs.items():
+        drawn = [("itself", found.whiteness), *found.inputs.items()]
+        for name, test in drawn:
+            own = name == "itself"
+            # Lag 0 of an autocorrelation is 1 and says nothing.
+            keep = test.lags != 0 if own else np.ones(test.lags.size, dtype=bool)
+            lags, values = test.lags[keep].astype(np.float64), test.values[keep]
+            band = np.full(lags.size, test.band)
+            words = "could be white noise" if own else f"could be independent of earlier {symbol(name)}"
+            words = words if test.passed else words.replace("could", "cannot")
+            other = "itself" if own else symbol(name)
+            figures.append(
+                line_chart(
+                    lags, [("", values)], stems=True, width=SMALL, height=190, bands=[(-band, band)],
+                    title=f"Residual of {symbol(output)} with {other}{suffix}",
+                    x_label="lag [samples]", y_label="correlation",
+                    caption=f"Shade: 99 % band. The residual {words} (99 %).",
+                )
+            )  # fmt: skip
+    return figures
+
+
+def response_frequencies(model: Model, step: float | None = None, duration: float | None = None) -> Floats:
+    """Frequencies at which a model is worth looking at: from one period in a record to half the sampling rate."""
+    if step is not None and duration is not None:
+        return np.geomspace(2 * math.pi / duration, math.pi / step, 240)
+    corner = []
+    for pairs in transfer_functions(model).denominator.values():
+        (top, high), (bottom, low) = pairs[0], pairs[-1]
+        corner.append(abs(bottom / top) ** (1 / (high - low)) if high > low else 1.0)
+    middle = float(np.exp(np.mean(np.log(corner))))
+    return np.geomspace(middle / 100, middle * 100, 240)
+
+
+def bode_charts(model: Model, w: ArrayLike | None = None) -> list[Figure]:
+    """Gain and phase of every output from every input that is not modelled, with 95 % bands where they are known.
+
+    Parameters
+    ----------
+    model
+        The model.
+    w
+        Frequencies [rad/s]; by default around the model's own.
+    """
+    omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
+    curves = bode_curves(model, omega)
+    figures = []
+    for curve in curves:
+        title = f"{symbol(curve.output)} from {symbol(curve.input)}"
+        shade = "Shade: 95 % band, from the covariance of the fit." if curve.gain_spread is not None else ""
+        for kind, values, spread, label in (
+            ("gain", curve.gain, curve.gain_spread, "gain [dB]"),
+            ("phase", curve.phase, curve.phase_spread, "phase [degrees]"),
+        ):
+            bands = [] if spread is None else [(values - spread, values + spread)]
+            figures.append(
+                line_chart(
+                    omega, [("", values)], log_x=True, bands=bands, title=f"{title}: {kind}", width=SMALL, height=220,
+                    x_label="frequency [rad/s]", y_label=label, caption=shade,
+                )
+            )  # fmt: skip
+    return figures
+
+
+@dataclass(frozen=True)
+class BodeCurve:
+    """Gain [dB] and phase [degrees] of one output from one input, and half-widths of their 95 % bands or None."""
+
+    output: str
+    input: str
+    gain: Floats
+    phase: Floats
+    gain_spread: Floats | None
+    phase_spread: Floats | None
+
+
+def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
+    """Curves of all pairs in which the input reaches the output; Coulomb terms are not linear and have none."""
+    response = frequency_response(model, omega)
+    spread = None
+    if model.estimate is not None and model.estimate.covariance is not None:
+        spread = response_deviation(model, omega)
+    inputs = response_inputs(model, coupled=True)
+    found = []
+    for i, output in enumerate(model.outputs):
+        for j, name in enumerate(inputs):
+            h = response[i, j]
+            if not np.any(h) or name.startswith(COULOMB):
+                continue
+            with np.errstate(divide="ignore", invalid="ignore"):
+                gain = 20 * np.log10(np.abs(h))
+            phase = np.degrees(np.unwrap(np.angle(np.where(np.isfinite(h), h, 1.0))))
+            widths: tuple[Floats | None, Floats | None] = (None, None)
+            if spread is not None:
+                widths = (DECIBEL * NORMAL_95 * spread[0][i, j], np.degrees(NORMAL_95 * spread[1][i, j]))
+            found.append(BodeCurve(output, name, gain, phase, *widths))
+    return found
+
+
+# ------------------------------------------------------------------------------------------------ order landscape
+
+
+def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
+    """Scores of an order lattice over two of its orders, best dark.
+
+    Parameters
+    ----------
+    landscape
+        From :func:`ftlm.report.landscape`.
+    title
+        Default: says what is shown.
+    """
+    across, upward = landscape.names
+    heading = title or f"Score over {symbol(across)} and {symbol(upward)}"
+    good = landscape.scores[np.isfinite(landscape.scores) & (landscape.scores > 0)]
+    if good.size == 0:
+        raise DataError("no candidate of this lattice has a finite score; widen it")
+    low, high = float(good.min()), float(good.max())
+    best = np.unravel_index(int(np.argmin(np.where(np.isfinite(landscape.scores), landscape.scores, np.inf))),
+                            landscape.scores.shape)  # fmt: skip
+    at = f"{symbol(across)} = {landscape.x[best[1]]:g}, {symbol(upward)} = {landscape.y[best[0]]:g}"
+    described = f"Heat map. Best score {number(low)} at {at}; worst {number(high)}."
+    left_out = int(np.sum(~np.isfinite(landscape.scores)))
+    caption = f"Best: {at} (ring). Dark is good; colours are steps of the logarithm. Other orders as in the best model."
+    if left_out:
+        caption += f" Grey: {left_out} pairs that are no candidate or whose free run diverges."
+    drawings = [
+        _heat_drawing(landscape, (low, high), (int(best[0]), int(best[1])), heading, described, narrow=n)
+        for n in (False, True)
+    ]
+    return Figure(heading, drawings[0], drawings[1], caption)
+
+
+def _heat_drawing(
+    landscape: Landscape, ends: tuple[float, float], best: tuple[int, int], title: str, described: str, *, narrow: bool
+) -> Markup:
+    width = NARROW if narrow else SMALL
+    rows, columns = landscape.scores.shape
+    left, top, bottom = 46.0, 26.0, 84.0
+    w = width - left - 14
+    cell_w = w / columns
+    h = min(max(rows * 6.0, 140.0), 300.0)
+    cell_h = h / rows
+    height = top + h + bottom
+    low, high = (math.log(v) for v in ends)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        place = (np.log(landscape.scores) - low) / (high - low if high > low else 1.0)
+    classes = np.where(np.isfinite(place), np.clip(np.nan_to_num(place * len(HEAT)), 0, len(HEAT) - 1), -1).astype(int)
+    out = [
+        Markup('<svg class="chart {}" role="img" viewBox="0 0 {} {:.0f}" width="{}" height="{:.0f}">').format(
+            "narrow" if narrow else "wide", width, height, width, height
+        ),
+        Markup("<title>{}</title><desc>{}</desc>").format(title, described),
+    ]
+    for i in range(rows):
+        y = top + h - (i + 1) * cell_h
+        j = 0
+        while j < columns:
+            # Cells alike in a row are one rectangle.
+            end = j + 1
+            while end < columns and classes[i, end] == classes[i, j]:
+                end += 1
+            colour = HEAT[classes[i, j]] if classes[i, j] >= 0 else NO_SCORE
+            out.append(
+                Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" fill="{}"/>').format(
+                    left + j * cell_w, y, (end - j) * cell_w + 0.3, cell_h + 0.3, colour
+                )
+            )
+            j = end
+    centre = (left + (best[1] + 0.5) * cell_w, top + h - (best[0] + 0.5) * cell_h)
+    for radius, colour, thickness in ((7, "#fff", 4), (7, "#d1480a", 2)):
+        out.append(
+            Markup('<circle cx="{:.1f}" cy="{:.1f}" r="{}" fill="none" stroke="{}" stroke-width="{}"/>').format(
+                *centre, radius, colour, thickness
+            )
+        )
+    out.append(Markup('<g font-size="12" fill="currentColor">'))
+    across, upward = landscape.names
+    for k in np.unique(np.linspace(0, columns - 1, min(columns, 5 if narrow else 9)).round().astype(int)).tolist():
+        out.append(_text(left + (k + 0.5) * cell_w, top + h + 16, f"{landscape.x[k]:g}", "middle"))
+    for k in np.unique(np.linspace(0, rows - 1, min(rows, 7)).round().astype(int)).tolist():
+        out.append(_text(left - 6, top + h - (k + 0.5) * cell_h + 4, f"{landscape.y[k]:g}", "end"))
+    out.append(_text(4, top - 12, f"order {symbol(upward)}", "start"))
+    out.append(_text(left + w, top + h + 34, f"order {symbol(across)}", "end"))
+    size = 20.0 if narrow else 26.0
+    out.append(_text(left, top + h + 76, f"score {number(ends[0], 3)}", "start"))
+    out.append(_text(left + size * len(HEAT), top + h + 76, f"{number(ends[1], 3)}", "end"))
+    out.append(Markup("</g>"))
+    for k, colour in enumerate(HEAT):
+        out.append(
+            Markup('<rect x="{:.1f}" y="{:.1f}" width="{:.1f}" height="12" fill="{}"/>').format(
+                left + k * size, top + h + 48, size + 0.3, colour
+            )
+        )
+    out.append(Markup("</svg>"))
+    return Markup("").join(out)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from markupsafe import Markup, escape
 
 from ftlm.errors import ModelError
+from ftlm.output_error import NORMAL_95
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from ftlm.models import Equation, Model, Order
     from ftlm.order_search import SearchResult
     from ftlm.output_error import JointFit
+    from ftlm.residuals import InformationCriteria, Residuals
     from ftlm.validation import Comparison, Metrics
 
 __all__ = [
@@ -28,15 +30,18 @@ __all__ = [
     "Table",
     "equation_html",
     "errors_table",
+    "information_table",
     "initial_terms_table",
     "number",
     "paper_row",
     "paper_table",
     "paper_table_text",
     "parameter_table",
+    "residual_table",
     "search_summary",
     "search_top",
     "settings_table",
+    "starts_table",
     "symbol",
     "symbol_html",
 ]
@@ -46,6 +51,9 @@ DIGITS = 5
 #: Columns from which a table is set smaller, so that the paper's fifteen fit a laptop's screen.
 DENSE = 12
 DIVERGED = "diverged"
+#: Decimals of an order in an equation; the model's file has them all.
+ORDER_DECIMALS = 4
+THIN = Markup('<mspace width="0.17em"></mspace>')  # our constant
 NOT_IN_MODEL = "–"
 
 _GREEK = {
@@ -54,6 +62,7 @@ _GREEK = {
 }  # fmt: skip
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 _SYMBOL = re.compile(rf"({'|'.join(_GREEK)}|[A-Za-z])_?(\d*)", re.ASCII)
 
 
@@ -208,22 +217,59 @@ class Table:
 
 
 def equation_html(item: Equation) -> Markup:
-    """Return an identified equation with its orders as superscripts and its indices as subscripts."""
-    parts = [Markup("{} = ").format(_derivative_html(item.order, item.output))]
+    """Return an identified equation typeset as MathML, a piece for each term so that it breaks between terms."""
+    parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
     for k, term in enumerate(item.terms):
         value = term.fixed or 0.0
-        sign = ("−" if value < 0 else "") if k == 0 else ("− " if value < 0 else "+ ")
-        factor = Markup('<data value="{}">{}</data>').format(repr(abs(value)), number(abs(value)))
-        derivative = _derivative_html(term.order, term.signal)
-        # A term stays on one line with its sign; the equation breaks between terms.
-        parts.append(Markup('{}<span class="term">{}{} {}</span>').format(" " if k else "", sign, factor, derivative))
-    return Markup('<span class="equation">{}</span>').format(Markup("").join(parts))
+        sign = "−" if value < 0 else "" if k == 0 else "+"
+        # The first sign belongs to its number; the others stand between two terms.
+        lead = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
+        parts.append(_math(lead + _number_math(abs(value)) + THIN +
+                           _derivative_math(term.order, term.signal), "term"))  # fmt: skip
+    return Markup('<span class="equation">{}</span>').format(Markup(" ").join(parts))
+
+
+def _math(content: Markup, name: str = "") -> Markup:
+    kind = Markup(' class="{}"').format(name) if name else Markup("")
+    return Markup("<math{}><mrow>{}</mrow></math>").format(kind, content)
+
+
+def _number_math(value: float) -> Markup:
+    mantissa, times, power = number(value).partition("×10")
+    base = Markup("<mn>{}</mn>").format(mantissa)
+    if not times:
+        return base
+    exponent = power.translate(_PLAIN_DIGITS)
+    sign = Markup("<mo>−</mo>") if exponent.startswith("-") else Markup("")
+    raised = Markup("<mrow>{}<mn>{}</mn></mrow>").format(sign, exponent.lstrip("-"))
+    return Markup("{}<mo>×</mo><msup><mn>10</mn>{}</msup>").format(base, raised)
+
+
+def _symbol_math(name: str) -> Markup:
+    found = _SYMBOL.fullmatch(name)
+    if not found:
+        return Markup("<mi>{}</mi>").format(name)
+    stem = Markup("<mi>{}</mi>").format(_GREEK.get(found[1], found[1]))
+    return Markup("<msub>{}<mn>{}</mn></msub>").format(stem, found[2]) if found[2] else stem
+
+
+def _derivative_math(order: Order, signal: str) -> Markup:
+    if not order.names and order.constant == 0:
+        return _symbol_math(signal)
+    value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed(order.constant)
+    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN, _symbol_math(signal))
+
+
+def _signed(value: float) -> Markup:
+    value = round(value, ORDER_DECIMALS) + 0.0
+    text = number(Exact(abs(value)))
+    return Markup("<mrow><mo>−</mo><mn>{}</mn></mrow>" if value < 0 else "<mn>{}</mn>").format(text)
 
 
 def _derivative_html(order: Order, signal: str) -> Markup:
     if not order.names and order.constant == 0:
         return symbol_html(signal)
-    text = str(order) if order.names else number(Exact(order.constant))
+    text = str(order) if order.names else number(Exact(round(order.constant, ORDER_DECIMALS) + 0.0))
     return Markup("D<sup>{}</sup> {}").format(text, symbol_html(signal))
 
 
@@ -236,18 +282,28 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
     Parameters
     ----------
     model
-        The model.
+        The model. What its ``estimate`` knows is used where there is no fit.
     joint
         The fit that it came from, where there is one: it knows the standard errors.
     title
         Caption.
     """
     reference = model.structure.reference
-    errors = {} if joint is None else joint.standard_errors
-    rows: list[list[Cell]] = [
-        [symbol_html(name), Exact(value) if joint is None else value, errors.get(name), None, "free order"]
-        for name, value in model.orders.items()
-    ]
+    errors: Mapping[str, float | None] = {}
+    extra: Mapping[str, float] = {}
+    if joint is not None:
+        errors, extra = joint.standard_errors, joint.coefficients
+    elif model.estimate is not None:
+        errors, extra = model.estimate.standard_errors, model.estimate.values
+    known = any(e is not None for e in errors.values())
+
+    def row(name: str, value: float, stated: float | None, place: str) -> list[Cell]:
+        error = errors.get(name)
+        half = None if error is None else NORMAL_95 * error
+        ends: list[Cell] = [None, None] if half is None else [value - half, value + half]
+        return [symbol_html(name), value, error, *ends, stated, place]
+
+    rows = [row(n, v if known else Exact(v), None, "free order") for n, v in model.orders.items()]
     shown = set(model.orders)
     for item in model.equations:
         for term in item.terms:
@@ -259,26 +315,66 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
             stated = reference.get(term.name)
             shown.add(term.name)
             # + 0.0 makes the negative zero of a product of signs a plain zero.
-            rows.append([
-                symbol_html(term.name), float(term.coefficient), errors.get(term.name),
-                None if stated is None else stated + 0.0, place,
-            ])  # fmt: skip
-    if joint is not None:
-        rows += [
-            [symbol_html(n), v, errors[n], None, "free in the coefficient law"]
-            for n, v in joint.coefficients.items()
-            if n not in shown
-        ]
-    columns = ["parameter", "value", "standard error", "stated", "what it is"]
-    if joint is None:
-        note = "No standard errors are given here: this table does not say how many of the digits mean something."
+            rows.append(row(term.name, float(term.coefficient), None if stated is None else stated + 0.0, place))
+    rows += [row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown]
+    columns = ["parameter", "value", "standard error", "from", "to", "stated", "what it is"]
+    if known:
+        note = "A coefficient without an interval follows from the law. Intervals hold as far as the model does."
     else:
-        note = "95 % intervals are the value ± 1.96 standard errors. A coefficient without one follows from the law."
-    left_out = ([] if joint is not None else [2]) + ([] if reference else [3])
+        note = "No standard errors are given here: this table does not say how many of the digits mean something."
+    left_out = ([] if known else [2, 3, 4]) + ([] if reference else [5])
     if reference:
         note += " Stated values belong to the integer orders of the maker's model."
     kept = [i for i in range(len(columns)) if i not in left_out]
-    return Table(title, tuple(columns[i] for i in kept), [[row[i] for i in kept] for row in rows], note=note)
+    groups = (("", 3), ("95 % interval", 2), ("", len(kept) - 5)) if known else ()
+    return Table(
+        title, tuple(columns[i] for i in kept), [[row[i] for i in kept] for row in rows], groups=groups, note=note
+    )
+
+
+def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic starts") -> Table:
+    """Return where the first fits began and how far each came on thinned samples, best first."""
+    kept = joint.starts[:rows]
+    cells: list[list[Cell]] = [[k + 1, origin, level] for k, (level, origin) in enumerate(kept)]
+    note = f"{len(joint.starts)} starts in all; the best ones went on on all samples." if joint.starts else ""
+    return Table(title, ("rank", "start from", "cost per residual"), cells, note=note)
+
+
+def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
+    """Return every residual test with its statistic and limit."""
+    rows: list[list[Cell]] = []
+    for output, found in tests.outputs.items():
+        white = found.whiteness
+        rows.append([symbol_html(output), "whiteness", white.statistic, white.limit, _verdict(white.passed)])
+        rows += [
+            [symbol_html(output), Markup("independence of {}").format(symbol_html(n)), t.statistic, t.limit,
+             _verdict(t.passed)]
+            for n, t in found.inputs.items()
+        ]  # fmt: skip
+    return Table(
+        title,
+        ("output", "test", "statistic", "limit (99 %)", "verdict"),
+        rows,
+        note="Whiteness: Ljung-Box sum over 25 lags. Independence: largest correlation at lags from 0 on. One true "
+        "model in a hundred fails each.",
+    )
+
+
+def _verdict(passed: bool) -> str:
+    return "passed" if passed else "failed"
+
+
+def information_table(information: InformationCriteria, *, title: str = "Information criteria") -> Table:
+    """Return AIC, AICc and BIC with what they count."""
+    criteria = (("AIC", information.aic), ("AICc", information.aicc), ("BIC", information.bic))
+    # Differences count, not sizes: all digits before the point.
+    rows: list[list[Cell]] = [[name, Exact(round(value, 1))] for name, value in criteria]
+    rows += [["numbers estimated", information.parameters], ["samples", information.samples]]
+    note = (
+        "Lower is better, among models of the same outputs on the same runs. Orders, coefficients, initial terms and "
+        "one noise level an output count as numbers."
+    )
+    return Table(title, ("criterion", "value"), rows, note=note)
 
 
 def settings_table(result: Identification, *, title: str = "What the result depends on") -> Table:

@@ -1,0 +1,241 @@
+"""Reports in a real browser: no request, no error, zoom, hostile names inert, accessible, whole without scripts."""
+
+import os
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm.report import model_page
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+if CHROMIUM is None and not os.environ.get("CI"):
+    pytest.skip("no Chromium here; apt-get install chromium", allow_module_level=True)
+
+sync_api = pytest.importorskip("playwright.sync_api")
+axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+
+HOSTILE = "</script><script>window.hacked = 1</script>\"><img src=x onerror=hacked=1><svg onload=hacked=1> & 'x'"
+WIDTHS = (360, 800, 1280)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, small_model, small_run, with_noise):
+    """Reports of an output-error fit, of a searched model and of a saved model, every name hostile."""
+    where = tmp_path_factory.mktemp("pages")
+
+    def named(run, words):
+        return ftlm.Run.from_arrays(
+            step=run.step, inputs={"u": run["u"]}, outputs={"y": run["y"]}, units=run.units, name=words + HOSTILE
+        )
+
+    run = named(with_noise(small_run, 0.02, 1), "run ")
+    n = 600
+    late = ftlm.Run.from_arrays(
+        step=0.02, inputs={"u": np.sin(np.arange(n) ** 1.2 / 30)}, outputs={"y": np.zeros(n)}, units=run.units
+    )
+    other = named(with_noise(small_model.simulate(late, tolerance=1e-4), 0.02, 2), "other ")
+    words = "D^alpha y = a D^nu y + c y + b u"
+    fit = ftlm.identify(run, replace(ftlm.equation(words), name="fit " + HOSTILE))
+    fit.report(where / "fit.html", validation=other)
+    free = ftlm.equation(words, orders={"alpha": "1.3:1.9:0.1", "nu": "0.2:1.2:0.1"})
+    searched = ftlm.identify(run, replace(free, name="search " + HOSTILE), method="multi-innovation")
+    warned = replace(searched, warnings=(*searched.warnings, "a warning " + HOSTILE))
+    warned.report(where / "search.html")
+    model_page(ftlm.load_model(fit.model.save(where / "m.json")), where / "model.html", validation=other)
+    return where
+
+
+PAGES = ("fit", "search", "model")
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_api.sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield found
+        found.close()
+
+
+class Opened:
+    """A page that notes what it says and what it asks for."""
+
+    def __init__(self, browser, path, **options):
+        options = {"viewport": {"width": 1280, "height": 900}, **options}
+        self.context = browser.new_context(**options)
+        self.page = self.context.new_page()
+        self.said, self.asked = [], []
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(str(error)))
+        self.page.on("dialog", lambda dialog: (self.said.append(f"dialog {dialog.message}"), dialog.dismiss()))
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.goto(path.as_uri())
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.context.close()
+
+
+def view_of(page, svg="svg.chart.wide[data-frame]"):
+    return [float(v) for v in page.locator(svg).first.get_attribute("data-view").split()]
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_a_page_asks_for_nothing_and_complains_of_nothing(browser, folder, name):
+    with Opened(browser, folder / f"{name}.html") as opened:
+        opened.page.wait_for_timeout(200)
+        assert opened.said == []
+        assert [url for url in opened.asked if not url.startswith(("file:", "data:"))] == []
+        assert len([url for url in opened.asked if url.startswith("file:")]) == 1
+        assert (folder / f"{name}.html").stat().st_size < 2_000_000
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_hostile_names_are_text(browser, folder, name):
+    with Opened(browser, folder / f"{name}.html") as opened:
+        page = opened.page
+        assert page.evaluate("typeof window.hacked") == "undefined"
+        assert HOSTILE in page.title()
+        assert HOSTILE in page.locator("h1").inner_text()
+        assert page.locator("main img, main iframe, main object, main script").count() == 0
+        assert page.evaluate("document.scripts.length") == 1
+        if name == "search":
+            assert "a warning " + HOSTILE in page.locator(".warnings").first.inner_text()
+        # Even a script that found its way in would not run: the page allows its own by hash.
+        page.evaluate(
+            "() => { const s = document.createElement('script'); s.textContent = 'window.hacked = 2';"
+            " document.body.append(s); }"
+        )
+        assert page.evaluate("typeof window.hacked") == "undefined"
+
+
+def test_zoom_by_buttons(browser, folder):
+    with Opened(browser, folder / "fit.html") as opened:
+        page = opened.page
+        chart = page.locator("svg.chart.wide[data-frame]").first
+        whole = [float(v) for v in chart.get_attribute("data-frame").split()]
+        labels = chart.locator(".ticks text").all_inner_texts()
+        bar = page.locator(".zoom.wide").first
+        assert bar.get_by_role("button", name="Zoom out").is_disabled()
+        bar.get_by_role("button", name="Zoom in").click()
+        low, high, *heights = view_of(page)
+        assert (high - low) == pytest.approx((whole[1] - whole[0]) / 2)
+        assert heights == whole[2:]
+        assert chart.locator(".ticks text").all_inner_texts() != labels
+        bar.get_by_role("button", name="Move right").click()
+        assert view_of(page)[1] == pytest.approx(whole[1])
+        bar.get_by_role("button", name="Move left").focus()
+        page.keyboard.press("Enter")
+        assert view_of(page)[0] < low + (high - low)
+        bar.get_by_role("button", name="Show the whole chart").click()
+        assert view_of(page) == whole
+        assert chart.locator(".ticks text").count() >= 4
+        assert opened.said == []
+
+
+def test_zoom_by_dragging_shows_what_was_dragged_over(browser, folder):
+    with Opened(browser, folder / "fit.html") as opened:
+        page = opened.page
+        chart = page.locator("svg.chart.wide[data-frame]").first
+        chart.scroll_into_view_if_needed()
+        box = chart.bounding_box()
+        left, top, width, height = [float(v) for v in chart.get_attribute("data-plot").split()]
+        whole = [float(v) for v in chart.get_attribute("data-frame").split()]
+        scale = box["width"] / float(chart.get_attribute("viewBox").split()[2])
+
+        def place(x, y):
+            return box["x"] + scale * (left + x * width), box["y"] + scale * (top + y * height)
+
+        page.mouse.move(*place(0.25, 0.5))
+        page.mouse.down()
+        page.mouse.move(*place(0.5, 0.52), steps=4)
+        page.mouse.up()
+        span = whole[1] - whole[0]
+        assert view_of(page)[:2] == pytest.approx([whole[0] + 0.25 * span, whole[0] + 0.5 * span], abs=0.01 * span)
+        inner = [float(v) for v in chart.locator("svg.plot").get_attribute("viewBox").split()]
+        assert inner[0] == pytest.approx(0.25 * 10 * width, rel=0.02)
+        assert inner[2] == pytest.approx(0.25 * 10 * width, rel=0.02)
+        page.mouse.dblclick(*place(0.5, 0.5))
+        assert view_of(page) == whole
+        # A box, taller than a slip of the hand, zooms in both directions.
+        page.mouse.move(*place(0.2, 0.1))
+        page.mouse.down()
+        page.mouse.move(*place(0.4, 0.9), steps=4)
+        page.mouse.up()
+        assert view_of(page)[2] > whole[2]
+        assert view_of(page)[3] < whole[3]
+        assert opened.said == []
+
+
+@pytest.mark.parametrize("name", PAGES)
+def test_without_scripts_everything_but_the_zoom_is_there(browser, folder, name):
+    with Opened(browser, folder / f"{name}.html") as opened:
+        opened.page.evaluate("document.querySelectorAll('.zoom').forEach((z) => z.remove())")
+        with_scripts = opened.page.locator("main").inner_text()
+    with Opened(browser, folder / f"{name}.html", java_script_enabled=False) as opened:
+        assert opened.page.locator("main").inner_text() == with_scripts
+        assert opened.page.locator(".zoom").count() == 0
+        boxes = [c.bounding_box() for c in opened.page.locator("svg.chart.wide").all()]
+        assert len(boxes) >= 4
+        assert all(b["width"] > 200 and b["height"] > 80 for b in boxes)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("name", PAGES)
+def test_the_accessibility_check_passes(browser, folder, name, scheme):
+    for width in (WIDTHS[0], WIDTHS[2]):
+        with Opened(
+            browser, folder / f"{name}.html", viewport={"width": width, "height": 900}, color_scheme=scheme
+        ) as opened:
+            found = axe.Axe().run(opened.page)
+            broken = [(v["id"], [n["html"][:120] for n in v["nodes"]][:3]) for v in found.response["violations"]]
+            assert broken == []
+            assert len(found.response["passes"]) > 10
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", PAGES)
+def test_no_width_makes_a_page_scroll_sideways(browser, folder, name, width):
+    with Opened(browser, folder / f"{name}.html", viewport={"width": width, "height": 900}) as opened:
+        page = opened.page
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        narrow, wide = (page.locator(f"svg.chart.{kind}").first for kind in ("narrow", "wide"))
+        assert narrow.is_visible() == (width < 620)
+        assert wide.is_visible() == (width >= 620)
+        assert page.locator(".zoom:visible").count() == page.locator("svg.chart[data-frame]:visible").count()
+
+
+def test_paper_has_no_buttons_and_equations_are_typeset(browser, folder):
+    with Opened(browser, folder / "fit.html") as opened:
+        page = opened.page
+        # Typeset: the exponent stands above the line of its base.
+        up, base = (page.locator(f"math msup > :nth-child({k})").first.bounding_box() for k in (2, 1))
+        assert up["y"] < base["y"]
+        page.emulate_media(media="print")
+        assert page.locator(".zoom:visible").count() == 0
+        assert page.locator("nav").is_hidden()
+        printed = page.pdf(format="A4")
+        assert printed.startswith(b"%PDF")
+        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+
+
+def test_warnings_come_first(browser, folder):
+    with Opened(browser, folder / "search.html") as opened:
+        heads = opened.page.locator("h2").all_inner_texts()
+        assert heads[0] == "Warnings"
+        assert {"Equations", "Errors", "Measured and simulated", "Residuals", "Frequency response"} <= set(heads)
+        assert {"Convergence of the recursion", "Order search", "Settings"} <= set(heads)
+
+
+def test_the_accessibility_check_can_fail(browser, tmp_path):
+    path = tmp_path / "poor.html"
+    path.write_text(
+        '<html><title>x</title><body style="color:#bbb;background:#fff"><img src="data:,">faint</body></html>'
+    )
+    with Opened(browser, path) as opened:
+        found = {v["id"] for v in axe.Axe().run(opened.page).response["violations"]}
+        assert {"image-alt", "color-contrast", "html-has-lang"} <= found
