@@ -5,12 +5,12 @@ PYTHON ?= python3
 CORE := $(shell find rust -name '*.rs') Cargo.toml Cargo.lock pyproject.toml
 export RUSTDOCFLAGS := -D warnings
 
-.PHONY: demo test test-slow test-rust test-python lint bench wheel wheel-test clean
+.PHONY: demo test test-slow test-rust test-python lint docs bench wheel wheel-test clean
 
 demo: $(VENV)/.built
 	$(BIN)/ftlm demo -o demo --force
 
-test: lint test-rust test-python wheel-test
+test: lint test-rust test-python docs wheel-test
 
 $(VENV)/.tools: requirements-test.txt
 	$(PYTHON) -m venv $(VENV)
@@ -40,6 +40,10 @@ test-python: $(VENV)/.built
 test-slow: $(VENV)/.built
 	$(BIN)/python -m pytest -m slow --timeout 7200
 
+# Pages in docs/_build/html; a warning is an error.
+docs: $(VENV)/.built
+	$(BIN)/python -m sphinx -q -W --keep-going -b html docs docs/_build/html
+
 bench: $(VENV)/.built
 	cargo bench --bench kernels
 	$(BIN)/python benches/search.py
@@ -58,4 +62,4 @@ wheel-test: wheel
 	rm -rf $(VENV)-wheel wheels/demo
 
 clean:
-	rm -rf $(VENV) $(VENV)-wheel wheels demo target
+	rm -rf $(VENV) $(VENV)-wheel wheels demo target docs/_build docs/_pictures

@@ -450,7 +450,7 @@ def poles(model: Model, *, coupling: str = "simulated") -> Complex:
     Returns
     -------
     ndarray of complex
-        Values of s [rad/s], |arg s| < pi, slowest first, without those at the origin. Roots on other sheets are no
+        Values of s [rad/s], ``|arg s| < pi``, slowest first, without those at the origin. Roots on other sheets are no
         poles: they only shape how a response dies away.
 
     Raises
@@ -498,7 +498,7 @@ def stability(model: Model, *, coupling: str = "simulated") -> Stability:
 
     Notes
     -----
-    Matignon (1996): roots lambda in s^q are stable where |arg lambda| > q pi/2. Without a common base the number of
+    Matignon (1996): roots lambda in s^q are stable where ``|arg lambda| > q pi/2``. Without a common base the number of
     zeros of the characteristic function D(s) on the right is (p_max − p_min)/2 − Φ/π, Φ the turn of D(jω) from ω = 0 to
     ∞ and p the powers of its highest and lowest term: the argument principle on the right half plane, where s^p has one
     value. Delays of inputs do not matter.

@@ -212,7 +212,7 @@ class Run:
             place on a regular grid; a mean step that differs from a short decimal number by rounding alone is taken
             as that number.
         inputs, outputs : mapping of str to array_like, shape (N,), N ≥ 3
-            Signals by name: lists, NumPy arrays, pandas or polars series of real numbers, |value| ≤ 1e150. `inputs`
+            Signals by name: lists, NumPy arrays, pandas or polars series of real numbers up to 1e150 in size. `inputs`
             may be empty; at least one output is needed. A name begins with a letter or an underscore and holds
             letters, digits, ``_ . [ ]``.
         units : mapping of str to str, optional

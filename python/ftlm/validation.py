@@ -49,7 +49,7 @@ class Metrics:
     nr
         Normalised residual RMSE / sigma(y) (paper (47)).
     fit
-        100 (1 - |y - yhat| / |y - mean y|) in percent.
+        100 (1 - ‖y - ŷ‖ / ‖y - mean‖) in percent.
     """
 
     error: float

@@ -1,7 +1,8 @@
-"""The Python blocks of the README run as they stand, its commands exist, and what it links is there."""
+"""Every Python block of the README and of the pages runs as it stands, commands exist, links lead somewhere."""
 
 from __future__ import annotations
 
+import inspect
 import re
 import shlex
 import subprocess
@@ -11,16 +12,19 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+README = ROOT / "README.md"
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+DOCUMENTS = [README, *PAGES]
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", README, flags=re.DOTALL | re.MULTILINE)
+def blocks(document: Path, language: str) -> list[str]:
+    text = document.read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
 
 
-def test_the_python_blocks_run_one_after_the_other(tmp_path: Path) -> None:
-    found = blocks("python")
-    assert len(found) >= 2
+@pytest.mark.parametrize("document", [d for d in DOCUMENTS if blocks(d, "python")], ids=lambda d: d.name)
+def test_the_python_blocks_run_one_after_the_other(document: Path, tmp_path: Path) -> None:
+    found = blocks(document, "python")
     ran = subprocess.run(
         [sys.executable, "-W", "error", "-c", "\n".join(found)],
         cwd=tmp_path,
@@ -29,16 +33,45 @@ def test_the_python_blocks_run_one_after_the_other(tmp_path: Path) -> None:
         check=False,
     )
     assert ran.returncode == 0, ran.stderr
-    assert "order search (y)" in ran.stdout
+    if document == README:
+        assert len(found) >= 2
+        assert "order search (y)" in ran.stdout
+    if document.name == "tutorial.md":
+        assert (tmp_path / "model.html").stat().st_size > 50_000
+
+
+def test_the_pages_that_teach_have_blocks_that_run() -> None:
+    assert {"tutorial.md", "arm.md", "choosing.md", "numbers.md", "comparison.md"} <= {
+        d.name for d in PAGES if blocks(d, "python")
+    }
+
+
+def test_the_commands_of_the_tutorial_run(tmp_path: Path) -> None:
+    tutorial = ROOT / "docs" / "tutorial.md"
+    made = subprocess.run(
+        [sys.executable, "-c", blocks(tutorial, "python")[0]], cwd=tmp_path, capture_output=True, check=False
+    )
+    assert made.returncode == 0, made.stderr
+    for command in commands_of(blocks(tutorial, "sh")[-1]):
+        ran = subprocess.run(
+            [sys.executable, "-m", "ftlm", *shlex.split(command)[1:]],
+            cwd=tmp_path, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert ran.returncode == 0, command + ran.stdout + ran.stderr
+    assert (tmp_path / "model.html").exists()
+
+
+def commands_of(text: str) -> list[str]:
+    return [line for line in text.replace("\\\n", " ").splitlines() if line.startswith("ftlm ")]
 
 
 def commands() -> list[str]:
-    text = "\n".join(blocks("sh")).replace("\\\n", " ")
-    return [line for line in text.splitlines() if line.startswith("ftlm ")]
+    found = [command for d in DOCUMENTS for block in blocks(d, "sh") for command in commands_of(block)]
+    return list(dict.fromkeys(found))
 
 
 @pytest.mark.parametrize("command", commands())
-def test_every_command_and_option_of_the_readme_exists(command: str) -> None:
+def test_every_command_and_option_of_the_documents_exists(command: str) -> None:
     words = shlex.split(command, comments=True)
     shown = subprocess.run(
         [sys.executable, "-m", "ftlm", words[1], "--help"], capture_output=True, text=True, check=False, env=wide()
@@ -55,11 +88,33 @@ def wide() -> dict[str, str]:
     return {**os.environ, "COLUMNS": "250", "NO_COLOR": "1", "TERM": "dumb"}
 
 
-def test_linked_files_exist() -> None:
-    for document in ("README.md", "CONTRIBUTING.md"):
-        text = (ROOT / document).read_text(encoding="utf-8")
-        for target in re.findall(r"\]\((?!https?:)([^)#]+)\)", text):
-            assert (ROOT / target).exists(), f"{document} links {target}"
+@pytest.mark.parametrize("document", [*DOCUMENTS, ROOT / "CONTRIBUTING.md"], ids=lambda d: d.name)
+def test_linked_files_exist(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\((?!https?:)([^)#]+)(?:#[^)]*)?\)", text):
+        assert (document.parent / target).exists(), f"{document.name} links {target}"
+
+
+def test_every_page_is_in_the_contents() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    listed = re.search(r"```\{toctree\}\n:hidden:\n\n(.*?)```", index, re.DOTALL)
+    assert listed is not None
+    assert set(listed[1].split()) == {d.stem for d in PAGES} - {"index"}
+
+
+def issubclass_of_error(value: object) -> bool:
+    return isinstance(value, type) and issubclass(value, Exception)
+
+
+def test_the_reference_names_every_public_name() -> None:
+    import ftlm
+
+    text = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    for name in ftlm.__all__:
+        value = getattr(ftlm, name)
+        if name in ("PARAMETERS", "__version__") or inspect.ismodule(value) or issubclass_of_error(value):
+            continue
+        assert re.search(rf"ftlm\.{name}\b", text), f"{name} is not in docs/api.md"
 
 
 def test_the_map_names_only_what_exists() -> None:

@@ -1,0 +1,46 @@
+"""How the pages are built: `make docs`, warnings as errors, no network, pictures drawn by the build itself."""
+
+import sys
+from pathlib import Path
+
+import ftlm
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))
+
+project = "ftlm"
+author = "the ftlm authors"
+copyright = "MIT licence"
+version = release = ftlm.__version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "numpydoc"]
+exclude_patterns = ["_build"]
+source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
+root_doc = "index"
+myst_heading_anchors = 3
+myst_enable_extensions = ["deflist", "colon_fence"]
+# Pages link to files of the repository, which are no pages.
+suppress_warnings = ["myst.xref_missing"]
+
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
+numpydoc_show_class_members = False
+numpydoc_xref_param_type = False
+
+html_theme = "pydata_sphinx_theme"
+html_title = f"ftlm {release}"
+html_show_sourcelink = False
+html_sidebars = {"**": []}
+html_theme_options = {
+    "navigation_with_keys": False,
+    "show_prev_next": True,
+    "secondary_sidebar_items": ["page-toc"],
+    "header_links_before_dropdown": 4,
+}
+
+
+def setup(app: object) -> None:
+    """Draw the pictures before the pages that show them are read."""
+    from pictures import draw  # noqa: PLC0415 — the folder is on the path only now
+
+    draw(HERE / "_pictures")
