@@ -4,7 +4,7 @@
 //! the widest instructions of the machine at hand. Nothing is contracted to fused multiply-adds and no sum is
 //! reordered, so a kernel gives the same bits whether it runs inside [`widest`] or not.
 
-use pulp::Arch;
+use pulp::{Arch, Simd, WithSimd};
 
 /// Values that a kernel works on side by side.
 pub const WIDTH: usize = 8;
@@ -12,10 +12,30 @@ pub const WIDTH: usize = 8;
 /// One value of each of several computations that run side by side.
 pub type Lanes<const L: usize> = [f64; L];
 
-/// Runs `work`, and what is inlined into it, with the widest vector instructions of this machine.
-#[inline(always)]
-pub fn widest<R>(work: impl FnOnce() -> R) -> R {
-    Arch::new().dispatch(work)
+/// A kernel for [`widest`]. `run`, and all of its inner loops' functions, must be `#[inline(always)]`: what the compiler
+/// leaves outside is compiled for the oldest machine.
+pub trait Kernel {
+    /// What it returns.
+    type Output;
+
+    /// Does the work.
+    fn run(self) -> Self::Output;
+}
+
+struct Inlined<K>(K);
+
+impl<K: Kernel> WithSimd for Inlined<K> {
+    type Output = K::Output;
+
+    #[inline(always)]
+    fn with_simd<S: Simd>(self, _: S) -> K::Output {
+        self.0.run()
+    }
+}
+
+/// Runs a kernel with the widest vector instructions of this machine.
+pub fn widest<K: Kernel>(kernel: K) -> K::Output {
+    Arch::new().dispatch(Inlined(kernel))
 }
 
 /// Σ a·b, summed in [`WIDTH`] lanes that are joined at the end.

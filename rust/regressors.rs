@@ -90,7 +90,7 @@ impl Record {
 }
 
 /// What a column of a bank is.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Key {
     /// I^η of a signal; η in grains.
     Integral {
@@ -141,6 +141,12 @@ impl Index {
     #[must_use]
     pub fn get(&self, key: Key) -> Option<usize> {
         self.positions.get(&key).copied()
+    }
+
+    /// Puts the keys in order of signal and order, so that neighbours on a lattice are neighbours here.
+    pub fn sort(&mut self) {
+        self.keys.sort_unstable();
+        self.positions = self.keys.iter().enumerate().map(|(i, &key)| (key, i)).collect();
     }
 
     /// All keys in order.

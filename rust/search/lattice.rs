@@ -400,17 +400,44 @@ impl<'a> Cursor<'a> {
         any != 0
     }
 
-    /// Goes to the next candidate; at the last one it stays.
-    pub(crate) fn advance(&mut self) {
-        for g in (0..self.lattice.groups.len()).rev() {
+    /// Goes to the next candidate; at the last one it stays. Returns the first group that has changed; after a change
+    /// of block all have.
+    pub(crate) fn advance(&mut self) -> usize {
+        let groups = self.lattice.groups.len();
+        for g in (0..groups).rev() {
+            if self.lattice.blocks[self.block].slices[g].count == 1 {
+                continue;
+            }
             if self.step(g) {
-                return;
+                return g;
             }
             self.seek(g, 0);
         }
         if self.block + 1 < self.lattice.blocks.len() {
             self.block += 1;
-            (0..self.lattice.groups.len()).for_each(|g| self.seek(g, 0));
+            (0..groups).for_each(|g| self.seek(g, 0));
+        }
+        0
+    }
+
+    /// The term, and its position in its axis, that alone changes over this and the next `len` − 1 candidates, by one
+    /// position each; none where something else does too.
+    #[inline]
+    pub(crate) fn stretch(&self, len: usize) -> Option<(usize, usize)> {
+        let slices = &self.lattice.blocks[self.block].slices;
+        let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
+        let group = &self.lattice.groups[g];
+        let digit = self.digits[g][group.last()];
+        let whole = digit + len <= group.axes[group.last()].len();
+        (whole && (digit..digit + len).all(|i| self.completions[g].has(i))).then(|| (group.terms[group.last()], digit))
+    }
+
+    /// Goes over this many candidates of a stretch.
+    #[inline]
+    pub(crate) fn skip(&mut self, count: usize) {
+        let slices = &self.lattice.blocks[self.block].slices;
+        if let Some(g) = (0..slices.len()).rev().find(|&g| slices[g].count > 1) {
+            self.digits[g][self.lattice.groups[g].last()] += count;
         }
     }
 
@@ -434,9 +461,10 @@ impl<'a> Cursor<'a> {
         self.block
     }
 
-    /// Calls `take` with the position in the equation and in its axis of every term's order.
-    pub(crate) fn each(&self, mut take: impl FnMut(usize, usize)) {
-        for (group, digits) in self.lattice.groups.iter().zip(&self.digits) {
+    /// Calls `take` with the position in the equation and in its axis of the orders of this group and those after it.
+    #[inline(always)]
+    pub(crate) fn each(&self, from: usize, mut take: impl FnMut(usize, usize)) {
+        for (group, digits) in self.lattice.groups[from..].iter().zip(&self.digits[from..]) {
             group.terms.iter().zip(digits).for_each(|(&term, &digit)| take(term, digit));
         }
     }

@@ -216,6 +216,8 @@ impl Normal {
 struct Plain {
     stride: usize,
     gram: Vec<f64>,
+    /// Its diagonal, and the roots of that.
+    diagonal: Vec<f64>,
     norms: Vec<f64>,
     /// What rounding may add to a squared sum, per unit of the squared sum of norms.
     unit: f64,
@@ -240,10 +242,12 @@ impl<const L: usize> Solve<L> {
 /// Memory of a screening of L candidates side by side.
 struct Screen<const L: usize> {
     solve: Solve<L>,
-    positions: Vec<[usize; L]>,
+    positions: Vec<Columns<L>>,
     initial: Vec<usize>,
-    /// One candidate's columns, coefficients and initial terms.
+    /// Columns of the candidate that comes next.
     terms: Vec<usize>,
+    /// One candidate's columns, coefficients and initial terms.
+    columns: Vec<usize>,
     coefficients: Vec<f64>,
     weights: Vec<f64>,
 }
@@ -252,12 +256,32 @@ impl<const L: usize> Screen<L> {
     fn new(width: usize) -> Self {
         Self {
             solve: Solve::new(),
-            positions: vec![[0; L]; width],
+            positions: vec![Columns::new([0; L]); width],
             initial: Vec::new(),
             terms: vec![0; width],
+            columns: vec![0; width],
             coefficients: vec![0.0; width],
             weights: Vec::new(),
         }
+    }
+}
+
+/// [`Bound::evaluate`] as a kernel.
+struct Bounding<'a, F> {
+    bound: &'a Bound,
+    limit: f64,
+    columns: F,
+}
+
+impl<'a, F> lanes::Kernel for Bounding<'a, F>
+where
+    F: Fn(usize) -> (&'a [usize], &'a [f64], &'a [usize], &'a [f64]),
+{
+    type Output = (f64, f64);
+
+    #[inline(always)]
+    fn run(self) -> (f64, f64) {
+        self.bound.evaluate(self.limit, self.columns)
     }
 }
 
@@ -344,6 +368,7 @@ impl Problem {
         #[allow(clippy::cast_precision_loss)]
         let plain = plain.then(|| Plain {
             stride: width + 1,
+            diagonal: (0..=width).map(|p| unweighted[p * (width + 2)]).collect(),
             norms: (0..=width).map(|p| unweighted[p * (width + 2)].max(0.0).sqrt()).collect(),
             gram: unweighted,
             unit: 4.0 * f64::EPSILON * samples as f64,
@@ -411,7 +436,7 @@ impl Problem {
         scratch: &mut Scratch,
         control: &Control,
     ) -> Verdict {
-        let sources: Vec<[usize; 1]> = positions.iter().map(|&p| [p]).collect();
+        let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
         let [singular] = self.solve(&sources, initial, &mut scratch.one);
         if singular {
             return Verdict::Failed(Failure::Singular);
@@ -423,7 +448,7 @@ impl Problem {
         if let (true, Some(bound)) = (bounded && limit < f64::INFINITY, &self.bound) {
             let (weights, n) = (&scratch.weights, initial.len());
             let columns = |r: usize| (positions, &scratch.coefficients[..], initial, &weights[r * n..(r + 1) * n]);
-            let (lowest, _) = lanes::widest(|| bound.evaluate(limit, columns));
+            let (lowest, _) = lanes::widest(Bounding { bound, limit, columns });
             if lowest > limit {
                 return Verdict::Bounded(lowest);
             }
@@ -447,7 +472,7 @@ impl Problem {
     ///
     /// `positions` gives the column of each term per candidate; the initial terms are those of all.
     #[inline(always)]
-    fn solve<const L: usize>(&self, positions: &[[usize; L]], initial: &[usize], solve: &mut Solve<L>) -> [bool; L] {
+    fn solve<const L: usize>(&self, positions: &[Columns<L>], initial: &[usize], solve: &mut Solve<L>) -> [bool; L] {
         let normal = &self.terms;
         let (free, width) = (self.free.len(), normal.width);
         let k = free + initial.len() * self.parts.len();
@@ -460,34 +485,34 @@ impl Problem {
         for (a, &ta) in self.free.iter().enumerate() {
             let rows = &positions[ta];
             for (b, &tb) in self.free[..=a].iter().enumerate() {
-                gram[packed(a, b)] = gather(rows, &positions[tb], |p, q| normal.correlation[p * width + q]);
+                gram[packed(a, b)] = rows.with(&positions[tb], &normal.correlation, width);
             }
-            rhs[a] = gather(rows, rows, |p, _| normal.rhs[p]);
+            rhs[a] = rows.of(&normal.rhs);
             for (columns, fixed) in positions.iter().zip(&self.fixed) {
                 if let Some(value) = *fixed {
-                    let known =
-                        gather(rows, columns, |p, q| value * normal.size[q] * normal.correlation[p * width + q]);
-                    (0..L).for_each(|n| rhs[a][n] -= known[n]);
+                    let (size, known) = (columns.of(&normal.size), rows.with(columns, &normal.correlation, width));
+                    (0..L).for_each(|n| rhs[a][n] -= value * size[n] * known[n]);
                 }
             }
         }
         for (r, part) in self.parts.iter().enumerate() {
             for (i, &e) in initial.iter().enumerate() {
                 let a = free + r * initial.len() + i;
-                // This record's share of a term's column, against the size that the column has on all.
-                let share = |p: usize| part.correlation[e * width + p] * part.size[p] * normal.inverse[p];
+                let row = &part.correlation[e * width..(e + 1) * width];
                 for (b, &tb) in self.free.iter().enumerate() {
-                    gram[packed(a, b)] = gather(&positions[tb], &positions[tb], |p, _| share(p));
+                    // This record's share of a term's column, against the size that the column has on all.
+                    let columns = &positions[tb];
+                    let (c, size, all) = (columns.of(row), columns.of(&part.size), columns.of(&normal.inverse));
+                    gram[packed(a, b)] = std::array::from_fn(|n| c[n] * size[n] * all[n]);
                 }
                 for (j, &f) in initial[..=i].iter().enumerate() {
-                    gram[packed(a, free + r * initial.len() + j)] = [part.correlation[e * width + f]; L];
+                    gram[packed(a, free + r * initial.len() + j)] = [row[f]; L];
                 }
                 rhs[a] = [part.rhs[e]; L];
                 for (columns, fixed) in positions.iter().zip(&self.fixed) {
                     if let Some(value) = *fixed {
-                        let known =
-                            gather(columns, columns, |q, _| value * part.size[q] * part.correlation[e * width + q]);
-                        (0..L).for_each(|n| rhs[a][n] -= known[n]);
+                        let (size, known) = (columns.of(&part.size), columns.of(row));
+                        (0..L).for_each(|n| rhs[a][n] -= value * size[n] * known[n]);
                     }
                 }
             }
@@ -499,10 +524,14 @@ impl Problem {
             coefficients.push(match *fixed {
                 Some(value) => [value; L],
                 None => {
-                    let scale = gather(columns, columns, |p, _| normal.inverse[p]);
+                    let scale = columns.of(&normal.inverse);
                     let x = rhs[next];
                     next += 1;
-                    std::array::from_fn(|n| x[n] * scale[n])
+                    let mut out = [0.0; L];
+                    for n in 0..L {
+                        out[n] = x[n] * scale[n];
+                    }
+                    out
                 }
             });
         }
@@ -679,14 +708,64 @@ fn out_of_range(name: &str, value: f64, range: &str, remedy: &str) -> Error {
     Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() }
 }
 
-/// Elements for L candidates; read once where all of them stand at the same columns.
-#[inline(always)]
-fn gather<const L: usize>(rows: &[usize; L], columns: &[usize; L], read: impl Fn(usize, usize) -> f64) -> Lanes<L> {
-    let same = |x: &[usize; L]| x.iter().all(|&p| p == x[0]);
-    if L > 1 && same(rows) && same(columns) {
-        return [read(rows[0], columns[0]); L];
+/// Columns of one term of L candidates.
+#[derive(Debug, Clone, Copy)]
+struct Columns<const L: usize> {
+    at: [usize; L],
+    /// Whether they are all one, and whether each is the next one.
+    same: bool,
+    run: bool,
+}
+
+impl<const L: usize> Columns<L> {
+    fn new(at: [usize; L]) -> Self {
+        Self { at, same: L == 1, run: false }
     }
-    std::array::from_fn(|n| read(rows[n], columns[n]))
+
+    #[inline(always)]
+    fn compare(&mut self) {
+        let first = self.at[0];
+        self.same = self.at.iter().all(|&p| p == first);
+        self.run = !self.same && self.at.iter().enumerate().all(|(n, &p)| p == first + n);
+    }
+
+    /// Elements of a vector at these columns.
+    #[inline(always)]
+    fn of(&self, vector: &[f64]) -> Lanes<L> {
+        if self.same {
+            [vector[self.at[0]]; L]
+        } else if self.run {
+            part_of(&vector[self.at[0]..])
+        } else {
+            let mut out = [0.0; L];
+            out.iter_mut().zip(&self.at).for_each(|(x, &p)| *x = vector[p]);
+            out
+        }
+    }
+
+    /// Elements of a symmetric matrix (row-major) at these columns and those rows.
+    #[inline(always)]
+    fn with(&self, rows: &Self, matrix: &[f64], stride: usize) -> Lanes<L> {
+        if rows.same {
+            self.of(&matrix[rows.at[0] * stride..(rows.at[0] + 1) * stride])
+        } else if self.same {
+            rows.of(&matrix[self.at[0] * stride..(self.at[0] + 1) * stride])
+        } else {
+            let mut out = [0.0; L];
+            for n in 0..L {
+                out[n] = matrix[rows.at[n] * stride + self.at[n]];
+            }
+            out
+        }
+    }
+}
+
+/// The first L elements.
+#[inline(always)]
+fn part_of<T: Copy, const L: usize>(values: &[T]) -> [T; L] {
+    let mut out = [values[0]; L];
+    out.copy_from_slice(&values[..L]);
+    out
 }
 
 /// Gram matrix of a bank's columns and the target, (columns + 1)² row-major.
@@ -867,6 +946,23 @@ struct Hunt<'a> {
     failures: Vec<(u64, Failure)>,
 }
 
+/// [`Hunt::screen`] as a kernel.
+struct Screening<'a, 'b> {
+    hunt: &'a Hunt<'b>,
+    lo: u64,
+    hi: u64,
+    limit: f64,
+}
+
+impl lanes::Kernel for Screening<'_, '_> {
+    type Output = (Vec<Open>, Vec<u64>);
+
+    #[inline(always)]
+    fn run(self) -> Self::Output {
+        self.hunt.screen(self.lo, self.hi, self.limit)
+    }
+}
+
 impl Hunt<'_> {
     fn check_stop(&self) -> Result<()> {
         if self.control.stop.load(Ordering::Relaxed) {
@@ -883,7 +979,7 @@ impl Hunt<'_> {
 
     fn positions(&self, cursor: &Cursor<'_>, positions: &mut [usize]) {
         let table = &self.tables[cursor.block()];
-        cursor.each(|term, digit| positions[term] = table[term][digit]);
+        cursor.each(0, |term, digit| positions[term] = table[term][digit]);
     }
 
     fn initial(&self, cursor: &Cursor<'_>, initial: &mut Vec<usize>) {
@@ -902,12 +998,14 @@ impl Hunt<'_> {
         // Candidates differ in their Caputo terms, so they cannot share a layout.
         if self.options.initial != Initial::Caputo {
             let mut screen = Screen::<WIDTH>::new(width);
+            self.positions(&cursor, &mut screen.terms);
             while index + WIDTH as u64 <= hi {
                 self.screen_some(&mut cursor, index, limit, &mut screen, &mut open, &mut singular);
                 index += WIDTH as u64;
             }
         }
         let mut screen = Screen::<1>::new(width);
+        self.positions(&cursor, &mut screen.terms);
         while index < hi {
             self.screen_some(&mut cursor, index, limit, &mut screen, &mut open, &mut singular);
             index += 1;
@@ -925,16 +1023,32 @@ impl Hunt<'_> {
         open: &mut Vec<Open>,
         singular: &mut Vec<u64>,
     ) {
-        let Screen { solve, positions, initial, terms, coefficients, weights } = screen;
+        let Screen { solve, positions, initial, terms, columns, coefficients, weights } = screen;
         self.initial(cursor, initial);
-        #[allow(clippy::needless_range_loop)] // lane n of every term
-        for n in 0..L {
-            let table = &self.tables[cursor.block()];
-            cursor.each(|term, digit| positions[term][n] = table[term][digit]);
-            cursor.advance();
+        if let Some((term, digit)) = cursor.stretch(L) {
+            for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
+                *columns = Columns { at: [column; L], same: true, run: false };
+            }
+            let table = &self.tables[cursor.block()][term];
+            positions[term].at = part_of(&table[digit..]);
+            positions[term].compare();
+            cursor.skip(L - 1);
+            self.next(cursor, terms);
+        } else {
+            for n in 0..L {
+                for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
+                    columns.at[n] = column;
+                }
+                self.next(cursor, terms);
+            }
+            positions.iter_mut().for_each(Columns::compare);
         }
         let failed = self.problem.solve(positions, initial, solve);
-        let squares = self.problem.plain.as_ref().map(|plain| plain.error(positions, &solve.coefficients));
+        #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
+        let squares = match &self.problem.plain {
+            Some(plain) => Some(plain.error(positions, &solve.coefficients)),
+            None => None,
+        };
         for n in 0..L {
             let index = index + n as u64;
             if failed[n] {
@@ -944,13 +1058,13 @@ impl Hunt<'_> {
             let (bound, guess) = match (&squares, &self.problem.bound) {
                 (Some((least, guess)), _) => (least[n], guess[n]),
                 (None, Some(bound)) => {
-                    terms.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p[n]);
+                    columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.at[n]);
                     coefficients.iter_mut().zip(&solve.coefficients).for_each(|(c, x)| *c = x[n]);
                     weights.clear();
                     weights.extend(solve.initial.iter().map(|x| x[n]));
                     let e = initial.len();
                     bound.evaluate(limit, |r| {
-                        (&terms[..], &coefficients[..], &initial[..], &weights[r * e..(r + 1) * e])
+                        (&columns[..], &coefficients[..], &initial[..], &weights[r * e..(r + 1) * e])
                     })
                 }
                 (None, None) => (0.0, spread(index)),
@@ -961,6 +1075,14 @@ impl Hunt<'_> {
             }
             open.push(Open { index, bound, guess });
         }
+    }
+
+    /// Goes to the next candidate and its columns.
+    #[inline(always)]
+    fn next(&self, cursor: &mut Cursor<'_>, terms: &mut [usize]) {
+        let changed = cursor.advance();
+        let table = &self.tables[cursor.block()];
+        cursor.each(changed, |term, digit| terms[term] = table[term][digit]);
     }
 
     /// Follows open candidates in this order; what is learnt goes to `kept`, and to the counts if `counted`.
@@ -1050,7 +1172,7 @@ impl Hunt<'_> {
                     let mut initial = Vec::new();
                     this.positions(&cursor, &mut positions);
                     this.initial(&cursor, &mut initial);
-                    let sources: Vec<[usize; 1]> = positions.iter().map(|&p| [p]).collect();
+                    let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
                     let mut solve = Solve::<1>::new();
                     let [failed] = this.problem.solve(&sources, &initial, &mut solve);
                     if failed {
@@ -1094,25 +1216,28 @@ impl Hunt<'_> {
 impl Plain {
     /// Lower bounds of the squared equation error of L candidates, rounding allowed for, and its values.
     #[inline(always)]
-    fn error<const L: usize>(&self, positions: &[[usize; L]], coefficients: &[Lanes<L>]) -> (Lanes<L>, Lanes<L>) {
+    fn error<const L: usize>(&self, positions: &[Columns<L>], coefficients: &[Lanes<L>]) -> (Lanes<L>, Lanes<L>) {
         let (stride, target) = (self.stride, self.stride - 1);
         let mut sum = [self.gram[target * stride + target]; L];
         let mut size = [self.norms[target]; L];
         for (i, (rows, c)) in positions.iter().zip(coefficients).enumerate() {
-            let norms = gather(rows, rows, |p, _| self.norms[p]);
+            let norms = rows.of(&self.norms);
             // c·(c·G_ii + 2 Σ_{j<i} c_j G_ij − 2 b_i)
-            let mut inner = gather(rows, rows, |p, _| self.gram[p * stride + target]);
+            let mut inner = rows.of(&self.gram[target * stride..]);
             for (columns, d) in positions[..i].iter().zip(coefficients) {
-                let g = gather(rows, columns, |p, q| self.gram[p * stride + q]);
+                let g = rows.with(columns, &self.gram, stride);
                 (0..L).for_each(|n| inner[n] -= d[n] * g[n]);
             }
-            let diagonal = gather(rows, rows, |p, _| self.gram[p * stride + p]);
+            let diagonal = rows.of(&self.diagonal);
             for n in 0..L {
                 sum[n] += c[n] * (c[n] * diagonal[n] - 2.0 * inner[n]);
                 size[n] += c[n].abs() * norms[n];
             }
         }
-        let least = std::array::from_fn(|n| sum[n] - self.unit * size[n] * size[n]);
+        let mut least = [0.0; L];
+        for n in 0..L {
+            least[n] = sum[n] - self.unit * size[n] * size[n];
+        }
         (least, sum)
     }
 }
@@ -1173,6 +1298,7 @@ pub fn search(
             }
         }
     }
+    index.sort();
     let problem = Problem::new(records, lattice.output(), index, fixed, options)?;
     let problem = pool.install(|| problem.with_bound(lattice.count()));
     let tables = tables(lattice, &problem)?;
@@ -1205,7 +1331,7 @@ pub fn search(
                     if this.control.stop.load(Ordering::Relaxed) {
                         return Default::default();
                     }
-                    let found = lanes::widest(|| this.screen(lo, hi, limit));
+                    let found = lanes::widest(Screening { hunt: this, lo, hi, limit });
                     let closed = hi - lo - (found.0.len() + found.1.len()) as u64;
                     this.done(closed + found.1.len() as u64, closed);
                     found
