@@ -39,7 +39,7 @@ pub struct Correlation {
     /// r(k) = corr(x(t + k), y(t)) for k = −lags … lags; 0 where a signal does not vary.
     pub values: Vec<f64>,
     /// Variance of each of these if x and y are independent: Bartlett's Σ ρx(τ)ρy(τ)/N (doi:10.2307/2983611), the sum
-    /// cut off where the correlations of x have died away.
+    /// cut off where the correlations of x have died away and no less than for white noise.
     pub variance: f64,
     /// Number of lags that the sum took in on each side.
     pub window: usize,
@@ -83,7 +83,8 @@ pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correl
         sum += 2.0 * rx * ry;
         time += 2.0 * rx * rx;
     }
-    Ok(Correlation { values, variance: sum.max(f64::EPSILON) / count, window })
+    // Estimated correlations of signals that swing apart may add up to nothing or less; white noise is the floor.
+    Ok(Correlation { values, variance: sum.max(1.0) / count, window })
 }
 
 /// Covariances Σ x(t + k) y(t), k = −lags … lags, about the means, summed over runs.

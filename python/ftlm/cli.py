@@ -751,6 +751,7 @@ def plot(
     sliced: Slice = None,
     resample: Resample = None,
     force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Draw a saved model for a paper: its fit or residual tests on runs, or its Bode plot."""
     import io  # noqa: PLC0415
@@ -776,7 +777,7 @@ def plot(
     data = io.BytesIO()
     figure.savefig(data, format=suffix, dpi=200)
     write_atomically(out, data.getvalue(), force=force)
-    print(f"written: {out}")
+    print(json.dumps({"written": out}, ensure_ascii=False) if as_json else f"written: {out}")
 
 
 @app.command()
@@ -790,6 +791,7 @@ def export(
     order: Annotated[int, typer.Option("--order", help="Order of Oustaloup's filter, for control.")] = 5,
     out: Out = None,
     force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Write a saved model for another tool, to a file or to standard output."""
     from ftlm.exports import export_text  # noqa: PLC0415
@@ -804,10 +806,10 @@ def export(
         limits = (low, high)
     text = export_text(ftlm.load_model(model), to.value, band=limits, order=order)
     if out is None:
-        print(text, end="")
+        print(json.dumps({"to": to.value, "text": text}, ensure_ascii=False) if as_json else text.rstrip("\n"))
     else:
         write_atomically(out, text.encode(), force=force)
-        print(f"written: {out}")
+        print(json.dumps({"to": to.value, "written": out}, ensure_ascii=False) if as_json else f"written: {out}")
 
 
 @app.command()

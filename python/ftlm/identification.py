@@ -507,12 +507,13 @@ def _uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
         )
     errors = joint.standard_errors
     for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
-        if errors[name] > high - low:
+        # Negated so that a standard error that is not a number counts as too large.
+        if not errors[name] <= high - low:
             warnings.append(f"order {name} cannot be told from these runs: its standard error exceeds its bounds")
         elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
             warnings.append(f"order {name} = {value:g} is on its bound; widen it")
     for name, value in joint.coefficients.items():
-        if errors[name] > abs(value):
+        if not errors[name] <= abs(value):
             warnings.append(
                 f"coefficient {name} = {value:.4g} is not different from 0 in these runs "
                 f"(standard error {errors[name]:.3g})"

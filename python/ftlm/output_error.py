@@ -130,7 +130,8 @@ class JointFit:
     @property
     def standard_errors(self) -> dict[str, float]:
         """Standard error of each parameter."""
-        return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
+        with np.errstate(invalid="ignore"):
+            return dict(zip(self.names, np.sqrt(np.diag(self.covariance)).tolist(), strict=True))
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
@@ -141,9 +142,10 @@ class JointFit:
 
     @property
     def correlation(self) -> Floats:
-        """Correlation matrix of the parameters."""
-        spread = np.sqrt(np.diag(self.covariance))
-        scaled: Floats = self.covariance / np.outer(spread, spread)
+        """Correlation matrix of the parameters; not a number where a variance is 0 or not finite."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            spread = np.sqrt(np.diag(self.covariance))
+            scaled: Floats = self.covariance / np.outer(spread, spread)
         return scaled
 
 

@@ -239,8 +239,9 @@ def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = 25) -> Residua
     Whiteness: the 99 % band of one autocorrelation of white noise is 2.576/√N; the verdict is the sum of Ljung and Box
     (doi:10.1093/biomet/65.2.297) over all lags against the 99 % quantile of χ². Independence: the variance of one
     cross-correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), which allows for
-    coloured residuals; the verdict is the largest correlation at lags >= 0 against the band that holds for all of them
-    together with 99 % (Šidák). Both tests are of the free run: an equation error that passes proves nothing.
+    coloured residuals and is taken no smaller than for white ones; the verdict is the largest correlation at lags >= 0
+    against the band that holds for all of them together with 99 % (Šidák). Both tests are of the free run: an equation
+    error that passes proves nothing.
     """
     if not isinstance(model, Model):
         raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")

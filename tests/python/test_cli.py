@@ -136,6 +136,8 @@ def test_export_writes_for_other_tools_and_overwrites_nothing(folder: Path) -> N
     assert matlab.returncode == 0, matlab.stderr
     assert "fotf(G_y_u.a" in matlab.stdout
     assert json.loads(ftlm_command("export", "out.json", "--to", "json", cwd=folder).stdout)["outputs"] == ["y"]
+    as_json = json.loads(ftlm_command("export", "out.json", "--to", "matlab", "--json", cwd=folder).stdout)
+    assert as_json["text"].rstrip() == matlab.stdout.rstrip()
     written = ftlm_command("export", "out.json", "--to", "control", "--band", "0.1:100", "-o", "sys.py", cwd=folder)
     assert written.returncode == 0, written.stderr
     assert "control.ss(" in (folder / "sys.py").read_text()

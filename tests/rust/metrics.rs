@@ -121,6 +121,16 @@ fn correlations_of_independent_signals_have_the_stated_variance() {
 }
 
 #[test]
+fn the_variance_never_falls_below_that_of_white_noise() {
+    // Two swings in opposite phase of their correlations: the sum of Bartlett's products is negative.
+    let wave = |omega: f64| (0..2000).map(|k| (omega * f64::from(k)).sin()).collect::<Vec<f64>>();
+    for (a, b) in [(0.05, 0.08), (0.01, 0.03), (0.3, 0.31)] {
+        let found = correlation(&[wave(a)], &[wave(b)], 25).expect("lengths agree");
+        assert!(found.variance >= 1.0 / 2000.0, "{a} {b}: {}", found.variance);
+    }
+}
+
+#[test]
 fn correlations_are_pooled_over_runs_and_normalised() {
     let (a, b) = (white(300, 5), white(200, 6));
     let shifted: Vec<f64> = b.iter().map(|v| 10.0 + v).collect();

@@ -1,0 +1,102 @@
+"""A model that cannot be trusted says so, and what is printed can be computed again from what is saved."""
+
+import re
+
+import numpy as np
+import pytest
+
+import ftlm
+
+WORDS = "D^alpha y = a D^0.6 y + c y + b u"
+
+
+def said(found, words):
+    return [w for w in found.warnings if words in w]
+
+
+@pytest.fixture(scope="module")
+def noisy(small_run, with_noise):
+    return with_noise(small_run, 0.01, 4)
+
+
+def test_a_model_that_can_be_trusted_warns_of_nothing(noisy, small_model):
+    found = ftlm.identify(noisy, ftlm.equation(WORDS))
+    assert found.warnings == ()
+    n = 700
+    blank = ftlm.Run.from_arrays(
+        step=0.02, inputs={"u": np.sin(np.arange(n) ** 1.2 / 30)}, outputs={"y": np.zeros(n)}, units=noisy.units
+    )
+    assert found.validate(small_model.simulate(blank, tolerance=1e-4)).warnings == ()
+
+
+def test_near_identity_orders_say_so(clean_a, with_noise):
+    run = with_noise(clean_a, 1e-4, 1)
+    structure = ftlm.flexible_link(stage=1, coupling="measured", laws=()).equation("theta12")
+    orders = {"alpha2": 2.0, "beta2": 1.95, "mu2": 1.9, "gamma2": 1.05}
+    found = ftlm.identify(run, structure.with_orders(orders), method="least-squares")
+    (warning,) = said(found, "nearly says that theta12 equals itself")
+    assert "orders 1.95, 1.9 are close to alpha = 2" in warning
+    assert found.equation_error["theta12"].nr < 0.2 * found.output_error["theta12"].nr
+
+
+@pytest.mark.parametrize("method", ["least-squares", "output-error"])
+def test_orders_on_the_edge_of_their_interval_say_so(noisy, method):
+    structure = ftlm.equation(WORDS, orders={"alpha": "1.1:1.4:0.1"})
+    found = ftlm.identify(noisy, structure, method=method)
+    assert found.orders["alpha"] == pytest.approx(1.4)
+    assert said(found, "order alpha = 1.4 is on ")
+
+
+def test_an_order_that_the_run_says_nothing_of_says_so(small_run, with_noise):
+    # The truth has no such term: its order can be anything.
+    run = with_noise(small_run, 0.3, 2)
+    structure = ftlm.equation("D^1.6 y = -3 D^0.6 y + c y + b u + d D^kappa u", orders={"kappa": "0:0.5:0.05"})
+    found = ftlm.identify(run, structure)
+    width = 0.5
+    assert found.standard_errors["kappa"] > width or abs(found.coefficients["d"]) < 2 * found.standard_errors["d"]
+    assert [w for w in found.warnings if "kappa" in w or "coefficient d" in w], found.warnings
+
+
+def test_standard_errors_wider_than_the_bounds_say_so(noisy):
+    from dataclasses import replace
+
+    from ftlm.identification import _uncertain
+    from ftlm.output_error import FreeProblem
+
+    structure = ftlm.equation(WORDS, orders={"alpha": "1.5:1.7:0.1"})
+    joint = ftlm.identify(noisy, structure).joint
+    problem = FreeProblem.of(structure)
+    assert not [w for w in _uncertain(joint, problem) if "alpha" in w]
+    for value in (0.3**2, np.nan, np.inf):
+        covariance = joint.covariance.copy()
+        covariance[0, 0] = value
+        words = _uncertain(replace(joint, covariance=covariance), problem)
+        assert "order alpha cannot be told from these runs: its standard error exceeds its bounds" in words, value
+
+
+def test_what_is_printed_is_what_compare_says(noisy, tmp_path):
+    for method in ("output-error", "least-squares", "multi-innovation"):
+        found = ftlm.identify(noisy, ftlm.equation(WORDS, orders={"alpha": "1.5:1.7:0.1"}), method=method)
+        loaded = ftlm.load_model(found.model.save(tmp_path / f"{method}.json"))
+        again = loaded.compare(noisy)
+        for name, figures in found.output_error.items():
+            assert again.output_error[name].fit == pytest.approx(figures.fit, rel=1e-12)
+            assert again.equation_error[name].nr == pytest.approx(found.equation_error[name].nr, rel=1e-12)
+        printed = re.search(r"^y +output error.* ([\d.]+)$", str(found), re.MULTILINE)
+        assert float(printed[1]) == pytest.approx(again.fit_percent["y"], rel=1e-3)
+
+
+def test_every_figure_of_a_report_follows_from_the_saved_model_and_the_run(noisy, tmp_path):
+    found = ftlm.identify(noisy, ftlm.equation(WORDS))
+    page = found.report(tmp_path / "p.html").read_text("utf-8")
+    shown = {float(v) for v in re.findall(r'<data value="([^"]+)">', page)}
+    loaded = ftlm.load_model(found.model.save(tmp_path / "m.json"))
+    comparison, tests = loaded.compare(noisy), loaded.resid(noisy)
+    figures = [*comparison.output_error.values(), *comparison.equation_error.values()]
+    expected = {v for f in figures for v in (f.error, f.rmse, f.nr, f.fit)}
+    expected |= {
+        v for t in (tests.outputs["y"].whiteness, tests.outputs["y"].inputs["u"]) for v in (t.statistic, t.limit)
+    }
+    expected |= set(loaded.orders.values()) | set(loaded.coefficients.values())
+    expected |= {v for v in loaded.estimate.standard_errors.values() if v is not None}
+    assert expected <= shown
