@@ -5,13 +5,16 @@ use crate::error::{Error, Result};
 /// Refuses a length that is no power of two.
 ///
 /// # Errors
-/// [`Error::NotPowerOfTwo`] with the two nearest powers.
+/// [`Error::NotPowerOfTwo`] with the two nearest powers, [`Error::Length`] for m = 0.
 pub fn check_power_of_two(m: usize) -> Result<()> {
+    if m == 0 {
+        return Err(Error::Length { name: "the signal".into(), expected: 1, found: 0 });
+    }
     if m.is_power_of_two() {
         Ok(())
     } else {
         let above = m.next_power_of_two();
-        Err(Error::NotPowerOfTwo { m, below: (above / 2).max(1), above })
+        Err(Error::NotPowerOfTwo { m, below: above / 2, above })
     }
 }
 

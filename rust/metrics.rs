@@ -17,9 +17,15 @@ pub struct Metrics {
 }
 
 /// Compares a measurement with residuals e = y − ŷ of the same length. Not finite where the residuals are not.
-#[must_use]
+///
+/// # Errors
+/// [`Error::Length`] for nothing, or for lengths that differ.
 #[allow(clippy::cast_precision_loss)]
-pub fn metrics(measured: &[f64], residuals: &[f64]) -> Metrics {
+pub fn metrics(measured: &[f64], residuals: &[f64]) -> Result<Metrics> {
+    if measured.is_empty() {
+        return Err(Error::Length { name: "measured".into(), expected: 1, found: 0 });
+    }
+    check_length("residuals", measured.len(), residuals.len())?;
     let m = measured.len() as f64;
     let mean = measured.iter().sum::<f64>() / m;
     let deviation = measured.iter().map(|y| (y - mean) * (y - mean)).sum::<f64>();
@@ -30,7 +36,7 @@ pub fn metrics(measured: &[f64], residuals: &[f64]) -> Metrics {
     let error = if error.is_nan() { f64::INFINITY } else { error };
     let squares = if squares.is_nan() { f64::INFINITY } else { squares };
     let nr = (squares / deviation).sqrt();
-    Metrics { error, rmse: (squares / m).sqrt(), nr, fit_percent: 100.0 * (1.0 - nr) }
+    Ok(Metrics { error, rmse: (squares / m).sqrt(), nr, fit_percent: 100.0 * (1.0 - nr) })
 }
 
 /// Correlations of two signals, pooled over runs.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -494,15 +495,19 @@ def _search_one(job: _Job) -> SearchResult:
     axes = [
         (signals.index(t.signal), axis_of(t.order, values), bool(t.order.names) and t.fixed is None) for t in item.terms
     ]
-    found = _core.search(
-        [r.core() for r in job.records],
-        (signals.index(item.output), axis_of(item.order, values), axes),
-        list(first.inputs),
-        [t.fixed for t in item.terms],
-        initial_tuple(first.initial),
-        job.settings.core(),
-        job.progress,
-    )
+    try:
+        found = _core.search(
+            [r.core() for r in job.records],
+            (signals.index(item.output), axis_of(item.order, values), axes),
+            list(first.inputs),
+            [t.fixed for t in item.terms],
+            initial_tuple(first.initial),
+            job.settings.core(),
+            job.progress,
+        )
+    except ModelError as error:
+        # The core knows signals by number.
+        raise ModelError(re.sub(r"signal (\d+)", lambda m: f"signal {signals[int(m[1])]!r}", str(error))) from None
 
     def named(alpha: float, orders: list[float]) -> dict[str, float]:
         pairs = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
@@ -553,7 +558,8 @@ def _search_law(job: _Job) -> SearchResult:
         for item, (_, _, _, c, _) in zip(structure.equations, parts, strict=True):
             coefficients |= named_coefficients(item, c)
         table.append(SearchRow(rank, index, score, dict(zip(names, free, strict=True)), coefficients))
-    return _result(job, table, dict(cast("Mapping[str, int]", found["counts"])), [])
+    failures = [(dict(zip(names, free, strict=True)), str(reason)) for _, free, reason in found["failures"]]
+    return _result(job, table, dict(cast("Mapping[str, int]", found["counts"])), failures)
 
 
 def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:

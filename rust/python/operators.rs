@@ -22,6 +22,7 @@ fn choice(name: &str, given: &str, known: &str) -> Error {
 #[pyo3(signature = (order, m, step, *, derivative = false))]
 pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, derivative: bool) -> PyResult<Array<'_>> {
     let kernel = detached(py, || {
+        check_points(m)?;
         fractional::check_order("order", order)?;
         check_step(step)?;
         Ok(if derivative {
@@ -33,9 +34,29 @@ pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, deriv
     Ok(PyArray1::from_vec(py, kernel))
 }
 
+/// More points than any record has would exhaust memory by a slip of the hand.
+const MOST_POINTS: usize = 1 << 27;
+
+fn check_points(m: usize) -> crate::error::Result<()> {
+    if m > MOST_POINTS {
+        #[allow(clippy::cast_precision_loss)]
+        return Err(Error::OutOfRange {
+            name: "m".into(),
+            value: m as f64,
+            range: format!("[0, {MOST_POINTS}]"),
+            remedy: "ask for as many points as the record has".into(),
+        });
+    }
+    Ok(())
+}
+
 #[pyfunction]
-pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> Array<'_> {
-    PyArray1::from_vec(py, fractional::grunwald_letnikov_weights(order, m))
+pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> PyResult<Array<'_>> {
+    let weights = detached(py, || {
+        check_points(m)?;
+        Ok(fractional::grunwald_letnikov_weights(order, m))
+    })?;
+    Ok(PyArray1::from_vec(py, weights))
 }
 
 #[pyfunction]

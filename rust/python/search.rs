@@ -216,9 +216,10 @@ pub fn search_stage<'py>(
             terms: terms.into_iter().map(|(signal, order)| (signal, affine(order))).collect(),
         })
         .collect();
-    let outcome = watched(py, progress.as_ref(), |control| {
+    let (lattice, outcome) = watched(py, progress.as_ref(), |control| {
         let lattice = LawLattice::new(&axes, &equations, &inputs)?;
-        stage::search(&records, &lattice, &fixed, &scales, &options, control)
+        let outcome = stage::search(&records, &lattice, &fixed, &scales, &options, control)?;
+        Ok((lattice, outcome))
     })?;
     let rows: Vec<_> = outcome
         .rows
@@ -239,6 +240,9 @@ pub fn search_stage<'py>(
     let dict = PyDict::new(py);
     dict.set_item("rows", rows)?;
     dict.set_item("counts", counted(py, &outcome.counts)?)?;
+    let failures: Vec<(u64, Vec<f64>, &str)> =
+        outcome.failures.iter().map(|&(index, failure)| (index, lattice.free(index), named(failure))).collect();
+    dict.set_item("failures", failures)?;
     dict.set_item("distinct", outcome.distinct)?;
     Ok(dict)
 }

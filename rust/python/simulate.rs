@@ -118,8 +118,7 @@ pub fn metrics(
 ) -> PyResult<(f64, f64, f64, f64)> {
     let measured = vector("measured", &measured)?;
     let residuals: Vec<f64> = residuals.as_array().iter().copied().collect();
-    check_length("residuals", measured.len(), residuals.len())?;
-    let found = crate::metrics::metrics(&measured, &residuals);
+    let found = crate::metrics::metrics(&measured, &residuals)?;
     Ok((found.error, found.rmse, found.nr, found.fit_percent))
 }
 

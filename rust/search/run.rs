@@ -36,7 +36,7 @@ const VECTORS: usize = 16;
 /// Transforms that following one candidate is worth; making test vectors must stay below a fraction of all that.
 const TRANSFORMS: u64 = 6;
 /// Failures listed one by one; the rest are only counted.
-const LISTED: usize = 100;
+pub(crate) const LISTED: usize = 100;
 /// Most threads a search starts.
 pub const MAX_THREADS: usize = 1024;
 

@@ -14,7 +14,7 @@ use crate::error::{check_length, Error, Result};
 use crate::regressors::{Index, Record};
 use crate::search::lattice::LawLattice;
 use crate::search::run::{
-    index_alpha, index_orders, pool, Control, Counts, Failure, Norm, Options, Problem, Row, Scratches, Verdict,
+    index_alpha, index_orders, pool, Control, Counts, Failure, Norm, Options, Problem, Row, Scratches, Verdict, LISTED,
 };
 
 /// An equation's candidates are first followed up to this multiple of its best score.
@@ -44,6 +44,8 @@ pub struct StageOutcome {
     pub rows: Vec<StageRow>,
     /// What became of the tuples.
     pub counts: Counts,
+    /// The first tuples without a score by index, at most 100.
+    pub failures: Vec<(u64, Failure)>,
     /// Distinct candidates of each equation.
     pub distinct: Vec<u64>,
 }
@@ -53,6 +55,8 @@ pub struct StageOutcome {
 struct Entry {
     value: f64,
     exact: bool,
+    /// Whether a bound without a run is all that is known.
+    bounded: bool,
     failure: Option<Failure>,
 }
 
@@ -97,14 +101,13 @@ impl Table<'_> {
             return Err(Error::Interrupted);
         }
         for (id, verdict) in verdicts {
+            let score = |raw: f64| self.problem.score(raw) / self.scale;
+            let open = Entry { value: 0.0, exact: false, bounded: false, failure: None };
             self.entries[id] = match verdict {
-                Verdict::Score(raw) => {
-                    Entry { value: self.problem.score(raw) / self.scale, exact: true, failure: None }
-                }
-                Verdict::Bounded(raw) | Verdict::Stopped(raw) => {
-                    Entry { value: self.problem.score(raw) / self.scale, exact: false, failure: None }
-                }
-                Verdict::Failed(failure) => Entry { value: f64::INFINITY, exact: true, failure: Some(failure) },
+                Verdict::Score(raw) => Entry { value: score(raw), exact: true, ..open },
+                Verdict::Bounded(raw) => Entry { value: score(raw), bounded: true, ..open },
+                Verdict::Stopped(raw) => Entry { value: score(raw), ..open },
+                Verdict::Failed(failure) => Entry { value: f64::INFINITY, exact: true, failure: Some(failure), ..open },
             };
         }
         Ok(())
@@ -177,8 +180,9 @@ pub fn search(
         }
         #[allow(clippy::cast_precision_loss)]
         let samples = records.iter().map(Record::m).sum::<usize>() as f64;
-        let entries = vec![Entry { value: 0.0, exact: false, failure: None }; structures.len()];
+        let entries = vec![Entry { value: 0.0, exact: false, bounded: false, failure: None }; structures.len()];
         let problem = Problem::new(records, equations[e].output, index, &fixed[e], options)?;
+        let problem = pool.install(|| problem.with_bound(structures.len() as u64));
         tables.push(Table { problem, structures, entries, scale: scales[e], samples, options });
     }
 
@@ -201,12 +205,12 @@ pub fn search(
     }
 
     let mut raise = FIRST_LIMIT;
-    let (kept, counts) = loop {
-        let (kept, counts) = join(lattice, &ids, &tables, options.keep, &pool, control)?;
+    let (kept, counts, failures) = loop {
+        let (kept, counts, failures) = join(lattice, &ids, &tables, options.keep, &pool, control)?;
         let worst = if kept.len() == options.keep { kept[kept.len() - 1].0 } else { f64::INFINITY };
         let wanted = unresolved(lattice, &ids, &tables, worst, raise, &pool, control)?;
         if wanted.iter().all(Vec::is_empty) {
-            break (kept, counts);
+            break (kept, counts, failures);
         }
         for (table, wanted) in tables.iter_mut().zip(&wanted) {
             table.evaluate(wanted, &pool, control)?;
@@ -228,7 +232,7 @@ pub fn search(
         }
         rows.push(StageRow { index, free: lattice.free(index), score, structures, rows: parts });
     }
-    Ok(StageOutcome { rows, counts, distinct })
+    Ok(StageOutcome { rows, counts, failures, distinct })
 }
 
 /// Length of the index ranges that threads take.
@@ -257,6 +261,9 @@ fn entries(
         .collect()
 }
 
+/// Best exact tuples, what became of all, and the first failures.
+type Joined = (Vec<(f64, u64)>, Counts, Vec<(u64, Failure)>);
+
 /// Best exact tuples and what became of all.
 fn join(
     lattice: &LawLattice,
@@ -265,12 +272,12 @@ fn join(
     keep: usize,
     pool: &rayon::ThreadPool,
     control: &Control,
-) -> Result<(Vec<(f64, u64)>, Counts)> {
+) -> Result<Joined> {
     let best = |kept: &mut Vec<(f64, u64)>| {
         kept.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
         kept.truncate(keep);
     };
-    let parts: Vec<(Vec<(f64, u64)>, Counts)> = pool.install(|| {
+    let parts: Vec<Joined> = pool.install(|| {
         chunks(lattice.product())
             .into_par_iter()
             .map(|(lo, hi)| {
@@ -279,10 +286,15 @@ fn join(
                 }
                 let mut kept = Vec::new();
                 let mut counts = Counts::default();
+                let mut failures = Vec::new();
                 for index in lo..hi {
                     let Some(found) = entries(lattice, ids, tables, index) else { continue };
                     counts.candidates += 1;
-                    match found.iter().find_map(|(_, entry)| entry.failure) {
+                    let failure = found.iter().find_map(|(_, entry)| entry.failure);
+                    if let (Some(failure), true) = (failure, failures.len() < LISTED) {
+                        failures.push((index, failure));
+                    }
+                    match failure {
                         Some(Failure::Singular) => counts.singular += 1,
                         Some(Failure::Diverged) => counts.diverged += 1,
                         None if found.iter().all(|(_, entry)| entry.exact) => {
@@ -292,20 +304,24 @@ fn join(
                                 best(&mut kept);
                             }
                         }
+                        None if found.iter().all(|(_, entry)| entry.exact || entry.bounded) => counts.bounded += 1,
                         None => counts.stopped += 1,
                     }
                 }
                 best(&mut kept);
-                Ok((kept, counts))
+                Ok((kept, counts, failures))
             })
             .collect::<Result<_>>()
     })?;
     let mut kept = Vec::new();
     let mut counts = Counts::default();
-    for (rows, part) in parts {
+    let mut failures = Vec::new();
+    for (rows, part, failed) in parts {
         kept.extend(rows);
+        failures.extend(failed.into_iter().take(LISTED - failures.len()));
         counts.candidates += part.candidates;
         counts.beaten += part.beaten;
+        counts.bounded += part.bounded;
         counts.stopped += part.stopped;
         counts.singular += part.singular;
         counts.diverged += part.diverged;
@@ -313,7 +329,7 @@ fn join(
     best(&mut kept);
     counts.kept = kept.len() as u64;
     counts.beaten -= counts.kept;
-    Ok((kept, counts))
+    Ok((kept, counts, failures))
 }
 
 /// Inexact entries that could still be part of a kept tuple, with the score up to which to follow each.

@@ -109,6 +109,17 @@ def test_block_pulse_rule_is_the_oracles_matrix(order):
 # Derivatives
 
 
+def test_absurd_numbers_of_points_are_refused():
+    for call in (lambda m: _core.grunwald_letnikov_weights(0.5, m), lambda m: _core.block_pulse_kernel(0.5, m, 0.1)):
+        with pytest.raises(ftlm.ModelError, match=r"m = 1e\+?15|m = 10{15} is outside \[0, 134217728\]; ask for"):
+            call(10**15)
+
+
+def test_figures_of_nothing_are_refused():
+    with pytest.raises(ftlm.DataError, match="measured has length 0, but 1 is needed"):
+        _core.metrics(np.zeros(0), np.zeros(0))
+
+
 def test_grunwald_letnikov_weights_are_exact(reference):
     for known in reference("grunwald_letnikov")["records"]:
         found = _core.grunwald_letnikov_weights(known["alpha"], max(known["j"]) + 1)[known["j"]]

@@ -1,5 +1,6 @@
 """Order searches against enumeration in NumPy; one table for any number of threads, counted to the last candidate."""
 
+import io
 import itertools
 import json
 import os
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 import ftlm
+import ftlm.progress
 import oracles
 from ftlm.order_search import Settings, available_threads, check_threads
 
@@ -280,6 +282,49 @@ def test_stage_under_its_law_is_enumeration(drive, plant, with_noise, criterion,
         assert row.score == pytest.approx(score, rel=1e-5)
         assert row.orders == orders
         assert row.coefficients == {n: pytest.approx(v, rel=1e-3, abs=1e-6) for n, v in coefficients.items()}
+
+
+def test_failures_under_a_law_are_listed_with_their_reason(run):
+    # The same current twice: where the law gives both terms one order they cannot be told apart.
+    twice = ftlm.Run.from_arrays(step=run.step, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]})
+    structure = ftlm.equation("D^alpha y = a D^(alpha-1) y + b u + c D^(alpha-1.5) v", initial="rest")
+    lattice = ftlm.lattice(step=0.1, alpha=(1.3, 1.7))
+    for threads in (1, 2):
+        found = ftlm.search_orders(twice, structure, lattice, m=M, coefficients="least-squares", threads=threads)
+        assert found.failures == [({"alpha": 1.5}, "singular")]
+        assert found.pruned["singular"] == 1
+        assert sum(found.pruned.values()) + len(found.table) == found.candidates == 5
+
+
+def test_an_empty_lattice_names_its_signal(run):
+    with pytest.raises(ftlm.ModelError, match=r"no orders of signal 'y' fit below alpha = 0\.5"):
+        search_empty(run)
+
+
+def search_empty(run):
+    lattice = ftlm.Lattice(orders={"alpha": [0.5], "beta": [1.0], "mu": [1.1]})
+    return ftlm.search_orders(run, ftlm.equation(EQUATION), lattice, m=M)
+
+
+def test_progress_shows_rate_share_pruned_and_time_left(monkeypatch, run):
+    shown = io.StringIO()
+    shown.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", shown)
+    monkeypatch.setattr(ftlm.progress, "PATIENCE", 0.0)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    with ftlm.progress.Progress("searching") as bar:
+        bar(250, 1000, 200)
+        bar(500, 1000, 499)
+    text = shown.getvalue()
+    assert "searching" in text
+    assert "500/1,000" in text
+    assert "99.8 % pruned" in text
+    assert "/s" in text
+    # Somebody else's function is told two numbers, as ever.
+    told = []
+    search(run, progress=lambda done, total: told.append((done, total)))
+    assert told[-1] == (36, 36)
 
 
 def test_one_equation_under_a_law_is_searched_too(run):

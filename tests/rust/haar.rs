@@ -63,7 +63,9 @@ fn lengths_that_are_no_power_of_two_are_named_with_their_neighbours() {
         message,
         "Haar coordinates need m to be a power of two, not 12; take m = 8 or 16, or block-pulse (time) coordinates"
     );
-    assert!(matches!(haar::check_power_of_two(0), Err(Error::NotPowerOfTwo { m: 0, below: 1, above: 1 })));
+    // Nothing has no neighbours to be named.
+    assert!(matches!(haar::check_power_of_two(0), Err(Error::Length { expected: 1, found: 0, .. })));
+    assert!(haar::transform(&mut []).is_err());
 }
 
 #[test]

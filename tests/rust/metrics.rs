@@ -5,18 +5,18 @@ use ftlm::metrics::{correlation, covariances, covariances_naive, metrics};
 
 #[test]
 fn the_four_figures_of_a_small_case() {
-    let found = metrics(&[1.0, 3.0, 1.0, 3.0], &[0.5, -0.5, 0.5, -0.5]);
+    let found = metrics(&[1.0, 3.0, 1.0, 3.0], &[0.5, -0.5, 0.5, -0.5]).unwrap();
     assert_eq!((found.error, found.rmse, found.nr, found.fit_percent), (2.0, 0.5, 0.5, 50.0));
-    let perfect = metrics(&[1.0, 2.0], &[0.0, 0.0]);
+    let perfect = metrics(&[1.0, 2.0], &[0.0, 0.0]).unwrap();
     assert_eq!((perfect.error, perfect.nr, perfect.fit_percent), (0.0, 0.0, 100.0));
     // The mean of the measurement, as a response, explains nothing: a fit of zero.
-    assert_eq!(metrics(&[1.0, 3.0], &[-1.0, 1.0]).fit_percent, 0.0);
+    assert_eq!(metrics(&[1.0, 3.0], &[-1.0, 1.0]).unwrap().fit_percent, 0.0);
 }
 
 #[test]
 fn a_diverged_response_has_no_finite_figures() {
     for bad in [f64::NAN, f64::INFINITY, 1e200] {
-        let found = metrics(&[1.0, 2.0, 3.0], &[0.0, bad, 0.0]);
+        let found = metrics(&[1.0, 2.0, 3.0], &[0.0, bad, 0.0]).unwrap();
         assert!(found.rmse.is_infinite() && found.nr.is_infinite(), "{bad}: {found:?}");
         assert_eq!(found.fit_percent, f64::NEG_INFINITY);
         assert_eq!(found.error.is_infinite(), !bad.is_finite());
@@ -92,6 +92,12 @@ fn covariances_by_spectra_are_those_by_definition() {
     let found = covariances(&x, &y, 4);
     let largest = (0..9).max_by(|&a, &b| found[a].total_cmp(&found[b]));
     assert_eq!(largest, Some(4 + 2));
+}
+
+#[test]
+fn figures_of_nothing_are_refused() {
+    assert_eq!(metrics(&[], &[]), Err(Error::Length { name: "measured".into(), expected: 1, found: 0 }));
+    assert_eq!(metrics(&[1.0], &[]), Err(Error::Length { name: "residuals".into(), expected: 1, found: 0 }));
 }
 
 #[test]

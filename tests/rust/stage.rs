@@ -9,7 +9,7 @@ use ftlm::estimate::least_squares;
 use ftlm::estimate::multi_innovation::{Innovation, Rows};
 use ftlm::regressors::Record;
 use ftlm::search::lattice::{LawEquation, LawLattice, MAX_TUPLES};
-use ftlm::search::run::{Control, Criterion, Estimator, Norm, Options};
+use ftlm::search::run::{Control, Criterion, Estimator, Failure, Norm, Options};
 use ftlm::search::stage::{search, StageOutcome};
 use ftlm::simulate::{equation_error, respond};
 
@@ -314,11 +314,25 @@ fn singular_and_diverged_tuples_are_counted() {
     let silent = with_signal(&base, 2, vec![0.0; 2000]);
     let found = search(&[silent], &lattice, &free(), &[1.0; 2], &options(), &Control::default()).unwrap();
     assert_eq!((found.counts.singular, found.counts.candidates, found.rows.len()), (tuples, tuples, 0));
+    let accepted: Vec<u64> = (0..lattice.product()).filter(|&i| lattice.structures(i).is_some()).collect();
+    let listed: Vec<(u64, Failure)> = accepted.iter().map(|&i| (i, Failure::Singular)).collect();
+    assert_eq!(found.failures, listed);
+    // More than are listed one by one.
+    let fine = LawLattice::new(&fine_axes(), &two_link(), &INPUTS).unwrap();
+    for threads in [1, 3] {
+        let options = Options { threads, ..options() };
+        let found =
+            search(&[with_signal(&base, 2, vec![0.0; 2000])], &fine, &free(), &[1.0; 2], &options, &Control::default());
+        let first = (0..fine.product()).filter(|&i| fine.structures(i).is_some()).take(100);
+        assert_eq!(found.unwrap().failures, first.map(|i| (i, Failure::Singular)).collect::<Vec<_>>());
+    }
     // Known coefficients with which every run explodes.
     let mut fixed = free();
     (fixed[1][0], fixed[1][2]) = (Some(2e3), Some(0.0));
     let found = search(&[base], &lattice, &fixed, &[1.0; 2], &options(), &Control::default()).unwrap();
     assert_eq!((found.counts.diverged, found.counts.candidates, found.rows.len()), (tuples, tuples, 0));
+    assert!(found.failures.iter().all(|f| f.1 == Failure::Diverged));
+    assert_eq!(found.failures.len() as u64, tuples);
 }
 
 #[test]
