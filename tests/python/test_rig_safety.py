@@ -203,14 +203,14 @@ def test_an_exception_outside_the_loop_leaves_the_motors_off(bench):
     bench.assert_safe(within=152)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_leave_the_motors_off(bench, number):
-    before = signal.getsignal(signal.SIGTERM)
+    before = signal.getsignal(number)
     bench.at(50, lambda: os.kill(os.getpid(), number))
     with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else SystemExit), bench.rig() as link:
         link.run(drive())
     bench.assert_safe(within=153)
-    assert signal.getsignal(signal.SIGTERM) is before
+    assert signal.getsignal(number) is before
 
 
 def test_garbage_collection_leaves_the_motors_off(bench):
@@ -218,10 +218,11 @@ def test_garbage_collection_leaves_the_motors_off(bench):
     link.__enter__()
     link.run(drive(50))
     assert bench.enabled
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     del link
     gc.collect()
     bench.assert_safe(within=152)
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
 
 
 @pytest.mark.parametrize("failing", ["write", "enable", "stop", "stop_watchdog", "close"])

@@ -191,6 +191,11 @@ class Excitation:
         return {k: list(v) if isinstance(v, tuple) else v for k, v in told.items() if v is not None}
 
 
+def partial_of(target: Path) -> Path:
+    """Where the rows of a run are until it has ended."""
+    return target.with_name(target.name + ".partial")
+
+
 class Partial:
     """Rows on disk while they come: a csv file beside the one asked for, which loads should the program die.
 
@@ -203,7 +208,7 @@ class Partial:
     """
 
     def __init__(self, target: Path | None, name: str, step: float, about: dict[str, Any]) -> None:
-        self.path = None if target is None else target.with_name(target.name + ".partial")
+        self.path = None if target is None else partial_of(target)
         self._step, self._rows = step, 0
         self._descriptor: int | None = None
         if self.path is None:
@@ -560,3 +565,9 @@ def _check_target(target: Path, *, force: bool) -> None:
         raise DataError(f"{str(target)!r} exists; choose another name, or overwrite it with force=True (--force)")
     if not target.resolve().parent.is_dir():
         raise DataError(f"{str(target.parent)!r} is no folder; make it first")
+    left = partial_of(target)
+    if left.exists() and not force:
+        raise DataError(
+            f"{str(left)!r} holds what was recorded by a program that did not end; load it, rename or remove it, or "
+            "overwrite it with force=True (--force)"
+        )

@@ -188,7 +188,7 @@ def shut_down(board: Board) -> list[str]:
 class Rig:
     """A rig between its start and its way out; use it in a ``with`` statement.
 
-    However the block is left (its end, an exception, Ctrl-C, SIGTERM, garbage collection), 0 V is written, the
+    However the block is left (its end, an exception, Ctrl-C, SIGTERM, SIGHUP, garbage collection), 0 V is written, the
     amplifiers are disabled, task and watchdog stopped and the board closed, each step tried even if one before it
     fails. If the program dies or freezes, the watchdog puts 0 V out.
 
@@ -235,13 +235,17 @@ class Rig:
         self.troubles: list[str] = []
         self._samples = 0
         self._finalizer: weakref.finalize[Any, Any] | None = None
-        self._handler: Any = None
+        self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> Rig:
         board = self.board
         self._finalizer = weakref.finalize(self, shut_down, board)
         if threading.current_thread() is threading.main_thread():
-            self._handler = signal.signal(signal.SIGTERM, _terminated)
+            # A closed terminal ends a program too.
+            for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
+                number = getattr(signal, name, None)
+                if number is not None:
+                    self._handlers[number] = signal.signal(number, _terminated)
         try:
             board.open()
             board.configure(self.rate)
@@ -270,9 +274,9 @@ class Rig:
             if self._finalizer is not None:
                 self.troubles += self._finalizer() or []
         finally:
-            if self._handler is not None:
-                signal.signal(signal.SIGTERM, self._handler)
-                self._handler = None
+            while self._handlers:
+                number, handler = self._handlers.popitem()
+                signal.signal(number, handler)
 
     def _check(self) -> None:
         fault = self.guard.fault
