@@ -469,8 +469,9 @@ impl Plant {
                 }
             }
         }
+        // The arm rests in the middle of a count, so that counting has no bias.
         #[allow(clippy::cast_possible_truncation)]
-        let mut counts: [i32; 2] = std::array::from_fn(|j| (angles[2 * j] / s.encoder_scale[j]).floor() as i32);
+        let mut counts: [i32; 2] = std::array::from_fn(|j| (angles[2 * j] / s.encoder_scale[j] + 0.5).floor() as i32);
         for injection in &self.injections {
             if let Injection::DeadEncoder { stage, from } = *injection {
                 if self.sample >= from {

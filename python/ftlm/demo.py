@@ -13,8 +13,9 @@ from ftlm.flexible_link import flexible_link, link_model
 from ftlm.identification import Identification, identify, multi_innovation_trace
 from ftlm.models import Model
 from ftlm.order_search import Lattice
+from ftlm.rig import record
 from ftlm.runs import Run
-from ftlm.simulation import explicit_euler, simulate
+from ftlm.simulation import explicit_euler
 from ftlm.validation import Metrics, compare, metrics
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ __all__ = ["Demo", "StageRow", "demo_plant", "demo_run", "run_demo"]
 INNOVATION_LENGTHS = (1, 3, 5, 7)
 #: Steps between two points of a convergence curve: 128 points are more than a page shows.
 TRACE_EVERY = 16
+#: The paper's inputs and their amplitudes [A].
+AMPLITUDES = {"square": 0.3, "sine": 0.6}
 #: The demonstration's arm: the effective coefficients, with fractional damping and friction in the link.
 PLANTS: dict[int, tuple[dict[str, float], dict[str, float]]] = {
     1: (
@@ -56,7 +59,7 @@ def demo_plant(stage: int) -> Model:
 
 
 def demo_run(shape: str, *, duration: float = 10.0, step: float = 0.002, noise: float = 1e-4, seed: int = 1) -> Run:
-    """A run of both simulated stages under the paper's inputs.
+    """A run of the virtual rig under the paper's inputs: the linear arm, encoders and all, and noise on every angle.
 
     Parameters
     ----------
@@ -82,25 +85,21 @@ def demo_run(shape: str, *, duration: float = 10.0, step: float = 0.002, noise: 
     """
     if not (np.isfinite(noise) and noise >= 0):
         raise ModelError(f"noise = {noise} rad is not a non-negative number")
-    rows = round(duration / step) + 1
-    t = np.arange(rows) * step
-    if shape == "square":
-        # Half a sample of slack keeps rounding from moving an edge.
-        current = np.where((t + step / 2) % 2.0 < 1.0, 0.3, -0.3)
-    elif shape == "sine":
-        current = 0.6 * np.sin(6.3 * t)
-    else:
+    if shape not in AMPLITUDES:
         raise ModelError(f"shape = {shape!r} is not known; use 'square' or 'sine'")
-    inputs = {"I1": current, "I2": current}
-    rng = np.random.default_rng([seed, ("square", "sine").index(shape)])
-    outputs: dict[str, Floats] = {}
-    for stage in (1, 2):
-        names = (f"theta{stage}1", f"theta{stage}2")
-        blank = Run.from_arrays(step=step, inputs=inputs, outputs={n: np.zeros(rows) for n in names}, name=shape)
-        truth = simulate(demo_plant(stage), blank, tolerance=1e-5)
-        outputs |= {n: truth[n] + noise * rng.standard_normal(rows) for n in names}
-    units = {n: "A" for n in inputs} | {n: "rad" for n in outputs}
-    return Run.from_arrays(step=step, inputs=inputs, outputs=outputs, units=units, name=shape)
+    recorded = record(
+        input=shape, amplitude=AMPLITUDES[shape], duration=duration, limit=duration, rate=1.0 / step, seed=seed,
+        parameters="linear",
+    )  # fmt: skip
+    rng = np.random.default_rng([seed, list(AMPLITUDES).index(shape)])
+    angles = [f"theta{stage}{k}" for stage in (1, 2) for k in (1, 2)]
+    return Run.from_arrays(
+        step=step,
+        inputs={name: recorded[name] for name in ("I1", "I2")},
+        outputs={name: recorded[name] + noise * rng.standard_normal(recorded.length) for name in angles},
+        units={"I1": "A", "I2": "A"} | dict.fromkeys(angles, "rad"),
+        name=shape,
+    )
 
 
 @dataclass(frozen=True)
@@ -269,7 +268,7 @@ def run_demo(
     there = [n for n in (*wanted, "demo.html") if (folder / n).exists()]
     if there and not force:
         raise DataError(f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or --force")
-    say("simulating both stages under a square and a sine current")
+    say("recording both stages on the virtual rig, under a square and a sine current")
     square = demo_run("square", noise=noise, seed=seed)
     sine = demo_run("sine", noise=noise, seed=seed)
     files = []

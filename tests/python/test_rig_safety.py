@@ -309,7 +309,9 @@ else:
     from ftlm.rig.quanser import QuanserBoard
     sys.modules |= Board("linear", page={page!r}).modules()
     board = QuanserBoard()
-rig.record(board, arm=True, input="sine", amplitude=0.2, duration=25.0, out={out!r})
+# A busy machine may be late before it is struck; that is not what is tested here.
+rig.experiment.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
+rig.record(board, arm=True, input="sine", amplitude=0.2, duration=25.0, watchdog=1.0, out={out!r})
 """
 
 
