@@ -96,7 +96,8 @@ class _FoundStage(TypedDict):
     #: (index, score, free orders, per equation (score, alpha, orders, coefficients, initial terms per record))
     rows: list[tuple[int, float, list[float], list[tuple[float, float, list[float], list[float], list[list[float]]]]]]
     counts: _Counts
-    #: distinct candidates of each equation
+    #: failures: list[tuple[int, list[float], str]]
+    distinct candidates of each equation
     distinct: list[int]
 
 class _Fit(TypedDict):
