@@ -277,9 +277,9 @@ class Identification:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        from html import escape  # noqa: PLC0415 — only notebooks need it
+        from ftlm.report.notebook import identification_html  # noqa: PLC0415 — only notebooks need it
 
-        return f"<pre>{escape(str(self))}</pre>"
+        return identification_html(self)
 
 
 def _settings_in_words(settings: Mapping[str, Any]) -> str:

@@ -1055,7 +1055,9 @@ class Model:
         return "\n".join(numeric(e) for e in self.equations)
 
     def _repr_html_(self) -> str:
-        return self.structure._repr_html_()
+        from ftlm.report.notebook import model_html  # noqa: PLC0415 — only notebooks need it
+
+        return model_html(self)
 
 
 def numeric(item: Equation) -> str:

@@ -200,6 +200,11 @@ class SearchResult:
         """Score of the best model."""
         return self.table[0].score
 
+    def _repr_html_(self) -> str:
+        from ftlm.report.notebook import search_html  # noqa: PLC0415 — only notebooks need it
+
+        return search_html(self)
+
     def to_frame(self) -> Any:
         """The ranked table as a pandas frame, by rank."""
         from ftlm.exports import to_frame  # noqa: PLC0415 — pandas is not always there

@@ -202,9 +202,9 @@ class Residuals:
         return "\n".join(lines)
 
     def _repr_html_(self) -> str:
-        from html import escape  # noqa: PLC0415 — only notebooks need it
+        from ftlm.report.notebook import residuals_html  # noqa: PLC0415 — only notebooks need it
 
-        return f"<pre>{escape(str(self))}</pre>"
+        return residuals_html(self)
 
 
 def resid(model: Model, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:

@@ -177,6 +177,11 @@ class Comparison:
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        from ftlm.report.notebook import comparison_html  # noqa: PLC0415 — only notebooks need it
+
+        return comparison_html(self)
+
 
 def as_runs(runs: Run | Sequence[Run]) -> list[Run]:
     """One run or several as a list.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import re
 import shlex
 import subprocess
@@ -93,6 +94,35 @@ def test_linked_files_exist(document: Path) -> None:
     text = document.read_text(encoding="utf-8")
     for target in re.findall(r"\]\((?!https?:)([^)#]+)(?:#[^)]*)?\)", text):
         assert (document.parent / target).exists(), f"{document.name} links {target}"
+
+
+NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
+def test_the_notebooks_run(notebook: Path, tmp_path: Path) -> None:
+    script = (
+        "import sys, nbformat, nbclient\n"
+        "notebook = nbformat.read(sys.argv[1], as_version=4)\n"
+        "nbclient.NotebookClient(notebook, timeout=240, kernel_name='python3').execute()\n"
+        "kinds = [set(o.get('data', {})) for c in notebook.cells for o in c.get('outputs', [])]\n"
+        "print(sum('text/html' in k for k in kinds), sum('image/png' in k for k in kinds))\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", script, str(notebook)],
+        cwd=tmp_path, capture_output=True, text=True, check=False, env={**wide(), "IPYTHONDIR": str(tmp_path)},
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr[-3000:]
+    rich, pictures = map(int, ran.stdout.split())
+    assert rich >= 3
+    assert pictures >= 2
+
+
+def test_notebooks_are_kept_without_output() -> None:
+    assert len(NOTEBOOKS) >= 2
+    for notebook in NOTEBOOKS:
+        cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+        assert all(not c.get("outputs") and c.get("execution_count") is None for c in cells), notebook.name
 
 
 def test_every_page_is_in_the_contents() -> None:

@@ -272,7 +272,8 @@ def test_results_print_and_are_json(clean_a, plants):
         assert line in text
     for warning in found.warnings:
         assert f"warning: {warning}" in text
-    assert found._repr_html_().startswith("<pre>flexible link")
+    assert "<math>" in found._repr_html_()
+    assert "Both errors" in found._repr_html_()
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["coefficients"] == found.coefficients
     assert document["warnings"] == list(found.warnings)

@@ -25,6 +25,7 @@ def found(small_run, with_noise):
 
 
 def saved(figure):
+    assert figure._repr_png_().startswith(b"\x89PNG")  # a notebook shows it
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=60)
     assert data.getvalue().startswith(b"\x89PNG")

@@ -290,6 +290,32 @@ def test_charts_of_residuals_and_frequencies_are_their_numbers(small_model, smal
     assert "phase" in phase.title
 
 
+def test_results_are_rich_in_a_notebook(identified, square):
+    shown = {
+        "identification": identified._repr_html_(),
+        "model": identified.model._repr_html_(),
+        "comparison": identified.model.compare(square)._repr_html_(),
+        "residuals": identified.resid(square)._repr_html_(),
+        "search": identified.searches["stage"]._repr_html_(),
+        "advice": square.advice()._repr_html_(),
+        "run": square._repr_html_(),
+        "structure": ftlm.flexible_link()._repr_html_(),
+    }
+    for name, text in shown.items():
+        parsed = Page(text)
+        assert not {"script", "img", "svg"} & set(parsed.tags), name
+        assert not re.search(r"https?:|src=", text), name
+    assert "<math>" in shown["identification"]
+    values = {float(v) for v in Page(shown["identification"]).data}
+    assert set(identified.coefficients.values()) <= values
+    assert identified.fit_percent["theta12"] in values
+    for warning in identified.warnings:
+        assert warning in " ".join(Page(shown["identification"]).text)
+    plain = ftlm.Model(ftlm.equation("D^1.5 y = -y + u"))._repr_html_()
+    assert "<table" not in plain
+    assert "<math>" in plain
+
+
 def test_same_result_same_bytes(tmp_path, identified):
     one, two = (report.identification_page(identified, tmp_path / n).read_bytes() for n in ("a.html", "b.html"))
     assert one == two

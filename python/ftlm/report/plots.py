@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,6 +29,8 @@ __all__ = ["bode", "fit", "landscape", "residuals"]
 
 #: Width of a figure, and height of one row of axes [inches]: a journal's double column.
 WIDTH, ROW = 7.0, 2.2
+#: Resolution in a notebook.
+NOTEBOOK_DPI = 110
 #: A fit has its error beneath it at this share of its height.
 BENEATH = 0.4
 
@@ -44,7 +47,16 @@ def _figure(rows: int, columns: int = 1, *, row: float = ROW, **options: Any) ->
         module = importlib.import_module("matplotlib.figure")
     except ImportError:
         raise ModelError("matplotlib is not installed; pip install 'ftlm[plot]'") from None
-    figure = module.Figure(figsize=(WIDTH, max(row * rows, 2.0)), layout="constrained")
+
+    class Drawing(module.Figure):  # type: ignore[misc, name-defined]
+        """A figure that a notebook shows although pyplot does not know it."""
+
+        def _repr_png_(self) -> bytes:
+            data = io.BytesIO()
+            self.savefig(data, format="png", dpi=NOTEBOOK_DPI)
+            return data.getvalue()
+
+    figure = Drawing(figsize=(WIDTH, max(row * rows, 2.0)), layout="constrained")
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
