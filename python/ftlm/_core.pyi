@@ -96,8 +96,9 @@ class _FoundStage(TypedDict):
     #: (index, score, free orders, per equation (score, alpha, orders, coefficients, initial terms per record))
     rows: list[tuple[int, float, list[float], list[tuple[float, float, list[float], list[float], list[list[float]]]]]]
     counts: _Counts
-    #: failures: list[tuple[int, list[float], str]]
-    distinct candidates of each equation
+    #: (index, free orders, reason), the first hundred
+    failures: list[tuple[int, list[float], Literal["singular", "diverged"]]]
+    #: distinct candidates of each equation
     distinct: list[int]
 
 class _Fit(TypedDict):
