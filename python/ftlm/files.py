@@ -1,4 +1,4 @@
-"""Loads one measured experiment from text files or MATLAB files, refusing whatever it cannot be sure of."""
+"""Loads one measured experiment from text, MATLAB or parquet files, refusing whatever it cannot be sure of."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ _BLOCK = 8 << 20
 _LONGEST_HEADER = 1 << 20
 _SAMPLE_LINES = 20
 _READER = Path(__file__).with_name("mat_reader.py")
+_PARQUET_READER = Path(__file__).with_name("parquet_reader.py")
 _READER_SECONDS = 60.0
 _TIME_NAMES = frozenset(("t", "time", "t_s", "time_s", "seconds", "time [s]"))
 _AGREE = 1e-9
@@ -117,14 +118,15 @@ def load(
     name: str | None = None,
     time_unit: str = "s",
 ) -> Run:
-    """Load one run from a text file, a version-5 .mat file, or several files that hold its columns.
+    """Load one run from a text, version-5 .mat or parquet file, or from several files that hold its columns.
 
     Parameters
     ----------
     path : path or sequence of paths
-        ``.mat``, or text: comma, semicolon, tab or white space between numbers, decimal points, UTF-8, lines that
-        begin with ``#`` skipped, an optional header of names. Without a header the columns are c1, c2, … The columns
-        of a matrix V of a .mat file are V.1, V.2, … (or ``V(:,1)``), a vector keeps its name; samples are in rows.
+        ``.mat``, ``.parquet``, or text: comma, semicolon, tab or white space between numbers, decimal points, UTF-8,
+        lines that begin with ``#`` skipped, an optional header of names. Without a header the columns are c1, c2, …
+        The columns of a matrix V of a .mat file are V.1, V.2, … (or ``V(:,1)``), a vector keeps its name; samples are
+        in rows.
         Columns of several files are pooled; a name that is in two of them is prefixed by its file, ``STEM/V.3``.
     time : str or int, optional
         Column of the time, by name or, in a single text file, by position from 0. Without `time` and `step`, a text
@@ -262,14 +264,11 @@ def _size(path: Path) -> int:
 
 
 def _tables(paths: list[Path]) -> list[_Table]:
-    for path in paths:
-        if path.suffix.lower() in (".parquet", ".pq"):
-            raise DataError(
-                f"{str(path)!r}: parquet is not supported in this version; convert it to csv, or pass the frame to "
-                "Run.from_frame"
-            )
-    matlab = [path for path in paths if path.suffix.lower() == ".mat"]
-    read = dict(zip(matlab, _read_mat(matlab), strict=True)) if matlab else {}
+    read: dict[Path, _Table] = {}
+    for kind in (_MATLAB, _PARQUET):
+        found = [path for path in paths if path.suffix.lower() in kind.suffixes]
+        if found:
+            read |= dict(zip(found, _read_apart(found, kind), strict=True))
     return [read[path] if path in read else _read_text(path) for path in paths]
 
 
@@ -688,10 +687,15 @@ def _ftlm_header(path: Path, line: bytes) -> _Header | None:
     text = line.removeprefix(_BOM).decode("utf-8", errors="replace")
     if not text.startswith(_FTLM_MARK):
         return None
-    version, _, body = text.removeprefix(_FTLM_MARK).partition(" ")
+    return _header_of(path, "line 1", text.removeprefix(_FTLM_MARK))
+
+
+def _header_of(path: Path, where: str, text: str) -> _Header:
+    """Return what ``VERSION JSON`` says."""
+    version, _, body = text.partition(" ")
     if version.strip() != "1":
         raise DataError(
-            f"{path.name}: line 1: the format ftlm-run {version.strip()[:20]!r} is not known here; use a newer ftlm, "
+            f"{path.name}: {where}: the format ftlm-run {version.strip()[:20]!r} is not known here; use a newer ftlm, "
             "or remove the line and name the columns"
         )
     try:
@@ -719,7 +723,7 @@ def _ftlm_header(path: Path, line: bytes) -> _Header | None:
             raise ValueError("a name, unit or warning is not text")
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(
-            f"{path.name}: line 1 is a damaged ftlm header ({str(error)[:100]}); restore it, or remove the line and "
+            f"{path.name}: {where} is a damaged ftlm header ({str(error)[:100]}); restore it, or remove the line and "
             "name the columns"
         ) from None
     return header
@@ -735,14 +739,32 @@ def _field(told: Mapping[str, object], key: str, kind: type[_Kind]) -> _Kind:
 # --- MATLAB -----------------------------------------------------------------------------------------------------------
 
 
-def _read_mat(paths: list[Path]) -> list[_Table]:
+@dataclass(frozen=True)
+class _Apart:
+    """A kind of file that is read in a process of its own."""
+
+    suffixes: tuple[str, ...]
+    package: str
+    extra: str
+    words: str
+    again: str
+
+
+_MATLAB = _Apart((".mat",), "scipy", "mat", ".mat", "save it again with save('FILE.mat', '-v7')")
+_PARQUET = _Apart((".parquet", ".pq"), "pyarrow", "parquet", "parquet", "save it again")
+
+
+def _read_apart(paths: list[Path], kind: _Apart) -> list[_Table]:
     folders = []
-    for package in ("numpy", "scipy"):
+    for package in ("numpy", kind.package):
         found = importlib.util.find_spec(package)
         if found is None or not found.submodule_search_locations:
-            raise DataError(f"{str(paths[0])!r}: reading .mat files needs {package}; run: pip install 'ftlm[mat]'")
+            raise DataError(
+                f"{str(paths[0])!r}: reading {kind.words} files needs {package}; run: pip install 'ftlm[{kind.extra}]'"
+            )
         folders.append(str(Path(next(iter(found.submodule_search_locations))).resolve().parent))
-    command = [sys.executable, "-I", str(_READER), json.dumps(folders), *(str(path.resolve()) for path in paths)]
+    reader = _READER if kind is _MATLAB else _PARQUET_READER
+    command = [sys.executable, "-I", str(reader), json.dumps(folders), *(str(path.resolve()) for path in paths)]
     try:
         done = subprocess.run(
             command,
@@ -756,7 +778,7 @@ def _read_mat(paths: list[Path]) -> list[_Table]:
         path = paths[min(answers.complete(len(paths)), len(paths) - 1)]
         raise DataError(
             f"{str(path)!r}: damaged file: the reader did not finish in {_READER_SECONDS:g} s; "
-            "get an intact copy or save it again with save('FILE.mat', '-v7')"
+            f"get an intact copy or {kind.again}"
         ) from None
     except OSError as error:
         raise DataError(
@@ -767,22 +789,19 @@ def _read_mat(paths: list[Path]) -> list[_Table]:
     for path in paths:
         table = answers.table(path)
         if table is None:
-            raise _crash(path, done.returncode)
+            raise _crash(path, done.returncode, kind)
         tables.append(table)
     return tables
 
 
-def _crash(path: Path, code: int) -> DataError:
+def _crash(path: Path, code: int, kind: _Apart) -> DataError:
     how = "ended too early" if code == 0 else f"ended with code {code}"
     if code < 0:
         try:
             how = f"crashed (signal {-code}, {signal.Signals(-code).name})"
         except ValueError:
             how = f"crashed (signal {-code})"
-    return DataError(
-        f"{str(path)!r}: damaged file: the reader {how}; "
-        "get an intact copy or save it again with save('FILE.mat', '-v7')"
-    )
+    return DataError(f"{str(path)!r}: damaged file: the reader {how}; get an intact copy or {kind.again}")
 
 
 class _Answers:
@@ -859,4 +878,6 @@ class _Answers:
         if not columns:
             why = ", ".join(f"{name!r} ({reason})" for name, reason in list(skipped.items())[:10]) or "it is empty"
             raise DataError(f"{str(path)!r} holds no real numeric matrix: {why}; save the samples as matrices")
-        return _Table(path=path, columns=columns, text=False, skipped=skipped)
+        told = header.get("ftlm-run")
+        own = _header_of(path, "its metadata", told) if isinstance(told, str) else None
+        return _Table(path=path, columns=columns, text=header.get("text") is True, header=own, skipped=skipped)

@@ -7,6 +7,8 @@ import copy
 import difflib
 import functools
 import html
+import importlib
+import io
 import json
 import math
 import os
@@ -641,11 +643,47 @@ class Run:
         DataError
             If the file exists and `force` is not set, or it cannot be written.
         """
-        target = Path(path)
-        if target.is_dir():
-            raise DataError(f"{str(target)!r} is a folder; give the name of a file in it")
-        if not force and os.path.lexists(target):
-            raise DataError(f"{str(target)!r} exists; choose another name, or overwrite it with force=True (--force)")
+        target = _new_file(path, force=force)
+        columns = [self._written_time(), *(self._data[name] for name in self.signals)]
+        lines = [
+            f"{_CSV_MARK}{self._header()}",
+            ",".join([_CSV_TIME, *self.signals]),
+            *map(",".join, zip(*(map(repr, column.tolist()) for column in columns), strict=True)),
+            "",
+        ]
+        _write_atomically(target, "\n".join(lines).encode())
+
+    def to_parquet(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
+        """Write this run to a parquet file that `ftlm.load` reads back bit for bit; needs pyarrow.
+
+        A column ``t_s`` and one a signal, float64; the header of `to_csv` is the metadata ``ftlm-run``.
+
+        Parameters
+        ----------
+        path : path
+            File to write.
+        force : bool, default False
+            Overwrite a file that exists.
+
+        Raises
+        ------
+        DataError
+            If pyarrow is not installed, the file exists and `force` is not set, or it cannot be written.
+        """
+        target = _new_file(path, force=force)
+        try:
+            pyarrow = importlib.import_module("pyarrow")
+            parquet = importlib.import_module("pyarrow.parquet")
+        except ImportError:
+            raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'") from None
+        columns = {_CSV_TIME: self._written_time()} | {name: self._data[name] for name in self.signals}
+        table = pyarrow.table(columns).replace_schema_metadata({"ftlm-run": self._header()})
+        content = io.BytesIO()
+        # Checksums, so that a flipped byte is no other answer.
+        parquet.write_table(table, content, write_page_checksum=True)
+        _write_atomically(target, content.getvalue())
+
+    def _header(self) -> str:
         header = {
             "name": self._name,
             "step": self._step,
@@ -656,14 +694,7 @@ class Run:
             "intersample": self._intersample,
             "warnings": list(self._facts),
         } | ({"about": self._about} if self._about else {})
-        columns = [self._written_time(), *(self._data[name] for name in self.signals)]
-        lines = [
-            f"{_CSV_MARK}{_CSV_VERSION} {json.dumps(header, ensure_ascii=False, allow_nan=False)}",
-            ",".join([_CSV_TIME, *self.signals]),
-            *map(",".join, zip(*(map(repr, column.tolist()) for column in columns), strict=True)),
-            "",
-        ]
-        _write_atomically(target, "\n".join(lines).encode())
+        return f"{_CSV_VERSION} {json.dumps(header, ensure_ascii=False, allow_nan=False)}"
 
     def _written_time(self) -> Array:
         exact = self._start + _grid(self.length, self._step)
@@ -1243,6 +1274,15 @@ def _interpolated(
 def _how_interpolated(behaviour: Mapping[str, Intersample]) -> str:
     held = [signal for signal, kind in behaviour.items() if kind == "zoh"]
     return f"{'held: ' + ', '.join(held) + '; ' if held else ''}others linear; no anti-alias filter"
+
+
+def _new_file(path: str | os.PathLike[str], *, force: bool) -> Path:
+    target = Path(path)
+    if target.is_dir():
+        raise DataError(f"{str(target)!r} is a folder; give the name of a file in it")
+    if not force and os.path.lexists(target):
+        raise DataError(f"{str(target)!r} exists; choose another name, or overwrite it with force=True (--force)")
+    return target
 
 
 def _write_atomically(target: Path, content: bytes) -> None:

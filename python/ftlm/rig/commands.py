@@ -20,7 +20,7 @@ __all__ = ["record"]
 
 
 def record(
-    out: Annotated[str, typer.Option("-o", "--out", metavar="CSV", help="Where to write the run.")],
+    out: Annotated[str, typer.Option("-o", "--out", metavar="FILE", help="Run to write, .csv or .parquet.")],
     rig: Annotated[str, typer.Option("--rig", help="virtual or q8.")] = "virtual",
     shape: Annotated[
         str, typer.Option("--input", help="square, sine, chirp, multisine, prbs, doublet or csv.")

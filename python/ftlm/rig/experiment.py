@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import json
 import math
 import os
@@ -193,7 +194,7 @@ class Excitation:
 
 def partial_of(target: Path) -> Path:
     """Where the rows of a run are until it has ended."""
-    return target.with_name(target.name + ".partial")
+    return target.with_name(target.stem + ".csv.partial")
 
 
 class Partial:
@@ -348,7 +349,7 @@ def record(
     name : str, optional
         Of the run; default the input's shape.
     out : path, optional
-        csv file to write.
+        File to write, .csv or .parquet.
     force : bool
         Whether to overwrite it.
     live : Streaming, optional
@@ -442,7 +443,8 @@ def _saved(
         place = f"{run.length} rows were recorded until then"
         if target is not None:
             try:
-                run.to_csv(target, force=force)
+                save = run.to_csv if target.suffix.lower() == ".csv" else run.to_parquet
+                save(target, force=force)
                 partial.remove()
                 place += f" and are in {target}"
             except DataError as error:
@@ -559,8 +561,10 @@ def _board(
 
 
 def _check_target(target: Path, *, force: bool) -> None:
-    if target.suffix.lower() != ".csv":
-        raise DataError(f"{str(target)!r} does not end with .csv; runs are written as csv")
+    if target.suffix.lower() not in (".csv", ".parquet"):
+        raise DataError(f"{str(target)!r} ends with neither .csv nor .parquet; runs are written as one of them")
+    if target.suffix.lower() == ".parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'")
     if target.exists() and not force:
         raise DataError(f"{str(target)!r} exists; choose another name, or overwrite it with force=True (--force)")
     if not target.resolve().parent.is_dir():
