@@ -371,6 +371,38 @@ def test_a_frozen_program_leaves_the_motors_off_and_wakes_to_a_fault(kind, tmp_p
     assert loaded.about["faults"]
 
 
+COMMAND = """
+import sys
+from ftlm import cli, rig
+rig.experiment.Limits = lambda: rig.Limits(late=60.0, missed=10**9)
+sys.argv = ["ftlm", "record", "--real-time", "--duration", "25", "--watchdog", "1", "-o", {out!r}]
+cli.main()
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_command_that_is_stopped_says_where_its_run_is(number, code, tmp_path):
+    out = tmp_path / "run.csv"
+    process = subprocess.Popen(
+        [sys.executable, "-c", COMMAND.format(out=str(out))],
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
+    )
+    partial = tmp_path / "run.csv.partial"
+    until = time.monotonic() + 60
+    while not partial.exists() or partial.stat().st_size < 20_000:
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert f"what was recorded is in {out}" in said
+    assert ftlm.load(out).about["faults"] == ["stopped by " + ("Ctrl-C" if code == 130 else "SIGTERM")]
+    assert not partial.exists()
+
+
 def test_on_a_virtual_clock_the_outputs_are_at_0_volts_one_timeout_after_the_last_reload(tmp_path, monkeypatch):
     bench = Bench("q8", tmp_path, monkeypatch)
 

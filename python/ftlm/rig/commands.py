@@ -79,9 +79,11 @@ def record(
     try:
         with Progress("recording", quiet=as_json) as progress:
             run = recorded(progress)
-    except KeyboardInterrupt:
-        print(f"ftlm: stopped by Ctrl-C; the motors are at 0 V, what was recorded is in {out}", file=sys.stderr)
-        raise typer.Exit(130) from None
+    except (KeyboardInterrupt, SystemExit) as ended:
+        what = experiment.stopped_by(ended)
+        print(f"ftlm: {what}; the motors are at 0 V, what was recorded is in {out}", file=sys.stderr)
+        code = ended.code if isinstance(ended, SystemExit) else 130
+        raise typer.Exit(code if isinstance(code, int) else 1) from None
     if stream is not None:
         print(f"live, after {stream.pulses} rows: {stream}", file=sys.stderr)
     if as_json:

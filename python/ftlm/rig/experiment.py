@@ -7,6 +7,7 @@ import importlib.util
 import json
 import math
 import os
+import signal
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -412,7 +413,7 @@ def record(
         faults.append(str(error))
     except (KeyboardInterrupt, SystemExit) as error:
         ended = error
-        faults.append("stopped by Ctrl-C" if isinstance(error, KeyboardInterrupt) else "stopped by SIGTERM")
+        faults.append(stopped_by(error))
     except BaseException:
         partial.remove()
         raise
@@ -426,6 +427,15 @@ def record(
         partial.close()
         raise
     return _saved(run, target, partial, force=force, ended=ended, faults=faults)
+
+
+def stopped_by(ended: KeyboardInterrupt | SystemExit) -> str:
+    """What stopped a run from outside, in words."""
+    if isinstance(ended, KeyboardInterrupt):
+        return "stopped by Ctrl-C"
+    number = ended.code - 128 if isinstance(ended.code, int) else 0
+    known = {int(s): s.name for s in signal.Signals}
+    return f"stopped by {known.get(number, 'an exit of the program')}"
 
 
 def _saved(
