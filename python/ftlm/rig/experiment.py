@@ -399,8 +399,8 @@ def record(
         board, rate=rate, watchdog=watchdog, limit=limit, limits=Limits(),
         sensor_filter=STOCK_FILTER if sensor_filter else None,
     )  # fmt: skip
-    for signal in () if live is None else live.signals:
-        _column(signal)
+    for needed in () if live is None else live.signals:
+        _column(needed)
     partial = Partial(target, name, 1.0 / rate, about)
     recorder = _Recorder(partial, len(commands), progress, live)
     faults: list[str] = []
