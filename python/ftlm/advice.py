@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ftlm.models import Structure
     from ftlm.runs import Run
 
     Floats = NDArray[np.float64]
@@ -29,6 +30,8 @@ LINE = 0.01
 #: Bins that one line fills through the Blackman-Harris window, whose side lobes are 92 dB down.
 LINE_BINS = 8
 BLACKMAN_HARRIS = (0.35875, -0.48829, 0.14128, -0.01168)
+#: A mean above this share of the deviation is a level, and not what is left of waves that the record cuts.
+LEVEL_SHARE = 0.3
 #: Two inputs more correlated than this move together.
 TOGETHER = 0.999
 #: Rows below which no fit means much.
@@ -126,7 +129,7 @@ class Advice:
         return f"<p>Advice on {escape(self.run)}:</p><ul>{items or '<li>nothing stands out</li>'}</ul>"
 
 
-def advise(run: Run) -> Advice:
+def advise(run: Run, structure: Structure | None = None) -> Advice:
     """Look for faults and poor excitation in a run; see :meth:`ftlm.Run.advice`."""
     found: list[Finding] = []
     moving = [n for n in run.signals if np.ptp(run[n]) > 0]
@@ -146,6 +149,8 @@ def advise(run: Run) -> Advice:
     for name in inputs:
         found += _saturation(run, name)
     found += _short(run, outputs) + _excitation(run, inputs)
+    if structure is not None:
+        found += excitation_for(run, structure)
     usual = [n for n in outputs if not wraps[n]]
     found += _feedback(run, inputs, usual) + _drift(run, inputs, usual)
     for name in outputs:
@@ -372,6 +377,36 @@ def _excitation(run: Run, inputs: list[str]) -> list[Finding]:
                         "cannot tell their effects apart; drive them one after the other, or by different signals",
                     )
                 )  # fmt: skip
+    return found
+
+
+def excitation_for(run: Run, structure: Structure) -> list[Finding]:
+    """Whether the inputs have lines enough for the free numbers of each equation.
+
+    In steady state a spectral line tells two numbers of every output that it reaches, a constant level one.
+    """
+    found = []
+    for item in structure.equations:
+        inputs = [s for s in item.signals if s in run.inputs]
+        # What is measured of the other outputs drives the equation, too.
+        if structure.coupling == "measured":
+            inputs += [s for s in item.signals if s != item.output and s in run.outputs]
+        else:
+            inputs = [s for s in structure.signals if s in run.inputs]
+        moving = [n for n in inputs if np.ptp(run[n]) > 0]
+        known = sum(2 * spectral_lines(run[n])[0] for n in moving)
+        known += sum(abs(float(np.mean(run[n]))) > LEVEL_SHARE * float(np.std(run[n])) for n in inputs)
+        free = len(item.order_names) + len(item.coefficient_names)
+        if free > known:
+            listed = ", ".join(inputs) or "no input"
+            found.append(
+                Finding(
+                    "excitation", item.output,
+                    f"the equation of {item.output} has {free} free numbers, but {listed} fixes {known} in steady "
+                    "state: what the run tells beyond them comes from its start alone; add frequencies to the input, or fix "
+                    "orders or coefficients",
+                )
+            )  # fmt: skip
     return found
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ftlm import _core
+from ftlm.advice import excitation_for
 from ftlm.checks import whole_number
 from ftlm.errors import DataError, InternalError, ModelError
 from ftlm.models import Estimate, Model, Structure, numeric
@@ -398,7 +399,7 @@ def identify(
     warnings = list(comparison.warnings) + pulled + _broken_law(model)
     for search in searches.values():
         warnings += [f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in search.edges.items()]
-    warnings += [f"run {r.name}: {w}" for r in found for w in r.warnings]
+    warnings += [f"run {r.name}: {w}" for r in found for w in r.warnings] + _unexcited(found, structure)
     warnings += discretisation(model, comparison)
     tests, criteria = _judged(model, found, len(orders) + len(coefficients))
     warnings += [] if tests is None else residual_warnings(tests)
@@ -483,7 +484,7 @@ def _identify_output_error(
         "starts": len(joint.starts), "noise": joint.noise, "converged": joint.converged,
     }  # fmt: skip
     warnings = list(comparison.warnings) + _uncertain(joint, problem)
-    warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings]
+    warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings] + _unexcited(runs, structure)
     warnings += discretisation(model, comparison)
     tests, criteria = _judged(model, runs, len(joint.names))
     # That they are coloured is said already, with what it means for the intervals.
@@ -532,6 +533,12 @@ def _uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             "standard errors allow for it"
         )
     return warnings
+
+
+def _unexcited(runs: Sequence[Run], structure: Structure) -> list[str]:
+    """Say so where no run alone has inputs rich enough for the free numbers of an equation."""
+    lacking = [{f.signal: f.sentence for f in excitation_for(run, structure)} for run in runs]
+    return [sentence for output, sentence in lacking[0].items() if all(output in other for other in lacking)]
 
 
 def _check_lattice_names(given: Lattice | None, structure: Structure) -> None:

@@ -24,6 +24,7 @@ from ftlm.errors import DataError
 
 if TYPE_CHECKING:
     from ftlm.advice import Advice
+    from ftlm.models import Structure
 
 __all__ = ["Run", "check_compatible"]
 
@@ -608,12 +609,17 @@ class Run:
                     "check the sensor and the column, or load a part of the record in which it moves with slice=",
                 )
 
-    def advice(self) -> Advice:
+    def advice(self, structure: Structure | None = None) -> Advice:
         """What to know about this run before a model is identified from it, in sentences with numbers.
 
         Looks for dead, constant and zeroed channels, saturation, spikes, encoders that wrap, outputs that do not start
         at rest, drift that no input explains, feedback from outputs to inputs, runs that are too short, and inputs that
         excite too little. Nothing is repaired.
+
+        Parameters
+        ----------
+        structure : Structure, optional
+            What is to be identified: its free numbers are counted against the inputs' spectral lines.
 
         Returns
         -------
@@ -622,7 +628,7 @@ class Run:
         """
         from ftlm.advice import advise  # noqa: PLC0415 — advice reads runs
 
-        return advise(self)
+        return advise(self, structure)
 
     def to_csv(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write this run to a csv file that `ftlm.load` reads back bit for bit, without being told the columns.

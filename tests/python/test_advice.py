@@ -124,6 +124,25 @@ def test_one_sine_excites_little_and_its_lines_are_counted():
     assert spectral_lines(np.sign(np.sin(np.pi * t + 1e-9)))[0] > 8
 
 
+def test_free_numbers_are_counted_against_lines():
+    t = np.arange(6000) * 0.005
+    rng = np.random.default_rng(1)
+    plant = ftlm.Model(ftlm.equation("D^1.8 y = -0.6 D^0.8 y - 9 y + 4 u"))
+    wanted = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
+    for waves, enough in (((3.1,), False), ((3.1, 7.7), False), ((1.3, 3.1, 7.7), True)):
+        u = sum(np.sin(w * t) for w in waves)
+        clean = plant.simulate(made(0.005, u, 0 * t), tolerance=1e-3)
+        run = made(0.005, u, clean["y"] + 1e-3 * rng.standard_normal(t.size))
+        said = [f.sentence for f in run.advice(wanted) if "free numbers" in f.sentence]
+        assert bool(said) is not enough, waves
+        if said:
+            assert f"has 5 free numbers, but u fixes {2 * len(waves)} in steady state" in said[0]
+        assert not [f for f in run.advice(plant.structure) if "free numbers" in f.sentence]
+    arm = ftlm.flexible_link(stage=1)
+    still = ftlm.Run.from_arrays(step=0.005, inputs={"I1": 0 * t + 1}, outputs={"theta11": t, "theta12": t**0.5})
+    assert len([f for f in still.advice(arm) if "fixes 1 in steady state" in f.sentence]) == 2
+
+
 def test_inputs_that_move_together_are_named():
     rng = np.random.default_rng(2)
     u = np.repeat(rng.choice([-1.0, 1.0], 60), 30)

@@ -74,6 +74,17 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
         assert "order alpha cannot be told from these runs: its standard error exceeds its bounds" in words, value
 
 
+def test_one_sine_for_many_numbers_says_so(small_model):
+    n = 900
+    blank = ftlm.Run.from_arrays(step=0.02, inputs={"u": np.sin(0.1 * np.arange(n))}, outputs={"y": np.zeros(n)})
+    clean = small_model.simulate(blank, tolerance=1e-5)
+    y = clean["y"] + 0.01 * np.random.default_rng(1).standard_normal(n)
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": clean["u"]}, outputs={"y": y})
+    structure = ftlm.equation("D^alpha y = a D^nu y + c y + b u")
+    found = ftlm.identify(run, structure)
+    assert said(found, "the equation of y has 5 free numbers, but u fixes 2")
+
+
 def test_what_is_printed_is_what_compare_says(noisy, tmp_path):
     for method in ("output-error", "least-squares", "multi-innovation"):
         found = ftlm.identify(noisy, ftlm.equation(WORDS, orders={"alpha": "1.5:1.7:0.1"}), method=method)
