@@ -59,7 +59,7 @@ DRIFT_LAGS = 12
 TREND_LEFT = 1e-3
 #: Orders of the autoregressions that whiten input and output, rows used, lags looked at, quarters that must agree.
 FEEDBACK_ORDER = 20
-FEEDBACK_ROWS = 20_000
+FEEDBACK_ROWS = 8_000
 FEEDBACK_LAGS = 10
 FEEDBACK_PARTS = 4
 FEEDBACK_LEVEL = 1e-6
@@ -403,8 +403,8 @@ def excitation_for(run: Run, structure: Structure) -> list[Finding]:
                 Finding(
                     "excitation", item.output,
                     f"the equation of {item.output} has {free} free numbers, but {listed} fixes {known} in steady "
-                    "state: what the run tells beyond them comes from its start alone; add frequencies to the input, or fix "
-                    "orders or coefficients",
+                    "state: what the run tells beyond them comes from its start alone; add frequencies to the input, "
+                    "or fix orders or coefficients",
                 )
             )  # fmt: skip
     return found
@@ -507,16 +507,18 @@ def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> list[Finding]:
     if rows < 20 * FEEDBACK_ORDER:
         return []
     found: list[tuple[float, Finding]] = []
-    for u_name, y_name in itertools.product(inputs, outputs):
-        u, y = run[u_name][:rows] - np.mean(run[u_name]), run[y_name][:rows] - np.mean(run[y_name])
-        if _few_levels(u):
-            continue  # switched between levels: made beforehand
-        order = FEEDBACK_ORDER
-        past_u, past_y = _lagged(u, order), _lagged(y, order)
-        new_u = _innovation(u[order:], past_u)
-        if np.median(np.abs(new_u)) <= PREDICTED * np.std(u):
-            continue  # predictable from itself: made beforehand
-        new_y = _innovation(y[order:], np.concatenate([past_u, past_y]))
+    order = FEEDBACK_ORDER
+    fed: list[tuple[str, Floats, Floats]] = []
+    for name in inputs:
+        u = run[name][:rows] - np.mean(run[name])
+        past_u = _lagged(u, order)
+        new_u = np.zeros(0) if _few_levels(u) else _innovation(u[order:], past_u)
+        # Switched between levels, or predictable from itself: made beforehand.
+        if new_u.size and np.median(np.abs(new_u)) > PREDICTED * np.std(u):
+            fed.append((name, past_u, new_u))
+    for (u_name, past_u, new_u), y_name in itertools.product(fed, outputs):
+        y = run[y_name][:rows] - np.mean(run[y_name])
+        new_y = _innovation(y[order:], np.concatenate([past_u, _lagged(y, order)]))
         if np.median(np.abs(new_y)) < 0.1 * np.std(new_y):
             continue  # hardly any noise: what is new are switches of the input
         # Winsorised, so that a few switches do not decide.
@@ -548,8 +550,11 @@ def _feedback(run: Run, inputs: list[str], outputs: list[str]) -> list[Finding]:
 
 
 def _innovation(x: Floats, past: Floats) -> Floats:
-    solution = np.linalg.lstsq(past.T, x, rcond=1e-10)[0]
-    return np.asarray(x - past.T @ solution)
+    """What a linear prediction from the past leaves, by normal equations: quick, and exact enough for a correlation."""
+    scale = np.linalg.norm(past, axis=1)
+    scaled = past / np.where(scale > 0, scale, 1.0)[:, None]
+    solution = np.linalg.lstsq(scaled @ scaled.T, scaled @ x, rcond=1e-13)[0]
+    return np.asarray(x - scaled.T @ solution)
 
 
 def _robust(x: Floats) -> float:
