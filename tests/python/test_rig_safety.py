@@ -718,6 +718,24 @@ def test_a_board_that_goes_away_in_a_run_is_a_fault(tmp_path, monkeypatch):
     bench.assert_safe()
 
 
+@pytest.mark.parametrize("code", [-111, -1270])
+def test_an_error_in_a_run_writes_zero_at_once(tmp_path, monkeypatch, code):
+    bench = Bench("q8", tmp_path, monkeypatch)
+
+    def lost(board):
+        if board.sample == 300:
+            board.refuse["task_read"] = code
+
+    bench.hardware.hooks["task_read"] = lost
+    with bench.rig() as link:
+        with pytest.raises(ftlm.RigFault, match="samples were lost"):
+            link.run(drive())
+        # Still inside the with statement, and already safe.
+        assert bench.writes[-1] == (300, (0.0, 0.0))
+        assert bench.writes[-2][1] != (0.0, 0.0)
+    bench.assert_safe()
+
+
 def test_without_package_or_library_the_words_say_which(monkeypatch, capsys):
     for name in ("quanser", "quanser.hardware"):
         monkeypatch.setitem(sys.modules, name, None)

@@ -324,7 +324,7 @@ class QuanserBoard:
 
 
 class _Spoken:
-    """The vendor's errors in words; 0 V is tried at once where a run was under way.
+    """The vendor's errors in words; latched where a run was under way.
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import signal
 import threading
@@ -299,7 +300,12 @@ class Rig:
         self._samples += len(commands)
         try:
             self.board.run(self.guard, commands)
-        except FtlmError as error:
+        except BaseException as error:
+            # At once, and not only on the way out: the caller may stay in the with statement.
+            with contextlib.suppress(Exception):
+                self.board.write((0.0, 0.0))
+            if not isinstance(error, FtlmError):
+                raise
             self.guard.fail(str(error))
         self._check()
 

@@ -41,7 +41,7 @@ FIELDS = {
 }
 SIZE = 4096
 _WRITE = struct.Struct("<Qdd")
-#: Longest that a watchdog process outlives its last heartbeat when nobody closes the page [s].
+#: Longest that a watchdog process outlives its last heartbeat, or waits for its first, when nobody closes the page [s].
 _ORPHAN = 30.0
 
 
@@ -142,7 +142,8 @@ def watch(path: str, *, keep: bool) -> None:
     """The watchdog: until the page is closed, or its program is gone and the outputs are safe."""
     page = Page(path)
     parent = os.getppid()
-    beat, last = page.get("beat"), time.monotonic()
+    began = time.monotonic()
+    beat, last = page.get("beat"), began
     page.set("ready", 1)
     armed = False
     try:
@@ -158,7 +159,7 @@ def watch(path: str, *, keep: bool) -> None:
                 trip(page, now)
                 if os.getppid() != parent or now - last > _ORPHAN:
                     break
-            elif not armed and os.getppid() != parent:
+            elif not armed and (os.getppid() != parent or now - began > _ORPHAN):
                 break
             time.sleep(min(0.005, timeout / 20.0) if armed else 0.005)
     finally:
