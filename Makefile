@@ -47,6 +47,7 @@ docs: $(VENV)/.built
 bench: $(VENV)/.built
 	cargo bench --bench kernels
 	$(BIN)/python benches/search.py
+	$(BIN)/python benches/promises.py
 	$(BIN)/python benches/rig.py
 
 wheel: $(VENV)/.tools

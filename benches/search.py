@@ -28,8 +28,8 @@ BRUTE_STEP = 0.2
 M = 2048
 
 
-def plant_a_run() -> ftlm.Run:
-    """Noise-free point samples of Plant A under the square current, 10 s at 2 ms."""
+def plant_a_run(hub: float = 1e-3, deflection: float = 1e-4) -> ftlm.Run:
+    """Point samples of Plant A under the square current, 10 s at 2 ms, with noise of these deviations in rad."""
     rows = 5001
     t = np.arange(rows) * 0.002
     current = np.where((t + 0.001) % 2 < 1, 0.3, -0.3)
@@ -38,7 +38,7 @@ def plant_a_run() -> ftlm.Run:
     )
     truth = ftlm.simulate(demo_plant(1), blank, tolerance=1e-8)
     rng = np.random.default_rng(7)
-    noisy = {"theta11": 1e-3, "theta12": 1e-4}
+    noisy = {"theta11": hub, "theta12": deflection}
     return ftlm.Run.from_arrays(
         step=0.002,
         inputs={"I1": current},
@@ -84,10 +84,11 @@ def main() -> None:
         found = ftlm.search_orders(run, equation, ftlm.lattice(alpha=(1.05, 2.0)), coefficients=coefficients, m=M)
         wall = time.perf_counter() - start
         cost = per_candidate[coefficients] = wall * threads / found.candidates
-        stopped = found.pruned["stopped early"] / found.candidates
+        bounded, stopped = (found.pruned[k] / found.candidates for k in ("bound", "stopped early"))
         say(
             f"lattice, {coefficients}: {found.candidates} candidates in {wall:.2f} s, {cost * 1e6:.2f} us of core time "
-            f"each ({cost / fft:.2f} FFTs), {100 * stopped:.1f} % stopped early"
+            f"each ({cost / fft:.3f} FFTs), {100 * bounded:.2f} % excluded by their bound, "
+            f"{100 * stopped:.2f} % stopped early"
         )
     start = time.perf_counter()
     brute = ftlm.search_orders(

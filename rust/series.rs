@@ -8,6 +8,7 @@
 
 use crate::error::{check_length, Error, Result};
 use crate::fft::{self, Bin, Plan, Workspace};
+use crate::lanes;
 
 /// Below this length a product is formed directly: it is faster there and free of transform rounding.
 const DIRECT: usize = 64;
@@ -257,6 +258,49 @@ impl<'a> Solver<'a> {
     }
 }
 
+/// Forward substitution within a block of one unknown, in place.
+struct Substitution<'a> {
+    divisor: &'a [f64],
+    inverse: f64,
+    block: &'a mut [f64],
+}
+
+impl lanes::Kernel for Substitution<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        for k in 0..self.block.len() {
+            self.block[k] *= self.inverse;
+            let y = self.block[k];
+            let (_, later) = self.block.split_at_mut(k + 1);
+            for (rest, &v) in later.iter_mut().zip(&self.divisor[1..]) {
+                *rest -= v * y;
+            }
+        }
+    }
+}
+
+/// What a solved block contributes to the terms right after it.
+struct Join<'a> {
+    series: &'a [f64],
+    solved: &'a [f64],
+    open: &'a mut [f64],
+}
+
+impl lanes::Kernel for Join<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        for (s, &y) in self.solved.iter().enumerate() {
+            for (rest, &v) in self.open.iter_mut().zip(&self.series[self.solved.len() - s..]) {
+                *rest -= v * y;
+            }
+        }
+    }
+}
+
 /// An n × n division under way: blocks of the quotients come out in order.
 ///
 /// Right-hand sides are added block by block ([`Division::add`]), then [`Division::advance`] solves the next block and
@@ -388,13 +432,10 @@ impl Division {
                 for j in 0..n {
                     let a = series(i, j, (2 * half).min(self.m));
                     // Split borrows: the solved part of j feeds the open part of i.
-                    for s in lo..hi {
-                        let y = self.rest[j][s];
-                        let kernel = &a[hi - s..];
-                        for (rest, &v) in self.rest[i][hi..end].iter_mut().zip(kernel) {
-                            *rest -= v * y;
-                        }
-                    }
+                    let mut solved = [0.0; BLOCK];
+                    solved[..hi - lo].copy_from_slice(&self.rest[j][lo..hi]);
+                    let open = &mut self.rest[i][hi..end];
+                    lanes::widest(Join { series: a, solved: &solved[..hi - lo], open });
                 }
             }
             return;
@@ -438,16 +479,8 @@ impl Division {
     ) {
         let n = self.n;
         if n == 1 {
-            let a = series(0, 0, hi - lo);
-            let block = &mut self.rest[0][lo..hi];
-            for k in 0..block.len() {
-                block[k] *= inverse[0];
-                let y = block[k];
-                let (_, later) = block.split_at_mut(k + 1);
-                for (rest, &v) in later.iter_mut().zip(&a[1..]) {
-                    *rest -= v * y;
-                }
-            }
+            let (divisor, block) = (series(0, 0, hi - lo), &mut self.rest[0][lo..hi]);
+            lanes::widest(Substitution { divisor, inverse: inverse[0], block });
             return;
         }
         let mut values = vec![0.0; n];

@@ -1,0 +1,284 @@
+"""Each promise of speed and memory beside its rival, in one run; instruction budgets of the three hottest kernels.
+
+``python benches/promises.py [--write] [--quick]`` prints them; ``--write`` appends them to benches/RESULTS.md.
+Core time is processor time, which other work on the machine disturbs less than wall time does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import re
+import resource
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import ftlm
+from ftlm import _core
+from ftlm.order_search import available_threads
+from ftlm.records import record
+from search import fft_time, plant_a_run
+
+HERE = Path(__file__).parent
+M = 2048
+#: Instructions a unit of work; a rise of more than a tenth is printed as one.
+BUDGET = HERE / "instructions.json"
+lines: list[str] = []
+
+
+def say(text: str) -> None:
+    """Print and keep."""
+    lines.append(text)
+    print(text, flush=True)
+
+
+def judge(name: str, what: str, ratio: float, promise: float, rival: str) -> None:
+    """One promise: reached where the ratio is at most (or, for a rate, the inverse) what is promised."""
+    verdict = "reached" if ratio <= promise else "NOT REACHED"
+    say(f"{name} {verdict}: {what}: {ratio:.3g} (promised {promise:.3g}); {rival}")
+
+
+def clocked(work):
+    """Result, wall and processor seconds of a call."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = work()
+    return result, time.perf_counter() - wall, time.process_time() - cpu
+
+
+def searches(quick: bool) -> None:
+    """P1 and P2."""
+    threads = available_threads()
+    equation = replace(ftlm.flexible_link(stage=1).equation("theta12"), initial="rest")
+    lattice = ftlm.lattice(alpha=(1.05, 2.0))
+    options = {"coefficients": "least-squares", "m": M}
+    clean, coarse = plant_a_run(), ftlm.lattice(step=0.1, alpha=(1.1, 2.0))
+    brute, _, cpu = clocked(lambda: ftlm.search_orders(clean, equation, coarse, early_stopping=False, **options))
+    brute_each = cpu / brute.candidates
+    for hub, deflection in ((1e-3, 1e-4), (1e-4, 1e-4), (1e-3, 1e-3)):
+        run = plant_a_run(hub, deflection)
+        fft = fft_time()
+        found, wall, cpu = min((clocked(lambda run=run: ftlm.search_orders(run, equation, lattice, **options))
+                               for _ in range(3)), key=lambda r: r[2])  # fmt: skip
+        each = cpu / found.candidates
+        shares = ", ".join(f"{100 * found.pruned[k] / found.candidates:.2f} % {k}" for k in ("bound", "stopped early"))
+        judge(
+            "P1", f"noise {hub:g} and {deflection:g} rad, core time a candidate over one real FFT of 4096", each / fft,
+            1 / 8,
+            f"{found.candidates} in {wall:.2f} s, {each * 1e6:.3f} us each, NumPy's FFT {fft * 1e6:.1f} us; {shares}; "
+            f"brute force {brute_each * 1e6:.0f} us each, {brute_each / each:.0f} times ours",
+        )  # fmt: skip
+    run = plant_a_run()
+    step = 0.05 if quick else 0.015
+    found, wall, cpu = clocked(lambda: ftlm.search_orders(
+        run, equation, ftlm.lattice(step=step, alpha=(1.05, 2.0)), criterion="equation-error", norm="l2", m=M,
+    ))  # fmt: skip
+    numpy_each = numpy_solve(run, equation)
+    judge(
+        "P2", "60 million a second over candidates a second on all cores", 60e6 / (found.candidates / cpu * threads), 1,
+        f"{found.candidates} candidates by processor time {found.candidates / cpu * threads / 1e6:.1f} million/s on "
+        f"{threads} cores, by wall time {found.candidates / wall / 1e6:.1f}; NumPy's batched solve "
+        f"{1 / numpy_each / 1e6:.2f} million/s on one",
+    )  # fmt: skip
+
+
+def numpy_solve(run: ftlm.Run, equation: ftlm.Structure, count: int = 200_000) -> float:
+    """Seconds a candidate of NumPy's batched solve and quadratic form on gathered Gram matrices."""
+    rec = record(run, equation, M)
+    y, hub, current = (rec.of(n) for n in ("theta12", "theta11", "I1"))
+    etas = np.arange(1, 41) * 0.05
+    kernels = [_core.block_pulse_kernel(float(e), M, rec.step) for e in etas]
+    spectrum = [np.fft.rfft(k, 2 * M) for k in kernels]
+    columns = [np.fft.irfft(s * np.fft.rfft(x, 2 * M))[:M] for x in (y, hub, current) for s in spectrum]
+    x = np.stack([*columns, y], axis=1)
+    x /= np.linalg.norm(x, axis=0)
+    gram = x.T @ x
+    rng = np.random.default_rng(0)
+    own = np.sort(rng.permuted(np.tile(np.arange(40), (count, 1)), axis=1)[:, :2], axis=1)
+    picks = np.column_stack([own, 40 + rng.integers(0, 40, count), 80 + rng.integers(0, 40, count)])
+    start = time.process_time()
+    a = gram[picks[:, :, None], picks[:, None, :]] + 1e-9 * np.eye(4)
+    b = gram[picks, -1]
+    c = np.linalg.solve(a, b[:, :, None])[:, :, 0]
+    np.argsort(1 - 2 * np.sum(b * c, axis=1) + np.einsum("ni,nij,nj->n", c, a, c))
+    return (time.process_time() - start) / count
+
+
+def kernels() -> None:
+    """P4, P5 and P6: the core's own figures, each beside its transforms, and the rivals in Python."""
+    from scipy.linalg import solve_triangular, toeplitz  # noqa: PLC0415
+    from scipy.signal import fftconvolve  # noqa: PLC0415
+
+    binary = bench_binary()
+    out = subprocess.run([binary], capture_output=True, text=True, check=True).stdout
+    found = {name: float(value) for name, value in (line.rsplit(" ", 1) for line in out.splitlines())}
+    start = time.perf_counter()
+    phi = ftlm.haar_matrix(M)
+    dense = phi @ ftlm.block_pulse_matrix(0.85, M, 10.0) @ phi.T
+    numpy_time = time.perf_counter() - start
+    assert np.allclose(dense, ftlm.operational_matrix(0.85, M, 10.0), atol=1e-12)
+    ours, write = found["operational matrix 2048"], found["write 2048"]
+    judge(
+        "P4", "dense P of 2048 over writing such a matrix once", ours / write, 3,
+        f"{ours * 1e3:.1f} ms, writing {write * 1e3:.1f} ms; F alone {found['block pulse matrix 2048'] * 1e3:.1f} ms, "
+        f"by faer {found['operational matrix by faer 2048'] * 1e3:.0f} ms, by NumPy {numpy_time * 1e3:.0f} ms",
+    )  # fmt: skip
+    lengths = [2**k for k in range(11, 21)]
+    pairs = {m: found[f"rfft {m}"] + found[f"irfft {m}"] for m in lengths}
+    worst = max(lengths, key=lambda m: found[f"apply {m}"] / pairs[m])
+    signal, kernel = np.random.default_rng(0).standard_normal((2, M))
+    rival = best(lambda: fftconvolve(kernel, signal)[:M])
+    judge(
+        "P5", f"I^eta applied over a forward and an inverse FFT, worst of 2^11 to 2^20 (2^{worst.bit_length() - 1})",
+        found[f"apply {worst}"] / pairs[worst], 1.3,
+        "by length " + ", ".join(f"{found[f'apply {m}'] / pairs[m]:.2f}" for m in lengths)
+        + f"; at 2048 {found['apply 2048'] * 1e6:.1f} us, SciPy's fftconvolve {rival * 1e6:.1f} us",
+    )  # fmt: skip
+    ratios = {m: found[f"simulate {m}"] / found[f"rfft {m}"] for m in lengths}
+    worst = max(lengths, key=lambda m: ratios[m])
+    kernel = np.abs(kernel) + np.eye(1, M)[0] * M
+    matrix = toeplitz(kernel, np.zeros(M))
+    rival = best(lambda: solve_triangular(matrix, signal, lower=True))
+    judge(
+        "P6", f"free run over one FFT of twice its length, worst of 2^11 to 2^20 (2^{worst.bit_length() - 1})",
+        ratios[worst], 15,
+        "exact division throughout, so no residual to check; by length "
+        + ", ".join(f"{ratios[m]:.1f}" for m in lengths)
+        + f"; at 2048 {found['simulate 2048'] * 1e6:.0f} us, SciPy's triangular solve {rival * 1e6:.0f} us",
+    )  # fmt: skip
+
+
+def best(work) -> float:
+    """Shortest of some runs, in seconds."""
+    times = []
+    for _ in range(10):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return min(times)
+
+
+def bench_binary() -> str:
+    """Path of the Rust side, built if need be."""
+    out = subprocess.run(
+        ["cargo", "bench", "--bench", "promises", "--no-run", "--message-format", "json"],
+        capture_output=True, text=True, check=True, cwd=HERE.parent,
+    ).stdout  # fmt: skip
+    built = [json.loads(line) for line in out.splitlines() if line.startswith("{")]
+    return next(b["executable"] for b in built if b.get("executable") and b["target"]["name"] == "promises")
+
+
+def instructions(write: bool) -> None:
+    """Instructions of the three hottest kernels against their budget."""
+    if shutil.which("valgrind") is None:
+        say("instruction budget skipped: valgrind is not installed")
+        return
+    budget = json.loads(BUDGET.read_text(encoding="utf-8")) if BUDGET.exists() else {}
+    binary = bench_binary()
+
+    def count(kernel: str) -> tuple[int, int]:
+        ran = subprocess.run(
+            ["valgrind", "--tool=callgrind", "--callgrind-out-file=/dev/null", binary, kernel],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        units = re.search(r"units (\d+)", ran.stdout)
+        collected = re.search(r"Collected : (\d+)", ran.stderr)
+        if units is None or collected is None:
+            raise SystemExit(f"callgrind did not count {kernel}: {ran.stderr[-300:]}")
+        return int(collected[1]), int(units[1])
+
+    nothing, _ = count("nothing")
+    for kernel in ("screen", "divide", "apply"):
+        total, units = count(kernel)
+        each = round((total - (nothing if kernel == "screen" else 0)) / units)
+        allowed = budget.get(kernel)
+        if allowed is None:
+            budget[kernel] = each
+            say(f"instructions of {kernel}: {each} a unit, taken as its budget")
+        else:
+            verdict = "within" if each <= 1.1 * allowed else "BEYOND"
+            say(f"instructions of {kernel}: {each} a unit, {verdict} the budget of {allowed}")
+    if write:
+        BUDGET.write_text(json.dumps(budget, indent=2) + "\n", encoding="utf-8")
+
+
+STREAM = """
+import resource, sys, time
+from dataclasses import replace
+import ftlm
+from search import plant_a_run
+run = plant_a_run()
+equation = replace(ftlm.flexible_link(stage=1).equation("theta12"), initial="rest")
+step = float(sys.argv[1])
+coarse = ftlm.lattice(step=0.5, alpha=(1.0, 2.0))
+ftlm.search_orders(run, equation, coarse, coefficients="least-squares", m=2048)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+lattice = ftlm.lattice(step=step, alpha=(1.05, 2.0))
+start = time.perf_counter()
+found = ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=2048)
+wall = time.perf_counter() - start
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+pruned = 1 - (len(found.table) + found.pruned["beaten"]) / found.candidates
+print(found.candidates, wall, (after - before) / 1024, pruned)
+"""
+
+
+def memory(quick: bool) -> None:
+    """P8: import, demo, peak memory; a search over 10^8 candidates."""
+
+    def seconds(code: str) -> float:
+        return best(lambda: subprocess.run([sys.executable, "-c", code], check=True))
+
+    nothing = seconds("pass")
+    ratio = (seconds("import ftlm") - nothing) / (seconds("import numpy") - nothing)
+    judge("P8", "import ftlm over import numpy, interpreter apart", ratio, 2, f"interpreter {nothing * 1e3:.0f} ms")
+    for step in (0.05,) if quick else (0.05, 0.0118):
+        ran = subprocess.run(
+            [sys.executable, "-c", STREAM, str(step)], capture_output=True, text=True, check=True, cwd=HERE
+        )
+        candidates, wall, peak, pruned = (float(x) for x in ran.stdout.split())
+        judge(
+            "P8", f"memory of a search over {candidates:.3g} candidates beyond the record, MB", peak, 200,
+            f"{wall:.1f} s, {candidates / wall:.3g} candidates/s, {100 * pruned:.3f} % pruned",
+        )  # fmt: skip
+    if not quick:
+        start = time.perf_counter()
+        folder = HERE.parent / "target" / "bench-demo"
+        subprocess.run(
+            [sys.executable, "-m", "ftlm", "demo", "-o", str(folder), "--force"], check=True, capture_output=True
+        )
+        judge("P8", "ftlm demo, seconds", time.perf_counter() - start, 20, f"load {os.getloadavg()[0]:.1f}")
+
+
+def main() -> None:
+    """Measure, judge, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md and write the budgets")
+    parser.add_argument("--quick", action="store_true", help="leave out what takes more than a few seconds")
+    arguments = parser.parse_args()
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    say(
+        f"commit {commit.stdout.strip() or 'unknown'}, {platform.machine()}, {os.cpu_count()} cores, "
+        f"load {os.getloadavg()[0]:.1f} at the start"
+    )
+    searches(arguments.quick)
+    kernels()
+    memory(arguments.quick)
+    instructions(arguments.write)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    say(f"load {os.getloadavg()[0]:.1f} at the end; this process took at most {peak:.0f} MB")
+    if arguments.write:
+        path = HERE / "RESULTS.md"
+        text = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
+        path.write_text(text.rstrip("\n") + "\n\n" + "\n".join(f"- {line}" for line in lines) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
