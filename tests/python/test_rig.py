@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -203,6 +204,16 @@ def test_parameters_that_cannot_be_used_are_refused(tmp_path, text, words):
     with pytest.raises(ftlm.ModelError) as refused:
         rig.record(duration=0.5, parameters=path)
     assert words in str(refused.value)
+
+
+def test_the_stock_filter_of_a_record_is_that_of_a_model(plant):
+    run = rig.record(duration=4.0, parameters="linear", sensor_filter="stock")
+    truth = plant("A")
+    stock = ftlm.flexible_link(stage=1, sensor_filter="stock").sensor_filter
+    filtered = replace(truth, structure=replace(truth.structure, sensor_filter=stock)).simulate(run)
+    assert np.abs(filtered["theta12"] - run["theta12"]).max() < 3e-4 * run["theta12"].std()
+    plain = truth.simulate(run)
+    assert np.abs(plain["theta12"] - run["theta12"]).max() > 0.1 * run["theta12"].std()
 
 
 # ----------------------------------------------------------------------------------------------------------------------
