@@ -10,7 +10,7 @@ use ftlm::regressors::Record;
 use ftlm::search::lattice::{Lattice, TermAxis};
 use ftlm::search::run::{search, Control, Criterion as Criterium, Estimator, Norm, Options};
 use ftlm::series::{self, Buffers, Kernel};
-use ftlm::{haar, operational, simulate};
+use ftlm::{haar, metrics, operational, simulate};
 
 /// 2048 pulses is a record of the paper; the longer ones show the growth.
 const LENGTHS: [usize; 3] = [1 << 11, 1 << 14, 1 << 17];
@@ -74,6 +74,22 @@ fn haar_transform(c: &mut Criterion) {
         group.throughput(Throughput::Elements(m as u64));
         group.bench_with_input(BenchmarkId::new("transform", m), &m, |b, _| {
             b.iter_batched_ref(|| signal.clone(), |x| haar::transform(x), BatchSize::LargeInput);
+        });
+    }
+    group.finish();
+}
+
+fn correlations(c: &mut Criterion) {
+    let mut group = c.benchmark_group("correlations of a residual, 25 lags");
+    for m in [1 << 12, 1 << 16] {
+        let (x, y) = (noise(m, 1), noise(m, 2));
+        group.throughput(Throughput::Elements(m as u64));
+        // As the residual tests take them: out to a quarter of the run, for the band.
+        group.bench_with_input(BenchmarkId::new("by spectra, N/4 lags", m), &m, |b, &m| {
+            b.iter(|| metrics::covariances(black_box(&x), &y, m / 4));
+        });
+        group.bench_with_input(BenchmarkId::new("by definition, 25 lags", m), &m, |b, _| {
+            b.iter(|| metrics::covariances_naive(black_box(&x), &y, 25));
         });
     }
     group.finish();
@@ -159,6 +175,6 @@ fn quick() -> Criterion {
 criterion_group! {
     name = kernels;
     config = quick();
-    targets = series_algebra, haar_transform, operational_matrices, order_search
+    targets = series_algebra, haar_transform, correlations, operational_matrices, order_search
 }
 criterion_main!(kernels);

@@ -534,9 +534,14 @@ def identify(
         found.model.save(out, force=force)
     if report is not None:
         found.report(report, validation=others or None, force=force)
-    show(found, as_json=as_json)
-    if others and not as_json:
-        print(f"\nvalidation on {', '.join(r.name for r in others)}\n{found.validate(others)}")
+    checked = found.validate(others) if others else None
+    if as_json:
+        document = {**found.to_dict(), "validation": None if checked is None else checked.to_dict()}
+        print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False, default=plain))
+    else:
+        show(found, as_json=False)
+        if checked is not None:
+            print(f"\nvalidation on {', '.join(r.name for r in others)}\n{checked}")
 
 
 @app.command()

@@ -65,6 +65,8 @@ def test_two_commands_from_a_file_to_a_validated_model(folder: Path) -> None:
     assert found.returncode == 0, found.stderr
     assert "alpha" in found.stdout
     assert "1.5" in found.stdout
+    checked = ftlm_command("identify", "square.csv", *SEARCH, "--validation", "sine.csv", "--json", cwd=folder)
+    assert json.loads(checked.stdout)["validation"]["output_error"]["y"]["fit"] > 99
     compared = ftlm_command("compare", "model.json", "sine.csv", "--min-fit", "99", cwd=folder)
     assert compared.returncode == 0, compared.stderr
     assert "equation error" in compared.stdout
