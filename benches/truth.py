@@ -1,0 +1,263 @@
+"""Truth under noise, measured: bias against step, Monte-Carlo of the joint fit, the three-term table, random plants.
+
+``python benches/truth.py bias | intervals | three-terms | random-plants | arm [--seeds 100] [--plants A,A2,3T]
+[--levels 20,40,60,80] [--write]`` prints tables; ``--write`` appends them to benches/RESULTS.md. Seeds are 0 to
+``--seeds`` less one, and are never changed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import platform
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
+
+import ftlm
+import plants
+from ftlm.output_error import Attempt, FreeProblem, descend, experiment, fit_output_error
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
+
+#: Half-width of a 95 % interval in standard errors.
+NORMAL_95 = 1.959963984540054
+#: A start ends in the global optimum if its noise variance is within this share of that reached from the truth.
+SAME_OPTIMUM = 0.01
+
+
+@dataclass(frozen=True)
+class Scores:
+    """z-scores of every seed and parameter of one plant at one noise level."""
+
+    plant: str
+    level: float
+    names: tuple[str, ...]
+    z: np.ndarray
+    seconds: float
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean z of each parameter."""
+        return self.z.mean(axis=0)
+
+    @property
+    def coverage(self) -> np.ndarray:
+        """Share of 95 % intervals that hold the truth, of each parameter, in percent."""
+        return 100.0 * np.mean(np.abs(self.z) < NORMAL_95, axis=0)
+
+    def __str__(self) -> str:
+        mean, held = self.mean, 100 * np.mean(np.abs(self.z) < NORMAL_95)
+        at = int(np.argmax(np.abs(mean)))
+        return (
+            f"{self.plant} {self.level:g} dB, {len(self.z)} seeds: largest |mean z| {abs(mean[at]):.2f} ({self.names[at]}); "
+            f"95 % intervals cover {held:.1f} % pooled, {self.coverage.min():.0f} to {self.coverage.max():.0f} % by "
+            f"parameter; largest |z| {np.max(np.abs(self.z)):.1f}; {self.seconds:.1f} s a fit on one core"
+        )
+
+
+def workers() -> int:
+    """Cores."""
+    return os.cpu_count() or 1
+
+
+def fitted(task: tuple[str, float, int]) -> tuple[np.ndarray, tuple[str, ...], float]:
+    """z-scores of one seed from the automatic start."""
+    name, level, seed = task
+    start = time.process_time()
+    found = fit_output_error([plants.noisy_run(name, level, seed)], plants.structure(name))
+    truth = plants.truth(name)
+    z = (found.values - np.array([truth[n] for n in found.names])) / np.sqrt(np.diag(found.covariance))
+    return z, tuple(found.names), time.process_time() - start
+
+
+def intervals(names: Iterable[str], levels: Iterable[float], seeds: int) -> Iterator[Scores]:
+    """Monte-Carlo of the joint fit from the automatic start."""
+    with ProcessPoolExecutor(workers()) as pool:
+        for name in names:
+            for level in levels:
+                ended = list(pool.map(fitted, [(name, level, s) for s in range(seeds)]))
+                z = np.array([e[0] for e in ended])
+                yield Scores(name, level, ended[0][1], z, float(np.mean([e[2] for e in ended])))
+
+
+def bias(names: Iterable[str]) -> Iterator[str]:
+    """Error of the estimates from noise-free samples against pulses a sample, in standard errors at 40 dB."""
+    for name in names:
+        structure, run, truth = plants.structure(name), plants.clean_run(name), plants.truth(name)
+        problem = FreeProblem.of(structure)
+        true = [truth[n] for n in (*problem.orders, *problem.coefficients)]
+        weights = [1.0 / (0.01 * float(np.std(run[o]))) for o in structure.outputs]
+        split = len(problem.orders)
+        before: np.ndarray | None = None
+        for every in (1, 2, 4, 8, 16):
+            prepared = [experiment(run, problem, "rest", weights, every=every)]
+            start = Attempt(true[:split], true[split:], "truth", {})
+            end = descend(problem, prepared, structure.signals, "rest", start, evaluations=60, plain=True)
+            jacobian = np.asarray(end.found["jacobian"])
+            size = np.linalg.norm(jacobian, axis=1)
+            scaled = jacobian / size[:, None]
+            errors = np.sqrt(np.diag(np.linalg.inv(scaled @ scaled.T))) / size
+            values = np.array(end.orders + end.coefficients)
+            plain = np.max(np.abs(values - true) / errors)
+            limit = "" if before is None else (
+                f"; extrapolated {np.max(np.abs((4 * values - before) / 3 - true) / errors):.2g}"
+            )  # fmt: skip
+            before = values
+            yield f"{name}, {every} pulses a sample: largest bias {plain:.2g} standard errors{limit}"
+
+
+def three_terms(task: tuple[float, int]) -> float:
+    """Fit to the noise-free output of one seed."""
+    level, seed = task
+    run, clean = plants.noisy_run("3T", level, seed), plants.clean_run("3T")
+    found = ftlm.identify(run, plants.structure("3T"), threads=1)
+    y = clean["y"]
+    simulated = found.model.simulate(clean, tolerance=1e-6)["y"]
+    return float(100 * (1 - np.linalg.norm(simulated - y) / np.linalg.norm(y - y.mean())))
+
+
+def three_terms_table(seeds: int) -> Iterator[str]:
+    """Median fit to the noise-free output, all five numbers free."""
+    with ProcessPoolExecutor(workers()) as pool:
+        for level in (40, 20, 10):
+            fits = np.array(list(pool.map(three_terms, [(level, s) for s in range(seeds)])))
+            yield (
+                f"3T {level} dB, {seeds} seeds: median fit to the clean output {np.median(fits):.3f} %, "
+                f"least {fits.min():.3f} %"
+            )
+
+
+def random_plant(seed: int) -> tuple[int, float, float, str]:
+    """Excess noise variance of one plant's automatic start over the fit from the truth, and its time."""
+    model, structure, clean = plants.random_plant(seed)
+    run = plants.with_noise(clean, 40.0, [seed, 40, 9])
+    truth = plants.random_truth(model, structure)
+    words = ", ".join(f"{n} {v:.3g}" for n, v in truth.items())
+    start = time.process_time()
+    try:
+        found = fit_output_error([run], structure)
+        taken = time.process_time() - start
+        reference = fit_output_error([run], structure, start=truth)
+    except ftlm.FtlmError as error:
+        return seed, np.inf, time.process_time() - start, f"{words}: {error}"
+    return seed, (found.noise["y"] / reference.noise["y"]) ** 2 - 1.0, taken, words
+
+
+def random_plants(seeds: int) -> Iterator[str]:
+    """Share of random plants whose automatic start ends in the global optimum; the others one by one."""
+    with ProcessPoolExecutor(workers()) as pool:
+        ended = list(pool.map(random_plant, range(seeds)))
+    missed = [e for e in ended if e[1] > SAME_OPTIMUM]
+    yield (
+        f"random plants, seeds 0 to {seeds - 1}, 40 dB: {seeds - len(missed)} of {seeds} end in the global optimum; "
+        f"{np.mean([e[2] for e in ended]):.2f} s a fit on one core"
+    )
+    for seed, excess, _, words in missed:
+        yield f"  missed: seed {seed} ({words}), noise variance {100 * excess:.3g} % above"
+
+
+# ------------------------------------------------------------------------------------------------ the real arm
+
+
+def measured(name: str, first: float, last: float) -> ftlm.Run:
+    """A run of the real arm, deviations from the first value."""
+    folder = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    run = ftlm.load(
+        folder / f"two_link_{name}" / f"{name}.csv", time="t_s",
+        inputs={"I1": "Im1_meas_A", "I2": "Im2_meas_A"},
+        outputs={"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"},
+        units={"theta11": "deg", "theta12": "deg", "theta21": "deg", "theta22": "deg"},
+        intersample={"I1": "foh", "I2": "foh"},
+    ).slice(first, last)  # fmt: skip
+    return run
+
+
+#: Own terms, then every other signal, of each equation of the arm.
+ARM = {
+    "theta11": ("theta12", "I1", "theta21", "theta22", "I2"),
+    "theta12": ("theta11", "I1", "theta21", "theta22", "I2"),
+    "theta21": ("theta22", "I2", "theta11", "theta12", "I1"),
+    "theta22": ("theta21", "I2", "theta11", "theta12", "I1"),
+}
+
+
+def arm_structure(output: str, *, whole: bool) -> ftlm.Structure:
+    """One equation with all measured signals: whole orders (2; 1, 0), or all of them free."""
+    others = ARM[output]
+    if whole:
+        terms = [f"a1 D^1 {output}", f"a0 {output}", *[f"c{i} {s}" for i, s in enumerate(others)]]
+        words = f"D^2 {output} = " + " + ".join(terms)
+    else:
+        terms = [f"a1 D^beta {output}", f"a0 D^mu {output}", *[f"c{i} D^nu{i} {s}" for i, s in enumerate(others)]]
+        words = f"D^alpha {output} = " + " + ".join(terms)
+    return replace(ftlm.equation(words), coupling="measured", initial=(0.0, 1.0))
+
+
+def arm_row(task: tuple[str, bool, str]) -> str:
+    """Fit of one equation on some of the two runs, and its fit on each."""
+    output, whole, used = task
+    runs = {"psf": measured("psf", 1.1, 19.5), "lqr": measured("lqr", 82.274, 102.074)}
+    chosen = [runs[u] for u in used.split("+")]
+    start = time.process_time()
+    kind = "whole" if whole else "fractional"
+    try:
+        found = ftlm.identify(chosen, arm_structure(output, whole=whole), threads=1)
+    except ftlm.FtlmError as error:
+        return f"{output} {kind} on {used}: {error}"
+    fits = {n: found.model.compare(r).fit_percent[output] for n, r in runs.items()}
+    orders = ", ".join(f"{n} {v:.2f}±{found.standard_errors[n]:.2g}" for n, v in found.orders.items())
+    return (
+        f"{output} {kind} on {used}: psf {fits['psf']:.1f} %, lqr {fits['lqr']:.1f} %"
+        f"{'; ' + orders if orders else ''} ({time.process_time() - start:.0f} s)"
+    )
+
+
+def arm() -> Iterator[str]:
+    """Whole against fractional orders on the real arm, on both runs and each predicting the other."""
+    tasks = [(o, w, u) for o in ARM for w in (True, False) for u in ("psf+lqr", "psf", "lqr")]
+    with ProcessPoolExecutor(workers()) as pool:
+        yield from pool.map(arm_row, tasks)
+
+
+def main() -> None:
+    """Measure and print; append with ``--write``."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("bias", "intervals", "three-terms", "random-plants", "arm"))
+    parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--plants", default="A,A2,3T")
+    parser.add_argument("--levels", default="20,40,60,80")
+    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    arguments = parser.parse_args()
+    names = arguments.plants.split(",")
+    rows: Iterable[object] = {
+        "bias": lambda: bias(names),
+        "intervals": lambda: intervals(names, [float(x) for x in arguments.levels.split(",")], arguments.seeds),
+        "three-terms": lambda: three_terms_table(arguments.seeds),
+        "random-plants": lambda: random_plants(arguments.seeds),
+        "arm": arm,
+    }[arguments.what]()
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    command = " ".join(["python benches/truth.py", *[a for a in sys.argv[1:] if a != "--write"]])
+    lines = [f"`{command}`, commit {commit.stdout.strip()}, {platform.machine()}, {workers()} cores:"]
+    print(lines[0])
+    for row in rows:
+        lines.append(f"- {row}")
+        print(lines[-1], flush=True)
+    if arguments.write:
+        results = Path(__file__).with_name("RESULTS.md")
+        with results.open("a", encoding="utf-8") as file:
+            file.write("\n" + "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()
