@@ -58,8 +58,9 @@ class Scores:
     def __str__(self) -> str:
         mean, held = self.mean, 100 * np.mean(np.abs(self.z) < NORMAL_95)
         at = int(np.argmax(np.abs(mean)))
+        worst = f"{abs(mean[at]):.2f} ({self.names[at]})"
         return (
-            f"{self.plant} {self.level:g} dB, {len(self.z)} seeds: largest |mean z| {abs(mean[at]):.2f} ({self.names[at]}); "
+            f"{self.plant} {self.level:g} dB, {len(self.z)} seeds: largest |mean z| {worst}; "
             f"95 % intervals cover {held:.1f} % pooled, {self.coverage.min():.0f} to {self.coverage.max():.0f} % by "
             f"parameter; largest |z| {np.max(np.abs(self.z)):.1f}; {self.seconds:.1f} s a fit on one core"
         )
