@@ -16,6 +16,7 @@ pub struct Record {
     step: f64,
     signals: Vec<Vec<f64>>,
     filter: Option<Vec<f64>>,
+    clean: Option<Vec<Vec<f64>>>,
 }
 
 impl Record {
@@ -39,7 +40,41 @@ impl Record {
         if let Some(series) = &filter {
             check_length("filter", m, series.len())?;
         }
-        Ok(Self { step, signals, filter })
+        Ok(Self { step, signals, filter, clean: None })
+    }
+
+    /// Gives every signal a substitute without most of its noise, for instrumental variables.
+    ///
+    /// # Errors
+    /// As [`Record::new`]; [`Error::Length`] where there are not as many substitutes as signals.
+    pub fn with_clean(mut self, clean: Vec<Vec<f64>>) -> Result<Self> {
+        check_length("clean signals", self.signals.len(), clean.len())?;
+        for (i, signal) in clean.iter().enumerate() {
+            let name = format!("clean signal {i}");
+            check_length(&name, self.m(), signal.len())?;
+            check_finite(&name, signal)?;
+        }
+        self.clean = Some(clean);
+        Ok(self)
+    }
+
+    /// The record of the substitutes, or this one where it has none.
+    #[must_use]
+    pub fn cleaned(&self) -> Self {
+        let signals = self.clean.clone().unwrap_or_else(|| self.signals.clone());
+        Self { step: self.step, signals, filter: self.filter.clone(), clean: None }
+    }
+
+    /// All signals, and with them the initial terms, behind a causal filter given as a series of m terms.
+    ///
+    /// # Errors
+    /// [`Error::Length`], [`Error::NotFinite`] where the filter blows up.
+    pub fn through(&self, filter: &[f64]) -> Result<Self> {
+        let m = self.m();
+        check_length("filter", m, filter.len())?;
+        let filtered = |series: &Vec<f64>| series::multiply(filter, series, m);
+        let known = self.filter.as_ref().map_or_else(|| filter.to_vec(), filtered);
+        Self::new(self.step, self.signals.iter().map(filtered).collect(), Some(known))
     }
 
     /// Number of pulses.

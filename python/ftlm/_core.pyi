@@ -62,7 +62,7 @@ _Equation: TypeAlias = tuple[_Structure, Sequence[float]]
 #: (whether Caputo's powers, else these exponents)
 _Initial: TypeAlias = tuple[bool, Sequence[float]]
 #: (criterion, norm, p or 0 for least squares, K0, Haar rows, keep, threads, early stopping)
-_Options: TypeAlias = tuple[str, str, int, float, bool, int, int, bool]
+_Options: TypeAlias = tuple[str, str, int, float, bool, int, int, bool, int]
 #: (output, values of alpha, [(signal, values, interchangeable), ...])
 _Lattice: TypeAlias = tuple[int, Sequence[float], Sequence[tuple[int, Sequence[float], bool]]]
 #: (constant, weight of each free order)
@@ -164,7 +164,6 @@ def multi_innovation(
 ) -> tuple[_Estimate, _Matrix | None]: ...
 def instrumental_variables(
     runs: Sequence[_Record],
-    clean: Sequence[_Record],
     equations: Sequence[_Structure],
     inputs: Sequence[bool],
     fixed: Sequence[Sequence[float | None]],
@@ -172,7 +171,6 @@ def instrumental_variables(
     iterations: int,
     tolerance: float,
 ) -> tuple[list[_Estimate], list[list[float]], int, bool, bool]: ...
-def projected(run: _Record, signal: int, inputs: Sequence[int], at_rest: bool) -> _Floats: ...
 def output_error(
     runs: Sequence[_Experiment],
     laws: Sequence[_FreeEquation],

@@ -33,6 +33,10 @@ STEP = 0.05
 ALPHA = (1.05, 2.0)
 
 
+#: Steps of refined instrumental variables a candidate; most stand still before.
+REFINEMENTS = 5
+
+
 @dataclass(frozen=True)
 class Lattice:
     """Intervals and step of an order search.
@@ -309,7 +313,7 @@ class Settings:
         for name, value, known in (
             ("criterion", criterion, ("output-error", "equation-error")),
             ("norm", norm, ("l1", "l2")),
-            ("coefficients", coefficients, ("multi-innovation", "least-squares")),
+            ("coefficients", coefficients, ("multi-innovation", "least-squares", "instrumental-variables")),
             ("rows", rows, ("haar", "time")),
         ):
             if value not in known:
@@ -331,11 +335,12 @@ class Settings:
         """Whether m must be a power of two."""
         return self.coefficients == "multi-innovation" and self.rows == "haar"
 
-    def core(self) -> tuple[str, str, int, float, bool, int, int, bool]:
+    def core(self) -> tuple[str, str, int, float, bool, int, int, bool, int]:
         """As the core takes them."""
         p = self.innovation_length if self.coefficients == "multi-innovation" else 0
-        haar = self.rows == "haar"
-        return self.criterion, self.norm, p, self.prior_covariance, haar, self.keep, self.threads, self.early_stopping
+        steps = REFINEMENTS if self.coefficients == "instrumental-variables" else 0
+        ranked = (self.criterion, self.norm, p, self.prior_covariance, self.rows == "haar")
+        return *ranked, self.keep, self.threads, self.early_stopping, steps
 
     def to_dict(self) -> dict[str, Any]:
         """For results and reports."""
@@ -401,7 +406,9 @@ def search_orders(
         ``"output-error"``: the free run, each equation driven by the measured other outputs. ``"equation-error"``:
         measured signals on the right-hand side; it prefers near-identities.
     coefficients
-        ``"multi-innovation"`` (closed form of paper (44)) or ``"least-squares"``.
+        ``"multi-innovation"`` (closed form of paper (44)), ``"least-squares"``, or ``"instrumental-variables"``: refined
+        instrumental variables for every candidate, which noise on the outputs does not bias; instruments for measured
+        outputs are their projections on what the inputs excite.
     norm
         ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
     innovation_length, prior_covariance, rows

@@ -478,7 +478,7 @@ def lattice_rows(
     cores = [r.core() for r in records]
     inputs = list(records[0].inputs)
     initial = initial_tuple(records[0].initial)
-    settings = ("output-error", "l1", 0, 1.0, False, keep, threads, True)
+    settings = ("output-error", "l1", 0, 1.0, False, keep, threads, True, 0)
 
     def coefficients(item: Any, raw: Sequence[float]) -> dict[str, float]:
         terms = zip(item.terms, raw, strict=True)

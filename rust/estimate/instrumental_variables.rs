@@ -352,8 +352,8 @@ fn unmoved(before: &[f64], after: &[f64], terms: usize, tolerance: f64) -> bool 
 
 /// Refined instrumental variables for one or several equations on one or several records.
 ///
-/// `clean[r]` is record r with every measured output replaced by something without most of its noise ([`project`]): it
-/// stands for outputs that no equation simulates, and is the first instrument for those that one does. The iteration
+/// The records' clean signals ([`Record::with_clean`]) stand for outputs that no equation simulates, and are the first
+/// instruments for those that one does; a record without them stands for itself. The iteration
 /// starts from two-stage least squares behind several low-passes; the end with the least output error is kept, and
 /// where none stands still the iterate with the least. An unstable iterate is damped (its series read at ρz, ρ < 1),
 /// which keeps instruments bounded and clean.
@@ -364,20 +364,15 @@ fn unmoved(before: &[f64], after: &[f64], terms: usize, tolerance: f64) -> bool 
 /// As least squares; [`Error::Singular`] where instruments cannot tell the terms apart; [`Error::Length`].
 pub fn fit(
     records: &[Record],
-    clean: &[Record],
     structures: &[Structure],
     fixed: &[Vec<Option<f64>>],
     initial: &Initial,
     settings: Settings,
 ) -> Result<Fit> {
-    check_length("clean records", records.len(), clean.len())?;
     check_length("fixed coefficients", structures.len(), fixed.len())?;
-    for (record, substitute) in records.iter().zip(clean) {
-        check_length("signals of a clean record", record.len(), substitute.len())?;
-        check_length("clean record", record.m(), substitute.m())?;
-    }
+    let clean: Vec<Record> = records.iter().map(Record::cleaned).collect();
     let exponents: Vec<Vec<f64>> = structures.iter().map(|s| s.initial_exponents(initial)).collect();
-    let problem = Problem { records, clean, structures, fixed, exponents: &exponents };
+    let problem = Problem { records, clean: &clean, structures, fixed, exponents: &exponents };
     let mut best: Option<Ended> = None;
     let mut failure = None;
     for multiple in PREFILTERS {
@@ -567,7 +562,10 @@ pub fn power_frequency(signal: &[f64], step: f64) -> f64 {
 }
 
 /// A second-order low-pass as a series: behind it the equation between all signals stays the same.
-fn low_pass(omega: f64, record: &Record) -> Result<Vec<f64>> {
+///
+/// # Errors
+/// As [`Filter::series`].
+pub fn low_pass(omega: f64, record: &Record) -> Result<Vec<f64>> {
     let numerator = vec![(omega * omega, 0.0)];
     let denominator = vec![(1.0, 2.0), (1.4 * omega, 1.0), (omega * omega, 0.0)];
     Filter { numerator, denominator }.series(record.m(), record.step())
@@ -677,6 +675,18 @@ impl<'a> Shelf<'a> {
             output: self.output,
         }
     }
+}
+
+/// A record with clean substitutes ([`project`]) for all signals that are no inputs; inputs stand for themselves.
+///
+/// # Errors
+/// As [`project`].
+pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool) -> Result<Record> {
+    let known: Vec<usize> = (0..record.len()).filter(|&s| inputs.get(s).copied().unwrap_or(false)).collect();
+    let clean = (0..record.len())
+        .map(|s| if known.contains(&s) { Ok(record.signal(s).to_vec()) } else { project(&record, s, &known, at_rest) })
+        .collect::<Result<Vec<_>>>()?;
+    record.with_clean(clean)
 }
 
 /// A measured signal without most of its noise: its least-squares projection on what the inputs excite.

@@ -6,7 +6,7 @@ use pyo3::types::PyDict;
 
 use super::arrays::{initial, record, records, rows, stacked, structure, vector, InitialArg, RecordArg, StructureArg};
 use super::errors::detached;
-use crate::equation::AffineOrder;
+use crate::equation::{AffineOrder, Initial};
 use crate::error::{check_finite, check_length, Error};
 use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
@@ -73,7 +73,6 @@ type InstrumentTuple = (Vec<EstimateTuple>, Vec<Vec<f64>>, usize, bool, bool);
 pub fn instrumental_variables(
     py: Python<'_>,
     runs: Vec<RecordArg<'_>>,
-    clean: Vec<RecordArg<'_>>,
     equations: Vec<StructureArg>,
     inputs: Vec<bool>,
     fixed: Vec<Vec<Option<f64>>>,
@@ -81,36 +80,25 @@ pub fn instrumental_variables(
     iterations: usize,
     tolerance: f64,
 ) -> PyResult<InstrumentTuple> {
-    let (measured, substitutes) = (records(&runs)?, records(&clean)?);
+    let measured = records(&runs)?;
     let structures =
         equations.into_iter().map(|e| structure(e, inputs.len(), &inputs)).collect::<PyResult<Vec<_>>>()?;
     let initial = initial(terms)?;
     let settings = instruments::Settings { iterations, tolerance };
-    let fit = detached(py, || instruments::fit(&measured, &substitutes, &structures, &fixed, &initial, settings))?;
+    let fit = detached(py, || {
+        let at_rest = initial == Initial::Rest;
+        let measured = measured
+            .into_iter()
+            .map(|r| instruments::with_projections(r, &inputs, at_rest))
+            .collect::<Result<Vec<_>, _>>()?;
+        instruments::fit(&measured, &structures, &fixed, &initial, settings)
+    })?;
     let (mut estimates, mut covariances) = (Vec::new(), Vec::new());
     for e in fit.estimates {
         estimates.push((e.coefficients, e.initial, e.exponents, Vec::new()));
         covariances.push(e.covariance);
     }
     Ok((estimates, covariances, fit.iterations, fit.converged, fit.damped))
-}
-
-#[pyfunction]
-#[allow(clippy::needless_pass_by_value)]
-pub fn projected<'py>(
-    py: Python<'py>,
-    run: RecordArg<'py>,
-    signal: usize,
-    inputs: Vec<usize>,
-    at_rest: bool,
-) -> PyResult<Bound<'py, PyArray1<f64>>> {
-    let record = record(&run)?;
-    if let Some(&missing) = inputs.iter().chain([&signal]).find(|&&s| s >= record.len()) {
-        let what = format!("signal {missing} is not in a record of {}", record.len());
-        return Err(Error::Structure { what, remedy: "number signals from 0".into() }.into());
-    }
-    let out = detached(py, || instruments::project(&record, signal, &inputs, at_rest))?;
-    Ok(PyArray1::from_vec(py, out))
 }
 
 /// (constant, weight of each free order).

@@ -24,9 +24,7 @@ mod _core {
     };
 
     #[pymodule_export]
-    use super::estimate::{
-        instrumental_variables, least_squares, multi_innovation, output_error, projected, Streaming,
-    };
+    use super::estimate::{instrumental_variables, least_squares, multi_innovation, output_error, Streaming};
 
     #[pymodule_export]
     use super::simulate::{

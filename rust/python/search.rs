@@ -9,9 +9,11 @@ use pyo3::types::PyDict;
 
 use super::arrays::{initial, records, InitialArg, RecordArg};
 use super::errors::caught;
-use crate::equation::AffineOrder;
+use crate::equation::{AffineOrder, Initial};
 use crate::error::Error;
+use crate::estimate::instrumental_variables::{with_projections, Settings};
 use crate::estimate::multi_innovation::{Innovation, Rows};
+use crate::regressors::Record;
 use crate::search::lattice::{Lattice, LawEquation, LawLattice, TermAxis};
 use crate::search::run::{self, Control, Counts, Criterion, Estimator, Failure, Norm, Options};
 use crate::search::stage;
@@ -69,11 +71,15 @@ fn state(control: &Control) -> (u64, u64, u64) {
     (read(&control.done), read(&control.total), read(&control.pruned))
 }
 
-/// (criterion, norm, p or 0 for least squares, K₀, Haar rows, keep, threads, early stopping).
-type OptionsArg = (String, String, usize, f64, bool, usize, usize, bool);
+/// (criterion, norm, p or 0 for least squares, K₀, Haar rows, keep, threads, early stopping, steps of instrumental
+/// variables or 0).
+type OptionsArg = (String, String, usize, f64, bool, usize, usize, bool, usize);
+
+/// Change below which a candidate's instrumental variables stand still: far below what moves a rank.
+const REFINED: f64 = 1e-4;
 
 fn options(argument: OptionsArg, terms: InitialArg) -> PyResult<Options> {
-    let (criterion, norm, length, prior_covariance, haar, keep, threads, early_stopping) = argument;
+    let (criterion, norm, length, prior_covariance, haar, keep, threads, early_stopping, iterations) = argument;
     let unknown = |what: String, remedy: &str| Error::Structure { what, remedy: remedy.into() };
     Ok(Options {
         criterion: match criterion.as_str() {
@@ -89,7 +95,9 @@ fn options(argument: OptionsArg, terms: InitialArg) -> PyResult<Options> {
             "l2" => Norm::L2,
             other => return Err(unknown(format!("norm '{other}' is not known"), "use l1 or l2").into()),
         },
-        estimator: if length == 0 {
+        estimator: if iterations > 0 {
+            Estimator::InstrumentalVariables(Settings { iterations, tolerance: REFINED })
+        } else if length == 0 {
             Estimator::LeastSquares
         } else {
             let rows = if haar { Rows::Haar } else { Rows::Time };
@@ -100,6 +108,15 @@ fn options(argument: OptionsArg, terms: InitialArg) -> PyResult<Options> {
         threads,
         early_stopping,
     })
+}
+
+/// Records with the clean signals that the estimator asks for.
+fn prepared(records: Vec<Record>, inputs: &[bool], options: &Options) -> Result<Vec<Record>, Error> {
+    if !matches!(options.estimator, Estimator::InstrumentalVariables(_)) {
+        return Ok(records);
+    }
+    let at_rest = options.initial == Initial::Rest;
+    records.into_iter().map(|r| with_projections(r, inputs, at_rest)).collect()
 }
 
 fn counted<'py>(py: Python<'py>, counts: &Counts) -> PyResult<Bound<'py, PyDict>> {
@@ -155,6 +172,7 @@ pub fn search<'py>(
     let options = options(settings, terms)?;
     let (lattice, outcome) = watched(py, progress.as_ref(), |control| {
         let lattice = lattice(orders, &inputs)?;
+        let records = prepared(records, &inputs, &options)?;
         let outcome = run::search(&records, &lattice, &fixed, &options, control)?;
         Ok((lattice, outcome))
     })?;
@@ -218,6 +236,7 @@ pub fn search_stage<'py>(
         .collect();
     let (lattice, outcome) = watched(py, progress.as_ref(), |control| {
         let lattice = LawLattice::new(&axes, &equations, &inputs)?;
+let records = prepared(records, &inputs, &options)?;
         let outcome = stage::search(&records, &lattice, &fixed, &scales, &options, control)?;
         Ok((lattice, outcome))
     })?;

@@ -2,6 +2,7 @@
 //! parallel ([`run`]), join the equations of a stage under its order law ([`stage`]).
 
 pub mod bound;
+mod instruments;
 pub mod lattice;
 pub mod run;
 pub mod stage;

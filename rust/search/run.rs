@@ -14,11 +14,13 @@ use rayon::prelude::*;
 use crate::dense;
 use crate::equation::{grains, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_length, Error, Result};
+use crate::estimate::instrumental_variables::Settings;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::haar;
 use crate::lanes::{self, Lanes, WIDTH};
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::search::bound::{self, Bound};
+use crate::search::instruments::{start_bank, Refiner};
 use crate::search::lattice::{Cursor, Lattice};
 use crate::series::{Division, BLOCK};
 use crate::small::{packed, solve_lanes};
@@ -65,6 +67,8 @@ pub enum Estimator {
     LeastSquares,
     /// Multi-innovation least squares in closed form.
     MultiInnovation(Innovation),
+    /// Refined instrumental variables from the records' clean signals ([`Record::with_clean`]).
+    InstrumentalVariables(Settings),
 }
 
 /// The settings of a search.
@@ -174,6 +178,7 @@ pub(crate) struct Problem {
     /// Where the equation error in squares ranks: its own Gram matrix, without weights and prior.
     plain: Option<Plain>,
     bound: Option<Bound>,
+    refiner: Option<Refiner>,
     fixed: Vec<Option<f64>>,
     /// Terms whose coefficients are estimated.
     free: Vec<usize>,
@@ -343,10 +348,12 @@ impl Problem {
         let squares = (width + 1) * (width + 1);
         let (mut sum, mut unweighted) = (vec![0.0; squares], Vec::new());
         let prior = match options.estimator {
-            Estimator::LeastSquares => 0.0,
+            Estimator::LeastSquares | Estimator::InstrumentalVariables(_) => 0.0,
             Estimator::MultiInnovation(innovation) => 1.0 / innovation.prior_covariance,
         };
+        let refined = matches!(options.estimator, Estimator::InstrumentalVariables(_));
         let plain = options.early_stopping
+            && !refined
             && options.criterion == Criterion::EquationError
             && options.norm == Norm::L2
             && options.initial == Initial::Rest;
@@ -354,8 +361,13 @@ impl Problem {
             unweighted = vec![0.0; squares];
         }
         let mut parts = Vec::new();
-        for (bank, target) in banks.iter().zip(&targets) {
-            let mut gram = plain_gram(bank, target);
+        for ((bank, target), record) in banks.iter().zip(&targets).zip(records) {
+            let mut gram = if refined {
+                let (bank, target) = start_bank(record, output, &index)?;
+                plain_gram(&bank, &target)
+            } else {
+                plain_gram(bank, target)
+            };
             unweighted.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
             if let Estimator::MultiInnovation(innovation) = options.estimator {
                 weigh(&mut gram, bank, target, innovation)?;
@@ -373,10 +385,17 @@ impl Problem {
             gram: unweighted,
             unit: 4.0 * f64::EPSILON * samples as f64,
         });
+        let refiner = match options.estimator {
+            Estimator::InstrumentalVariables(settings) => {
+                Some(Refiner::new(records, output, &index, &banks, settings)?)
+            }
+            _ => None,
+        };
         Ok(Self {
             index,
             banks,
             targets,
+            refiner,
             terms: Normal::new(&sum, width, prior),
             parts,
             plain,
@@ -390,7 +409,8 @@ impl Problem {
 
     /// Makes test vectors for about this many candidates, as far as they pay; on the current thread pool.
     pub(crate) fn with_bound(mut self, candidates: u64) -> Self {
-        if self.options.early_stopping && self.plain.is_none() {
+        // The bound speaks of coefficients, which a refinement changes.
+        if self.options.early_stopping && self.plain.is_none() && self.refiner.is_none() {
             let output_error = self.options.criterion == Criterion::OutputError;
             let own = (0..self.index.keys().len()).filter(|&p| !self.banks[0].kernel(p).is_empty()).count() as u64;
             // Two transforms for each own column and test vector; the products cost as much as a transform or so.
@@ -445,6 +465,13 @@ impl Problem {
         scratch.coefficients.extend(scratch.one.coefficients.iter().map(|c| c[0]));
         scratch.weights.clear();
         scratch.weights.extend(scratch.one.initial.iter().map(|c| c[0]));
+        if let Some(refiner) = &self.refiner {
+            let (coefficients, weights) = (&mut scratch.coefficients, &mut scratch.weights);
+            let (data, places) = ((&self.banks[..], &self.targets[..]), (positions, initial));
+            if let Err(failure) = refiner.refine(data, places, &self.fixed, coefficients, weights) {
+                return Verdict::Failed(failure);
+            }
+        }
         if let (true, Some(bound)) = (bounded && limit < f64::INFINITY, &self.bound) {
             let (weights, n) = (&scratch.weights, initial.len());
             let columns = |r: usize| (positions, &scratch.coefficients[..], initial, &weights[r * n..(r + 1) * n]);

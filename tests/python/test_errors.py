@@ -448,7 +448,7 @@ def test_the_core_answers_hostile_calls_with_typed_errors(
         lambda: _core.trace_errors(rec, structure, inputs, np.array([[coefficient, 1.0]])),
         lambda: _core.search(
             [rec], (output, [alpha, order], [(signal, [order, alpha], True)]), inputs, [None], (False, exponents),
-            ("output-error", "l1", 0, 1.0, False, 5, 1, True), None,
+            ("output-error", "l1", 0, 1.0, False, 5, 1, True, 2), None,
         ),
         lambda: _core.filter_series([(coefficient, order)], [(1.0, alpha)], 8, step),
         lambda: _core.fractional_integral(means, order, step, "trapezoidal"),

@@ -3,11 +3,13 @@
 use ftlm::equation::{Equation, Initial};
 use ftlm::error::Error;
 use ftlm::estimate::instrumental_variables::{
-    damped_inverse, fit, power_frequency, project, refine, step, Scratch, Settings, Source,
+    damped_inverse, fit, low_pass, power_frequency, project, refine, step, Scratch, Settings, Source,
 };
 use ftlm::estimate::least_squares;
 use ftlm::fractional::block_pulse_kernel;
 use ftlm::regressors::Record;
+use ftlm::search::lattice::{Lattice, TermAxis};
+use ftlm::search::run::{search, Control, Criterion, Estimator, Norm, Options};
 use ftlm::series::{divide_naive, multiply_naive, Kernel};
 use ftlm::{simulate, small};
 
@@ -30,9 +32,16 @@ fn measured(model: &Equation, m: usize, initial: &[(f64, f64)], noise: f64, seed
     (with_signal(&rest, 0, noisy), with_signal(&rest, 0, clean))
 }
 
-fn run(records: &[Record], clean: &[Record], model: &Equation, fixed: &[Option<f64>], initial: &Initial) -> Vec<f64> {
+/// Records with substitutes for their outputs.
+fn with_clean(record: &Record, output: usize, inputs: &[usize]) -> Record {
+    let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
+    signals[output] = project(record, output, inputs, true).unwrap();
+    record.clone().with_clean(signals).unwrap()
+}
+
+fn run(records: &[Record], model: &Equation, fixed: &[Option<f64>], initial: &Initial) -> Vec<f64> {
     let structures = std::slice::from_ref(&model.structure);
-    let found = fit(records, clean, structures, &[fixed.to_vec()], initial, Settings::default()).unwrap();
+    let found = fit(records, structures, &[fixed.to_vec()], initial, Settings::default()).unwrap();
     assert!(found.converged);
     found.estimates.into_iter().next().unwrap().coefficients
 }
@@ -103,7 +112,7 @@ fn exact_data_is_a_fixed_point_from_any_number_of_records_and_initial_terms() {
         .collect();
     let initial = Initial::Powers(vec![0.0, 0.9, 1.0]);
     let structures = std::slice::from_ref(&model.structure);
-    let found = fit(&records, &records, structures, &[FREE.to_vec()], &initial, Settings::default()).unwrap();
+    let found = fit(&records, structures, &[FREE.to_vec()], &initial, Settings::default()).unwrap();
     assert!(found.converged && !found.damped);
     let estimate = &found.estimates[0];
     check("coefficients of exact data", relative_distance(&estimate.coefficients, &model.coefficients), 1e-9);
@@ -112,7 +121,7 @@ fn exact_data_is_a_fixed_point_from_any_number_of_records_and_initial_terms() {
         check("initial terms", distance(found, &truth.iter().map(|t| t.1).collect::<Vec<_>>()), 1e-8);
     }
     let fixed = [Some(-3.0), None, None, Some(0.7)];
-    let kept = run(&records, &records, &model, &fixed, &initial);
+    let kept = run(&records, &model, &fixed, &initial);
     assert_eq!((kept[0], kept[3]), (-3.0, 0.7));
     check("free coefficients beside fixed ones", relative_distance(&kept, &model.coefficients), 1e-9);
 }
@@ -128,13 +137,11 @@ fn noise_that_ruins_least_squares_leaves_the_truth_within_its_standard_errors() 
         let mut random = Random::new(1000 + seed);
         let y: Vec<f64> = clean.signal(0).iter().map(|v| v + sigma * random.normal()).collect();
         let noisy = with_signal(&noisy, 0, y);
-        let cleaned = with_signal(&noisy, 0, project(&noisy, 0, &[1, 2], true).unwrap());
-        let records = [noisy];
+        let records = [with_clean(&noisy, 0, &[1, 2])];
         let squares = least_squares::fit(&records, &model.structure, &FREE, &Initial::Rest).unwrap();
         by_squares.iter_mut().zip(&squares.coefficients).for_each(|(s, c)| *s += c / 30.0);
         let structures = std::slice::from_ref(&model.structure);
-        let found =
-            fit(&records, &[cleaned], structures, &[FREE.to_vec()], &Initial::Rest, Settings::default()).unwrap();
+        let found = fit(&records, structures, &[FREE.to_vec()], &Initial::Rest, Settings::default()).unwrap();
         assert!(found.converged, "seed {seed}");
         let e = &found.estimates[0];
         for (k, list) in scores.iter_mut().enumerate() {
@@ -166,13 +173,11 @@ fn coupled_equations_are_simulated_from_the_input_alone() {
         let sigma = 0.01 * deviation(output);
         noisy = with_signal(&noisy, i, output.iter().map(|v| v + sigma * random.normal()).collect());
     }
-    let mut clean = noisy.clone();
-    for i in 0..2 {
-        clean = with_signal(&clean, i, project(&noisy, i, &[2], true).unwrap());
-    }
+    let clean = (0..3).map(|s| if s < 2 { project(&noisy, s, &[2], true).unwrap() } else { noisy.signal(s).to_vec() });
+    let noisy = noisy.clone().with_clean(clean.collect()).unwrap();
     let structures = [first.structure.clone(), second.structure.clone()];
     let found =
-        fit(&[noisy], &[clean], &structures, &[vec![None; 3], vec![None; 3]], &Initial::Rest, Settings::default())
+        fit(&[noisy], &structures, &[vec![None; 3], vec![None; 3]], &Initial::Rest, Settings::default())
             .unwrap();
     assert!(found.converged && !found.damped);
     for (estimate, model) in found.estimates.iter().zip(&both) {
@@ -192,9 +197,9 @@ fn units_do_not_matter() {
         record(noisy.step(), (0..3).map(|s| noisy.signal(s).iter().map(|v| v * f[s]).collect()).collect())
     };
     let one = std::slice::from_ref(&noisy);
-    let plain = run(one, one, &model, &FREE, &Initial::Rest);
+    let plain = run(one, &model, &FREE, &Initial::Rest);
     let other = scaled([1e6, 1e-4, 57.3]);
-    let found = run(std::slice::from_ref(&other), std::slice::from_ref(&other), &model, &FREE, &Initial::Rest);
+    let found = run(std::slice::from_ref(&other), &model, &FREE, &Initial::Rest);
     let expected = [plain[0], plain[1], plain[2] * 1e10, plain[3] * 1e6 / 57.3];
     for (a, b) in found.iter().zip(expected) {
         assert!((a / b - 1.0).abs() < 1e-6, "{found:?} {expected:?}");
@@ -205,8 +210,7 @@ fn units_do_not_matter() {
 fn refining_one_equation_alone_ends_where_the_whole_does() {
     let model = link();
     let (noisy, _) = measured(&model, 512, &[], 0.002, 13);
-    let cleaned = with_signal(&noisy, 0, project(&noisy, 0, &[1, 2], true).unwrap());
-    let whole = run(std::slice::from_ref(&noisy), &[cleaned], &model, &FREE, &Initial::Rest);
+    let whole = run(&[with_clean(&noisy, 0, &[1, 2])], &model, &FREE, &Initial::Rest);
     let kernels: Vec<Vec<f64>> =
         (0..2).map(|k| block_pulse_kernel(model.structure.integration(k), noisy.m(), noisy.step())).collect();
     let columns: Vec<Kernel> = (0..4)
@@ -283,9 +287,9 @@ fn instruments_that_say_nothing_are_refused() {
     let silent = with_signal(&with_signal(&noisy, 1, vec![0.0; 200]), 2, vec![0.0; 200]);
     let structures = std::slice::from_ref(&model.structure);
     let records = [silent];
-    let found = fit(&records, &records, structures, &[FREE.to_vec()], &Initial::Rest, Settings::default());
+    let found = fit(&records, structures, &[FREE.to_vec()], &Initial::Rest, Settings::default());
     assert!(matches!(found, Err(Error::Singular { .. })), "{found:?}");
-    let short = fit(&records, &[], structures, &[FREE.to_vec()], &Initial::Rest, Settings::default());
+    let short = fit(&records, structures, &[], &Initial::Rest, Settings::default());
     assert!(matches!(short, Err(Error::Length { .. })));
 }
 
@@ -316,4 +320,80 @@ fn scaled_inverse_is_the_inverse_whatever_the_units() {
     }
     assert!(matches!(small::scaled_inverse(&[1.0, 2.0, 2.0, 4.0], 2), Err(Error::Singular { .. })));
     assert!(matches!(small::scaled_inverse(&[0.0, 0.0, 0.0, 1.0], 2), Err(Error::Singular { .. })));
+}
+
+#[test]
+fn a_search_refines_every_candidate_as_refining_it_alone_does() {
+    let model = equation(0, 1.8, &[(0, 0.9, -3.0), (0, 0.0, -40.0), (1, 0.0, 4.0)]);
+    let mut random = Random::new(29);
+    let m = 400;
+    let rest = record(0.01, vec![vec![0.0; m], random.steps(m, 37)]);
+    let clean = simulate::respond(std::slice::from_ref(&model), &rest, &[vec![]]).unwrap().remove(0);
+    let sigma = 0.02 * deviation(&clean);
+    let noisy = with_signal(&rest, 0, clean.iter().map(|v| v + sigma * random.normal()).collect());
+    let noisy = with_clean(&noisy, 0, &[1]);
+    let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
+    let terms = [axis(0, &[0.7, 0.9, 1.1]), axis(0, &[0.0, 0.2]), axis(1, &[0.0, 0.1])];
+    let lattice = Lattice::new(0, &[1.6, 1.8, 2.0], &terms, |s| s == 1).unwrap();
+    let settings = Settings { iterations: 6, tolerance: 1e-9 };
+    let options = |threads, early_stopping| Options {
+        criterion: Criterion::OutputError,
+        norm: Norm::L1,
+        estimator: Estimator::InstrumentalVariables(settings),
+        initial: Initial::Rest,
+        keep: 10,
+        threads,
+        early_stopping,
+    };
+    let run = |threads, stopping| {
+        let records = [noisy.clone()];
+        search(&records, &lattice, &[None; 3], &options(threads, stopping), &Control::default()).unwrap()
+    };
+    let found = run(1, true);
+    assert_eq!(found.rows, run(2, true).rows);
+    assert_eq!(found.rows, run(1, false).rows);
+    let counts = found.counts;
+    let left = counts.beaten + counts.bounded + counts.stopped + counts.singular + counts.diverged;
+    assert_eq!(counts.kept + left, lattice.count());
+
+    let band = 2.0 * power_frequency(noisy.signal(0), noisy.step());
+    let smooth = noisy.cleaned().through(&low_pass(band, &noisy).unwrap()).unwrap();
+    let tidy = noisy.cleaned();
+    let mut scores: Vec<(f64, u64)> = Vec::new();
+    for index in 0..lattice.count() {
+        let structure = lattice.structure(index);
+        let start = least_squares::fit(std::slice::from_ref(&smooth), &structure, &[None; 3], &Initial::Rest).unwrap();
+        let spectra = |r: &Record| -> Vec<Kernel> {
+            (0..3).map(|k| Kernel::new(&r.integral(structure.terms[k].signal, structure.integration(k)))).collect()
+        };
+        let kernels: Vec<Vec<f64>> =
+            (0..2).map(|k| block_pulse_kernel(structure.integration(k), m, noisy.step())).collect();
+        let (measured, clean, goal) = (spectra(&noisy), spectra(&tidy), Kernel::new(noisy.signal(0)));
+        let source = Source {
+            own: vec![Some(&kernels[0]), Some(&kernels[1]), None],
+            measured: measured.iter().collect(),
+            clean: clean.iter().collect(),
+            initial: Vec::new(),
+            target: &goal,
+            output: noisy.signal(0),
+        };
+        let refined = refine(&[source], &[None; 3], &[], &start.coefficients, settings, &mut Scratch::default());
+        let Ok((coefficients, _, _)) = refined else { continue };
+        let equation = Equation { structure, coefficients };
+        let response = simulate::respond(std::slice::from_ref(&equation), &noisy, &[vec![]]).unwrap().remove(0);
+        let score = response.iter().zip(noisy.signal(0)).map(|(a, b)| (a - b).abs()).sum::<f64>();
+        scores.push((score, index));
+        if let Some(row) = found.rows.iter().find(|r| r.index == index) {
+            assert!((row.score / score - 1.0).abs() < 1e-4, "{} {score}", row.score);
+        }
+    }
+    scores.retain(|s| s.0.is_finite());
+    scores.sort_by(|a, b| a.0.total_cmp(&b.0));
+    assert_eq!(found.rows[0].index, scores[0].1);
+    let best = lattice.structure(found.rows[0].index);
+    assert_eq!((best.order, best.terms[0].order, best.terms[1].order), (1.8, 0.9, 0.0));
+    // Least squares does not find the true orders under this noise.
+    let squares = Options { estimator: Estimator::LeastSquares, ..options(1, true) };
+    let biased = search(&[noisy.clone()], &lattice, &[None; 3], &squares, &Control::default()).unwrap();
+    assert!(biased.rows[0].score > found.rows[0].score);
 }

@@ -263,6 +263,7 @@ fn naive(problem: &Problem, structure: &Structure) -> Result<(f64, Estimate), Fa
     let estimate = match &options.estimator {
         Estimator::LeastSquares => least_squares::fit(records, structure, fixed, &options.initial),
         Estimator::MultiInnovation(i) => closed_form(records, structure, fixed, &options.initial, i),
+        Estimator::InstrumentalVariables(_) => panic!("instrumental variables have a test of their own"),
     };
     let estimate = estimate.map_err(|_| Failure::Singular)?;
     let equation = Equation { structure: structure.clone(), coefficients: estimate.coefficients.clone() };
