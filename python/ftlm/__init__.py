@@ -21,6 +21,7 @@ from ftlm.operators import (
     operational_matrix,
 )
 from ftlm.order_search import Lattice, SearchResult, SearchRow, lattice, search_orders
+from ftlm.physical import PhysicalParameter, physical_parameters
 from ftlm.residuals import CorrelationTest, InformationCriteria, OutputResiduals, Residuals, information_criteria, resid
 from ftlm.runs import Run
 from ftlm.simulation import explicit_euler, simulate
@@ -45,6 +46,7 @@ __all__ = [
     "ModelError",
     "Order",
     "OutputResiduals",
+    "PhysicalParameter",
     "Residuals",
     "RigFault",
     "Run",
@@ -75,6 +77,7 @@ __all__ = [
     "multi_innovation_trace",
     "operational_matrix",
     "order_law",
+    "physical_parameters",
     "resid",
     "rig",
     "search_orders",

@@ -38,7 +38,6 @@ __all__ = [
     "operational_matrix",
     "output_error",
     "point_samples",
-    "projected",
     "pulse_means",
     "respond",
     "respond_with_initial",

@@ -23,7 +23,8 @@ from ftlm.order_search import (
     prepare,
     search_orders,
 )
-from ftlm.output_error import FreeProblem, JointFit, fit_output_error, is_white
+from ftlm.output_error import NORMAL_95, FreeProblem, JointFit, fit_output_error, is_white
+from ftlm.physical import PhysicalParameter, physical_parameters
 from ftlm.records import initial_tuple, structure_tuple
 from ftlm.residuals import (
     InformationCriteria,
@@ -41,12 +42,16 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ftlm.records import Record
     from ftlm.runs import Run
 
 __all__ = ["Identification", "Trace", "identify", "multi_innovation_trace"]
 
-METHODS = ("output-error", "multi-innovation", "least-squares")
-LATER = ("instrumental-variables", "genetic")
+METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares")
+LATER = ("genetic",)
+#: Most steps of refined instrumental variables, and the relative change of a coefficient that ends them.
+REFINEMENTS = 40
+STILL = 1e-8
 #: A coefficient that the prior moves by more than this share is not the data's alone.
 PULLED = 0.05
 #: Two parameters more correlated than this cannot be told apart.
@@ -107,6 +112,8 @@ class Identification:
         Information criteria, orders counted as parameters; None where there are no residuals.
     task
         The runs and the structure as they were given.
+    coefficient_errors
+        Standard errors of the coefficients at these orders, where the method gives no joint covariance.
     """
 
     model: Model
@@ -119,6 +126,7 @@ class Identification:
     residuals: Residuals | None = None
     information: InformationCriteria | None = None
     task: Task | None = field(default=None, repr=False)
+    coefficient_errors: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def orders(self) -> dict[str, float]:
@@ -127,13 +135,43 @@ class Identification:
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        """Standard errors of orders and coefficients by name; empty for the equation-error methods, which have none."""
-        return {} if self.joint is None else self.joint.standard_errors
+        """Standard errors by name.
+
+        Of orders and coefficients by output error; of coefficients alone, at the orders found and robust to coloured
+        residuals, by instrumental variables; empty for the equation-error methods.
+        """
+        if self.joint is None:
+            return dict(self.coefficient_errors)
+        return {**self.joint.standard_errors, **self.joint.derived_errors}
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals of orders and coefficients by name; empty for the equation-error methods."""
-        return {} if self.joint is None else self.joint.intervals
+        """95 % intervals by name, of what has standard errors."""
+        values = {**self.orders, **self.coefficients, **({} if self.joint is None else self.joint.coefficients)}
+        errors = self.standard_errors
+        return {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
+
+    def physical(self, **known: float) -> dict[str, PhysicalParameter]:
+        """Physical parameters of a flexible link once one of them is known; see :func:`ftlm.physical_parameters`.
+
+        Parameters
+        ----------
+        **known
+            One parameter a stage by name, such as ``J_12=0.1704``.
+
+        Returns
+        -------
+        dict
+            Every parameter of the stage by name, with standard error, interval and unit.
+
+        Raises
+        ------
+        ModelError
+            A model without coefficient law or intervals, or a name that is no parameter of it.
+        """
+        if self.joint is None:
+            raise ModelError(f"method {self.method!r} gives no joint covariance; identify by method='output-error'")
+        return physical_parameters(self.joint, known)
 
     @property
     def coefficients(self) -> dict[str, float]:
@@ -307,7 +345,7 @@ def identify(
     runs: Run | Sequence[Run],
     structure: Structure,
     *,
-    method: Literal["output-error", "multi-innovation", "least-squares"] = "output-error",
+    method: Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares"] = "output-error",
     criterion: Literal["output-error", "equation-error"] = "output-error",
     lattice: Lattice | None = None,
     norm: Literal["l1", "l2"] = "l1",
@@ -332,8 +370,10 @@ def identify(
     structure
         What to identify; see :func:`ftlm.equation` and :func:`ftlm.flexible_link`.
     method
-        ``"output-error"``: all equations and runs together, maximum likelihood for white noise. ``"multi-innovation"``:
-        the paper's (44) in closed form. ``"least-squares"``: its limit for a weak prior.
+        ``"output-error"``: all equations and runs together, maximum likelihood for white noise.
+        ``"instrumental-variables"``: refined instrumental variables, orders from the lattice, coefficients without the
+        bias of noise. ``"multi-innovation"``: the paper's (44) in closed form. ``"least-squares"``: its limit for a
+        weak prior.
     criterion, lattice, norm, keep, threads, progress
         Of the order search; see :func:`ftlm.search_orders`. Not used by ``"output-error"``, whose bounds are the
         structure's own.
@@ -384,7 +424,7 @@ def identify(
             )  # fmt: skip
             orders |= searches[name].orders
     structure_at = structure.with_orders(orders)
-    coefficients, pulled, pulses, initial = _estimate(found, structure_at, settings, m)
+    coefficients, pulled, pulses, initial, spread = _estimate(found, structure_at, settings, m)
     about: dict[str, str | float | int | bool | None] = {
         "method": method, "runs": ", ".join(r.name for r in found), **settings.to_dict(),
     }  # fmt: skip
@@ -406,7 +446,7 @@ def identify(
     used = {**settings.to_dict(), "m": pulses, "initial": initial}
     model = _kept_with(model, method, found, comparison, criteria, warnings)
     return Identification(
-        model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)),
+        model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)), coefficient_errors=spread,
         residuals=tests, information=criteria, task=Task(tuple(found), structure, lattice),
     )  # fmt: skip
 
@@ -557,14 +597,18 @@ def _lattice_of(given: Lattice | None, part: Structure) -> Lattice | None:
 
 def _estimate(
     runs: Sequence[Run], structure: Structure, settings: Settings, m: int | None
-) -> tuple[dict[str, float], list[str], int, str]:
-    """Coefficients by name at given orders, warnings about the prior, M, and the initial terms in words."""
+) -> tuple[dict[str, float], list[str], int, str, dict[str, float]]:
+    """Coefficients by name at given orders, warnings, M, the initial terms in words, and standard errors if known."""
     records = prepare(runs, structure, m, power_of_two=settings.needs_haar)
     initial = initial_tuple(records[0].initial)
+    words = records[0].initial if isinstance(records[0].initial, str) else f"t^{list(records[0].initial)}"
     cores = [r.core() for r in records]
     inputs = list(records[0].inputs)
     coefficients: dict[str, float] = {}
     warnings: list[str] = []
+    if settings.coefficients == "instrumental-variables":
+        coefficients, errors, warnings = _instrumental(structure, records)
+        return coefficients, warnings, records[0].m, str(words), errors
     for item in structure.equations:
         fixed = [t.fixed for t in item.terms]
         core_structure = structure_tuple(item, records[0].signals)
@@ -582,8 +626,39 @@ def _estimate(
             )  # fmt: skip
             warnings += _pulled(item.output, raw, weak[0], settings)
         coefficients |= named_coefficients(item, raw)
-    words = records[0].initial if isinstance(records[0].initial, str) else f"t^{list(records[0].initial)}"
-    return coefficients, warnings, records[0].m, str(words)
+    return coefficients, warnings, records[0].m, str(words), {}
+
+
+def _instrumental(structure: Structure, records: list[Record]) -> tuple[dict[str, float], dict[str, float], list[str]]:
+    """Coefficients by refined instrumental variables, their standard errors at these orders, and warnings.
+
+    Equations that drive each other are simulated together, so that every instrument follows from the inputs alone.
+    """
+    initial, inputs = initial_tuple(records[0].initial), list(records[0].inputs)
+    groups = [structure.equations] if structure.coupling == "simulated" else [(e,) for e in structure.equations]
+    coefficients: dict[str, float] = {}
+    errors: dict[str, float] = {}
+    warnings: list[str] = []
+    for group in groups:
+        outputs = ", ".join(e.output for e in group)
+        estimates, covariances, iterations, converged, damped = _core.instrumental_variables(
+            [r.core() for r in records], [structure_tuple(e, records[0].signals) for e in group], inputs,
+            [[t.fixed for t in e.terms] for e in group], initial, REFINEMENTS, STILL,
+        )  # fmt: skip
+        if not converged:
+            warnings.append(
+                f"{outputs}: instrumental variables did not stand still in {iterations} steps; the coefficients are "
+                "those of the least output error met. Too much noise for these terms: use method='output-error'"
+            )
+        if damped:
+            warnings.append(f"{outputs}: the free run of these coefficients is unstable; do not trust them")
+        for item, (raw, _, _, _), covariance in zip(group, estimates, covariances, strict=True):
+            coefficients |= named_coefficients(item, raw)
+            free = [t for t in item.terms if t.fixed is None]
+            spread = np.sqrt(np.diag(np.reshape(covariance, (len(free), len(free)))))
+            pairs = zip(free, spread.tolist(), strict=True)
+            errors |= {t.coefficient: s / abs(t.factor) for t, s in pairs if isinstance(t.coefficient, str)}
+    return coefficients, errors, warnings
 
 
 def _pulled(output: str, raw: list[float], weak: list[float], settings: Settings) -> list[str]:

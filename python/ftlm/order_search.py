@@ -406,9 +406,10 @@ def search_orders(
         ``"output-error"``: the free run, each equation driven by the measured other outputs. ``"equation-error"``:
         measured signals on the right-hand side; it prefers near-identities.
     coefficients
-        ``"multi-innovation"`` (closed form of paper (44)), ``"least-squares"``, or ``"instrumental-variables"``: refined
-        instrumental variables for every candidate, which noise on the outputs does not bias; instruments for measured
-        outputs are their projections on what the inputs excite.
+        ``"multi-innovation"`` (closed form of paper (44)), ``"least-squares"``, or ``"instrumental-variables"``:
+        refined instrumental variables for every candidate, which noise on the outputs does not bias. Measured outputs
+        that drive an equation are replaced by their projections on what the inputs excite, as instruments and in the
+        score.
     norm
         ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
     innovation_length, prior_covariance, rows

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -103,6 +103,8 @@ class JointFit:
         Coarse cost (per residual) and origin of every start, best first.
     residuals
         By run and output.
+    products
+        Coefficients that the coefficient law gives: sign and factors by name.
     """
 
     orders: dict[str, float]
@@ -116,6 +118,17 @@ class JointFit:
     converged: bool
     starts: list[tuple[float, str]]
     residuals: list[dict[str, Floats]]
+    products: Mapping[str, tuple[float, tuple[str, ...]]] = field(default_factory=dict)
+
+    @property
+    def derived_errors(self) -> dict[str, float]:
+        """Standard errors of the coefficients that the coefficient law gives, to first order."""
+        out, spread = {}, self.covariance[len(self.orders) :, len(self.orders) :]
+        for name, (sign, factors) in self.products.items():
+            value = sign * math.prod(self.coefficients[f] for f in factors)
+            slope = np.array([factors.count(n) * value / v if v else 0.0 for n, v in self.coefficients.items()])
+            out[name] = float(np.sqrt(slope @ spread @ slope))
+        return out
 
     @property
     def names(self) -> list[str]:
@@ -690,6 +703,7 @@ def fit_output_error(
         converged=best.found["status"] == "converged",
         starts=starts,
         residuals=residuals,
+        products=dict(problem.products),
     )
 
 

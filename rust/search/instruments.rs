@@ -25,7 +25,7 @@ pub(crate) struct Refiner {
 }
 
 impl Refiner {
-    /// Spectra of the columns of `banks` and of the same columns of the records' clean signals.
+    /// Spectra of the columns of `banks`, which are those of the records' clean signals, and of the same as measured.
     ///
     /// # Errors
     /// As [`Bank::new`].

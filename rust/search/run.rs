@@ -341,7 +341,12 @@ impl Problem {
                 }
             }
         }
-        let banks = records.iter().map(|r| Bank::new(&index, r, output)).collect::<Result<Vec<_>>>()?;
+        let refined = matches!(options.estimator, Estimator::InstrumentalVariables(_));
+        // Noise of a measured output that drives an equation would rank like a fault of the equation.
+        let banks = records
+            .iter()
+            .map(|r| if refined { Bank::new(&index, &r.cleaned(), output) } else { Bank::new(&index, r, output) })
+            .collect::<Result<Vec<_>>>()?;
         let targets: Vec<Vec<f64>> = records.iter().map(|r| r.signal(output).to_vec()).collect();
         let samples = records.iter().map(Record::m).sum();
         let width = index.keys().len();
@@ -351,7 +356,6 @@ impl Problem {
             Estimator::LeastSquares | Estimator::InstrumentalVariables(_) => 0.0,
             Estimator::MultiInnovation(innovation) => 1.0 / innovation.prior_covariance,
         };
-        let refined = matches!(options.estimator, Estimator::InstrumentalVariables(_));
         let plain = options.early_stopping
             && !refined
             && options.criterion == Criterion::EquationError

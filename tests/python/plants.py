@@ -10,11 +10,17 @@ import numpy as np
 import ftlm
 from ftlm.demo import demo_plant
 
-#: Free orders and coefficients of each plant in the order of the published Cramér-Rao table.
+#: Cramer-Rao standard deviations at 40 dB, as printed to one to three digits.
 CRAMER_RAO_40_DB = {
-    "A": (0.0008, 0.0008, 0.0002, 0.0002, 0.0004, 2.01, 0.159, 0.092, 0.351, 0.0011),
-    "A2": (0.0016, 0.0012, 0.0006, 0.0007, 0.0009, 42.4, 7.94, 0.98, 4.61, 0.0072),
-}
+    "A": {
+        "alpha1": 0.0008, "alpha2": 0.0008, "gamma1": 0.0002, "beta2": 0.0002, "mu2": 0.0004, "a1": 2.01, "b1": 0.159,
+        "d1": 0.092, "g1": 0.351, "r1": 0.0011,
+    },
+    "A2": {
+        "alpha3": 0.0016, "alpha4": 0.0012, "gamma3": 0.0006, "beta4": 0.0007, "mu4": 0.0009, "a3": 42.4, "b3": 7.94,
+        "d3": 0.98, "g3": 4.61, "r2": 0.0072,
+    },
+}  # fmt: skip
 THREE_TERMS = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
 
 

@@ -458,7 +458,6 @@ def test_output_error_is_the_default_and_gives_intervals(small_run, with_noise):
     [
         ({"method": "magic"}, "method = 'magic' is not known; use "),
         ({"method": "genetic"}, "method = 'genetic' is not in this version; use "),
-        ({"method": "instrumental-variables"}, "method = 'instrumental-variables' is not in this version"),
         ({"criterion": "error"}, "criterion = 'error' is not known"),
         ({"norm": "l0"}, "norm = 'l0' is not known"),
         ({"rows": "columns"}, "rows = 'columns' is not known"),

@@ -177,8 +177,7 @@ fn coupled_equations_are_simulated_from_the_input_alone() {
     let noisy = noisy.clone().with_clean(clean.collect()).unwrap();
     let structures = [first.structure.clone(), second.structure.clone()];
     let found =
-        fit(&[noisy], &structures, &[vec![None; 3], vec![None; 3]], &Initial::Rest, Settings::default())
-            .unwrap();
+        fit(&[noisy], &structures, &[vec![None; 3], vec![None; 3]], &Initial::Rest, Settings::default()).unwrap();
     assert!(found.converged && !found.damped);
     for (estimate, model) in found.estimates.iter().zip(&both) {
         for (k, (c, truth)) in estimate.coefficients.iter().zip(&model.coefficients).enumerate() {
