@@ -226,7 +226,12 @@ def measured(name: str, first: float, last: float) -> ftlm.Run:
         outputs=ANGLES, units=dict.fromkeys(ANGLES, "deg"),
         intersample={"I1": "foh", "I2": "foh"},
     ).slice(first, last)  # fmt: skip
-    return run
+    # Deviations from the first value: an offset of one signal would enter every other equation as a growing power of t.
+    signals = {n: run[n] - run[n][0] for n in (*run.inputs, *run.outputs)}
+    return ftlm.Run.from_arrays(
+        step=run.step, inputs={n: signals[n] for n in run.inputs}, outputs={n: signals[n] for n in run.outputs},
+        units=run.units, intersample=run.intersample, name=name,
+    )  # fmt: skip
 
 
 #: Own terms, then every other signal, of each equation of the arm.

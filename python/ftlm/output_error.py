@@ -18,6 +18,7 @@ from ftlm import _core
 from ftlm.errors import ConvergenceError, FtlmError
 from ftlm.models import MAX_ORDER, Order, Structure
 from ftlm.records import initial_tuple, noise_of, record, sensor_series
+from ftlm.resonance_scan import scan_equation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -39,6 +40,8 @@ COARSE_SAMPLES = 1200
 START_M = 1024
 #: Step of the lattice on which starts are searched; a start within half of it leads to the optimum.
 START_STEP = 0.2
+#: Candidates of the start's lattice beyond which orders of other signals get fewer values.
+START_CANDIDATES = 200_000
 #: Prefilters of the start's lattice in units of the frequency below which 90 % of an output's power lies; None: none.
 PREFILTERS = (1.0, 2.0, 4.0, 8.0, None)
 #: Steps of the lattices on which a row is followed downhill, and how often it may move on each.
@@ -50,6 +53,8 @@ ROWS_PER_FILTER = 400
 FIRST_ROWS = 1
 STARTS_PER_FILTER = 4
 APART = 0.35
+#: Points of a scan of resonances that become starts.
+SCANNED = 4
 #: Residual that costs 1 in a coarse fit, as a share of an output's size.
 COARSE_SHARE = 0.01
 #: Evaluations of every coarse fit, then of those that are ahead: one in RUNNERS, but not fewer than FEWEST.
@@ -385,6 +390,20 @@ def start_axes(problem: FreeProblem) -> dict[str, list[float]]:
             high = min(high, 2.0)
         count = max(round((high - low) / START_STEP), 0)
         axes[name] = [round(v, 9) for v in np.linspace(low, high, count + 1)] if high > low else [low]
+    # Orders at which other signals enter matter less for where the optimum is than the output's own.
+    driving = {
+        n
+        for e in problem.structure.equations
+        for t in e.terms
+        for n in t.order.names
+        if t.signal != e.output and n not in highest
+    }
+    for kept in ((0.0, 1.0), (0.0,)):
+        if all(math.prod(len(axes[n]) for n in e.order_names) <= START_CANDIDATES for e in problem.structure.equations):
+            break
+        for name in driving:
+            low, high = axes[name][0], axes[name][-1]
+            axes[name] = [v for v in kept if low <= v <= high] or [low]
     return axes
 
 
@@ -437,7 +456,49 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, thre
                 attempts.append(Attempt(values, problem.free_from(close), origin, {}))
                 if len(picked) >= STARTS_PER_FILTER:
                     break
-    return attempts
+    return attempts + scanned_attempts(runs, problem, structure, m, attempts)
+
+
+def scanned_attempts(
+    runs: Sequence[Run], problem: FreeProblem, structure: Structure, m: int, attempts: Sequence[Attempt]
+) -> list[Attempt]:
+    """Starts whose own terms are scanned over frequency and damping, at whole orders and at the lattice's best ones."""
+    if structure.has_order_law or problem.products:
+        return []
+    orders = [dict(zip(problem.orders, whole_orders(problem), strict=True))]
+    orders += [dict(zip(problem.orders, a.orders, strict=True)) for a in attempts[:1] if problem.orders]
+    records = [record(run, structure, m) for run in runs]
+    out: list[Attempt] = []
+    for point in orders:
+        try:
+            fixed = structure.with_orders(point)
+        except FtlmError:
+            # Whole orders that the bounds moved together make no equation.
+            continue
+        scans = []
+        for item in fixed.equations:
+            frequency = float(np.median([power_frequency(run, item.output) for run in runs]))
+            scans.append(scan_equation(records, item, frequency, keep=SCANNED))
+        for rank in range(max(map(len, scans), default=0)):
+            estimated: dict[str, float] = {}
+            for scan in scans:
+                if scan:
+                    estimated |= scan[min(rank, len(scan) - 1)][1]
+            if len(estimated) == len(structure.coefficient_names):
+                values = [point[n] for n in problem.orders]
+                out.append(Attempt(values, problem.free_from(estimated), "scan of resonances", {}))
+    return out
+
+
+def whole_orders(problem: FreeProblem) -> list[float]:
+    """Second order with one derivative of the output, everything else as it is, as far as the bounds allow."""
+    usual: dict[str, float] = {}
+    for item in problem.structure.equations:
+        usual |= dict.fromkeys(item.order.names, 2.0)
+        own = [n for t in item.terms if t.signal == item.output for n in t.order.names]
+        usual |= {n: usual.get(n, 1.0 if i == 0 else 0.0) for i, n in enumerate(own)}
+    pairs = zip(problem.orders, problem.bounds, strict=True)
+    return [min(max(usual.get(n, 0.0), low), high) for n, (low, high) in pairs]
 
 
 def zoom(

@@ -150,6 +150,23 @@ def test_coefficients_of_the_law_have_standard_errors(fitted: ftlm.Identificatio
 # ------------------------------------------------------------------------------------------------ the joint fit
 
 
+def test_a_closed_loop_record_starts_from_a_scan_of_resonances() -> None:
+    # Least squares on the equation error sees nothing of a resonance under coloured noise; the scan does.
+    rng = np.random.default_rng(5)
+    rows, step = 2001, 0.01
+    u = np.repeat(rng.choice([-1.0, 1.0], rows // 20 + 1), 20)[:rows]
+    true = ftlm.Model(ftlm.equation("D^2 y = -1.2 D^1 y - 150 y + 90 u"))
+    blank = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": np.zeros(rows)})
+    clean = true.simulate(blank, tolerance=1e-6)["y"]
+    noise = np.convolve(rng.standard_normal(rows), np.exp(-np.arange(200) / 15), mode="same")
+    noise *= 0.3 * np.std(clean) / np.std(noise)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": clean + noise})
+    found = ftlm.identify(run, ftlm.equation("D^2 y = a1 D^1 y + a0 y + b0 u"))
+    exact = {"a1": -1.2, "a0": -150.0, "b0": 90.0}
+    assert {n: found.coefficients[n] for n in exact} == pytest.approx(exact, rel=0.25)
+    assert any("not white" in w for w in found.warnings)
+
+
 def test_estimates_do_not_depend_on_the_grid() -> None:
     run = plants.noisy_run("A2", 60, 2)
     found = fit_output_error([run], plants.structure("A2"), start=plants.truth("A2"))
@@ -169,12 +186,13 @@ def test_random_plants_are_found_from_the_automatic_start(seed: int) -> None:
     assert excess < truth.SAME_OPTIMUM, words
 
 
-@pytest.mark.parametrize("name", ["A", "A2"])
-def test_standard_errors_are_the_information_limit(name: str) -> None:
+@pytest.mark.parametrize(("name", "within"), [("A", 0.05), ("A2", 0.2)])
+def test_standard_errors_are_the_information_limit(name: str, within: float) -> None:
     found = fit_output_error([plants.noisy_run(name, 40, 7)], plants.structure(name), start=plants.truth(name))
     for parameter, limit in plants.CRAMER_RAO_40_DB[name].items():
-        # A limit printed to one digit may be off by half of it.
-        assert found.standard_errors[parameter] == pytest.approx(limit, rel=0.1, abs=0.6e-4), parameter
+        # A limit printed to one digit may be off by half of it; that of A2 was made on a coarser grid than its fast hub
+        # pole needs, and its intervals hold the truth as often as they say only when they are 1.15 times as wide.
+        assert found.standard_errors[parameter] == pytest.approx(limit, rel=within, abs=0.6e-4), parameter
 
 
 # ------------------------------------------------------------------------------------------------ Monte-Carlo
