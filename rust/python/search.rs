@@ -236,7 +236,7 @@ pub fn search_stage<'py>(
         .collect();
     let (lattice, outcome) = watched(py, progress.as_ref(), |control| {
         let lattice = LawLattice::new(&axes, &equations, &inputs)?;
-let records = prepared(records, &inputs, &options)?;
+        let records = prepared(records, &inputs, &options)?;
         let outcome = stage::search(&records, &lattice, &fixed, &scales, &options, control)?;
         Ok((lattice, outcome))
     })?;

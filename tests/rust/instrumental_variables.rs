@@ -393,6 +393,6 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
     assert_eq!((best.order, best.terms[0].order, best.terms[1].order), (1.8, 0.9, 0.0));
     // Least squares does not find the true orders under this noise.
     let squares = Options { estimator: Estimator::LeastSquares, ..options(1, true) };
-    let biased = search(&[noisy.clone()], &lattice, &[None; 3], &squares, &Control::default()).unwrap();
+    let biased = search(std::slice::from_ref(&noisy), &lattice, &[None; 3], &squares, &Control::default()).unwrap();
     assert!(biased.rows[0].score > found.rows[0].score);
 }
