@@ -210,7 +210,7 @@ def instructions(write: bool) -> None:
 
 
 STREAM = """
-import resource, sys, time
+import sys, time
 from dataclasses import replace
 import ftlm
 from search import plant_a_run
@@ -219,12 +219,17 @@ equation = replace(ftlm.flexible_link(stage=1).equation("theta12"), initial="res
 step = float(sys.argv[1])
 coarse = ftlm.lattice(step=0.5, alpha=(1.0, 2.0))
 ftlm.search_orders(run, equation, coarse, coefficients="least-squares", m=2048)
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+with open("/proc/self/clear_refs", "w") as peak:
+    peak.write("5")  # forget the peak so far
+def status(name):
+    with open("/proc/self/status") as lines:
+        return next(int(line.split()[1]) for line in lines if line.startswith(name))
+before = status("VmRSS")
 lattice = ftlm.lattice(step=step, alpha=(1.05, 2.0))
 start = time.perf_counter()
 found = ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=2048)
 wall = time.perf_counter() - start
-after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+after = status("VmHWM")
 pruned = 1 - (len(found.table) + found.pruned["beaten"]) / found.candidates
 print(found.candidates, wall, (after - before) / 1024, pruned)
 """

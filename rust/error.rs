@@ -79,7 +79,7 @@ pub enum Error {
         limit: u128,
     },
     /// A bank of regressors that would not fit the memory set aside for it.
-    #[error("the bank of {columns} regressors of {m} pulses needs {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step or narrower intervals")]
+    #[error("the bank of {columns} regressors of {m} pulses and their products needs {bytes} bytes, more than the limit of {limit}; take a smaller m, a larger step or narrower intervals")]
     BankTooLarge {
         /// Number of columns.
         columns: usize,

@@ -18,7 +18,7 @@ use crate::estimate::instrumental_variables::Settings;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::haar;
 use crate::lanes::{self, Lanes, WIDTH};
-use crate::regressors::{Bank, Index, Key, Record};
+use crate::regressors::{Bank, Index, Key, Record, BANK_LIMIT};
 use crate::search::bound::{self, Bound};
 use crate::search::instruments::{start_bank, Refiner};
 use crate::search::lattice::{Cursor, Lattice};
@@ -341,6 +341,13 @@ impl Problem {
                 }
             }
         }
+        let width = index.keys().len();
+        // Banks refuse for themselves; products of all columns may need far more.
+        let bytes = 8 * (3 + records.len() as u128) * (width as u128 + 1).pow(2);
+        if bytes > BANK_LIMIT {
+            let m = records.iter().map(Record::m).max().unwrap_or(0);
+            return Err(Error::BankTooLarge { columns: width, m, bytes, limit: BANK_LIMIT });
+        }
         let refined = matches!(options.estimator, Estimator::InstrumentalVariables(_));
         // Noise of a measured output that drives an equation would rank like a fault of the equation.
         let banks = records
@@ -349,7 +356,6 @@ impl Problem {
             .collect::<Result<Vec<_>>>()?;
         let targets: Vec<Vec<f64>> = records.iter().map(|r| r.signal(output).to_vec()).collect();
         let samples = records.iter().map(Record::m).sum();
-        let width = index.keys().len();
         let squares = (width + 1) * (width + 1);
         let (mut sum, mut unweighted) = (vec![0.0; squares], Vec::new());
         let prior = match options.estimator {

@@ -483,6 +483,10 @@ fn settings_out_of_range_are_refused() {
     let none = Innovation { length: 0, ..innovation };
     let none = Options { estimator: Estimator::MultiInnovation(none), ..options() };
     assert!(matches!(run(&records, &[None], &none), Error::OutOfRange { .. }));
+    // A lattice whose regressors fit but whose products would not: refused before any of them is made.
+    let many = Lattice::new(0, &[3.0], &[axis(1, &range(0.0, 3.0, 2e-4), false)], |_| false).unwrap();
+    let found = search(&records, &many, &[None], &options(), &Control::default());
+    assert!(matches!(found, Err(Error::BankTooLarge { columns: 15_001, m: 100, .. })));
     let missing = Lattice::new(0, &[1.0], &[axis(5, &[0.0], false)], |_| false).unwrap();
     let found = search(&records, &missing, &[None], &options(), &Control::default());
     assert!(matches!(found, Err(Error::Structure { .. })));
