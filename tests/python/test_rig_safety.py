@@ -207,8 +207,8 @@ def test_an_exception_outside_the_loop_leaves_the_motors_off(bench):
 def test_signals_leave_the_motors_off(bench, number, request):
     if number == signal.SIGINT:
         # A shell that starts the tests in the background has them ignore Ctrl-C; here it must mean what it says.
-        request.addfinalizer(lambda kept=signal.getsignal(number): signal.signal(number, kept))
-        signal.signal(number, signal.default_int_handler)
+        kept = signal.signal(number, signal.default_int_handler)
+        request.addfinalizer(lambda: signal.signal(number, kept))
     before = signal.getsignal(number)
     bench.at(50, lambda: os.kill(os.getpid(), number))
     with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else SystemExit), bench.rig() as link:
