@@ -422,6 +422,23 @@ def test_on_a_virtual_clock_the_outputs_are_at_0_volts_one_timeout_after_the_las
     assert run.length == 101
 
 
+@pytest.mark.parametrize("call", ["task_read", "watchdog_reload", "write_analog"])
+def test_an_expiry_is_named_whichever_call_meets_it_first(tmp_path, monkeypatch, call):
+    bench = Bench("q8", tmp_path, monkeypatch)
+
+    def freeze(board):
+        if board.sample == 201 and not board.expired:
+            board.time += 0.5
+
+    bench.hardware.hooks[call] = freeze
+    words, run = recorded(bench, tmp_path)
+    assert "the watchdog expired" in words
+    assert "error -600" not in words
+    assert bench.writes[-1][1] == (0.0, 0.0)
+    assert not bench.hardware.enabled
+    assert "the watchdog expired" in run.about["faults"][0]
+
+
 @pytest.mark.parametrize("missing", ["both", "analog", "digital", "one line"])
 def test_it_does_not_start_without_expiration_states(bench, missing, monkeypatch):
     board = bench.board

@@ -43,6 +43,7 @@ ENDLESS = 0x7FFFFFFF
 OPTIONS_SIZE = 256
 #: `watchdog_clear` at start-up, when there is nothing to clear.
 NOTHING_TO_CLEAR = -599
+EXPIRED = "the watchdog expired: the program did not answer in time, and the board put 0 V out"
 #: The board's clock and the computer's drift apart; delays are counted from an instant that follows by this share.
 DRIFT = 1e-3
 
@@ -290,7 +291,7 @@ class QuanserBoard:
     def _put(self, guard: _core.Guard, volts: tuple[float, float]) -> None:
         with self._spoken("writing", guard=guard) as hil:
             if not hil.watchdog_reload():
-                guard.fail("the watchdog expired: the program did not answer in time, and the board put 0 V out")
+                guard.fail(EXPIRED)
                 return
             self._write(volts)
 
@@ -307,6 +308,13 @@ class QuanserBoard:
                 raise
             self._hil.watchdog_clear()
             act()
+
+    def _expired(self) -> bool:
+        """Whether the watchdog has expired; False where the board does not say."""
+        try:
+            return self._watched and not self._hil.watchdog_reload()
+        except self._error:
+            return False
 
     def _spoken(self, what: str, hil: Any = None, guard: _core.Guard | None = None) -> _Spoken:
         return _Spoken(self, what, self._hil if hil is None else hil, guard)
@@ -348,6 +356,9 @@ class _Spoken:
             return
         fault = board._fault(self._what, error)
         if self._guard is not None:
+            # A locked board refuses whatever is called next with an error of its own; the cause is the expiry.
+            if board._expired():
+                fault = RigFault(f"{EXPIRED} (Q8-USB, {self._what})")
             self._guard.fail(str(fault))
         raise fault from None
 
