@@ -103,11 +103,12 @@ class _FoundStage(TypedDict):
 class _Fit(TypedDict):
     orders: list[float]
     coefficients: list[float]
+    delays: list[float]
     #: half the weighted sum of squared residuals
     cost: float
     #: weighted residuals, records one after the other, outputs within
     residuals: _Vector
-    #: one row a free order, then one a coefficient
+    #: one row a free order, then one a coefficient, then one a delay
     jacobian: _Matrix
     #: initial terms per record and equation, and their exponents per equation
     initial: list[list[list[float]]]
@@ -179,6 +180,7 @@ def output_error(
     terms: _Initial,
     start_orders: Sequence[float],
     start_coefficients: Sequence[float],
+    delays: Sequence[tuple[int, tuple[float, float], float]],
     evaluations: int,
     tolerance: float,
 ) -> _Fit: ...

@@ -147,7 +147,10 @@ InputOrderOption = Annotated[InputOrder, typer.Option("--input-order", help="Ord
 StockFilter = Annotated[bool, typer.Option("--stock-filter", help="Deflections passed the stock 2 Hz low-pass.")]
 Orders = Annotated[list[str] | None, typer.Option("--order", metavar="NAME=VALUE", help="Fix an order.")]
 Fixed = Annotated[list[str] | None, typer.Option("--fixed", metavar="NAME=VALUE", help="Fix a coefficient.")]
-Delay = Annotated[list[str] | None, typer.Option("--delay", metavar="INPUT=SECONDS", help="Delay of an input.")]
+Delay = Annotated[
+    list[str] | None,
+    typer.Option("--delay", metavar="INPUT=SECONDS", help="Delay of an input; LEAST:LARGEST is estimated."),
+]
 InitialOption = Annotated[str, typer.Option("--initial", help="auto, rest, caputo, or exponents of t: 0,1.")]
 LatticeOption = Annotated[
     list[str] | None,
@@ -232,6 +235,26 @@ def numbers(option: str, given: list[str] | None) -> dict[str, float]:
             found[name] = float(value)
         except ValueError:
             raise ModelError(f"{option} {name}={value}: {value!r} is no number") from None
+    return found
+
+
+def delays(given: list[str] | None) -> dict[str, float | tuple[float, float]]:
+    """INPUT=SECONDS options, or INPUT=LEAST:LARGEST where the delay is to be estimated.
+
+    Raises
+    ------
+    ModelError
+        A value that is neither.
+    """
+    found: dict[str, float | tuple[float, float]] = {}
+    for name, value in pairs("--delay", given).items():
+        try:
+            ends = [float(v) for v in value.split(":")]
+        except ValueError:
+            ends = []
+        if len(ends) not in (1, 2):
+            raise ModelError(f"--delay {name}={value}: {value!r} is neither seconds nor LEAST:LARGEST, as in 0:0.02")
+        found[name] = ends[0] if len(ends) == 1 else (ends[0], ends[1])
     return found
 
 
@@ -349,7 +372,7 @@ def structure_of(
         initial = exponents
     from ftlm.models import check_initial  # noqa: PLC0415 — the public constructor of equations checks it otherwise
 
-    structure = replace(structure, initial=check_initial(initial), delay=numbers("--delay", delay))
+    structure = replace(structure, initial=check_initial(initial)).with_delays(delays(delay))
     return structure.with_orders(numbers("--order", orders)).with_coefficients(numbers("--fixed", fixed))
 
 

@@ -12,7 +12,7 @@ from ftlm import _core
 from ftlm.advice import excitation_for
 from ftlm.checks import whole_number
 from ftlm.errors import DataError, InternalError, ModelError
-from ftlm.models import Estimate, Model, Structure, numeric
+from ftlm.models import Estimate, Model, Structure, delay_name, numeric
 from ftlm.order_search import (
     Lattice,
     SearchResult,
@@ -147,9 +147,18 @@ class Identification:
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
         """95 % intervals by name, of what has standard errors."""
-        values = {**self.orders, **self.coefficients, **({} if self.joint is None else self.joint.coefficients)}
+        values = {**self.orders, **self.coefficients, **({} if self.joint is None else self._joint_values)}
         errors = self.standard_errors
         return {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
+
+    @property
+    def delays(self) -> dict[str, float]:
+        """Delays of inputs [s] by input, estimated or known."""
+        return dict(self.model.structure.delay)
+
+    @property
+    def _joint_values(self) -> dict[str, float]:
+        return {} if self.joint is None else dict(zip(self.joint.names, self.joint.values.tolist(), strict=True))
 
     def physical(self, **known: float) -> dict[str, PhysicalParameter]:
         """Physical parameters of a flexible link once one of them is known; see :func:`ftlm.physical_parameters`.
@@ -257,7 +266,7 @@ class Identification:
         """Orders and coefficients as a pandas frame: value, standard error, 95 % interval, stated value by name."""
         from ftlm.exports import to_frame  # noqa: PLC0415 — pandas is not always there
 
-        values = {**self.orders, **({} if self.joint is None else self.joint.coefficients), **self.coefficients}
+        values = {**self.orders, **self._joint_values, **self.coefficients}
         errors, intervals = self.standard_errors, self.intervals
         none = (math.nan, math.nan)
         rows = [
@@ -278,6 +287,7 @@ class Identification:
             "equations": {e.output: numeric(e) for e in self.model.equations},
             "orders": self.orders,
             "coefficients": self.coefficients,
+            "delays": self.delays,
             "standard_errors": self.standard_errors,
             "intervals": {n: list(i) for n, i in self.intervals.items()},
             **self.comparison.to_dict(),
@@ -293,7 +303,7 @@ class Identification:
         reference = self.model.structure.reference
         errors, shown = self.standard_errors, {**self.orders, **self.coefficients}
         if self.joint is not None:
-            shown = {**self.orders, **self.joint.coefficients, **self.coefficients}
+            shown = {**self.orders, **self._joint_values, **self.coefficients}
         for name, value in shown.items():
             spread = f" ± {errors[name]:<10.3g}" if name in errors else ""
             stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
@@ -466,7 +476,7 @@ def _kept_with(
     errors: dict[str, float | None] = {}
     covariance = None
     if joint is not None and problem is not None:
-        values = {**joint.orders, **joint.coefficients, **model.coefficients}
+        values = {**dict(zip(joint.names, joint.values.tolist(), strict=True)), **model.coefficients}
         errors = {n: _finite(v) for n, v in joint.standard_errors.items()}
         moved = problem.number_jacobian(list(joint.orders.values()), list(joint.coefficients.values()))
         spread = moved @ joint.covariance @ moved.T
@@ -506,12 +516,14 @@ def _identify_output_error(
     progress: Callable[[int, int], None] | None,
 ) -> Identification:
     """Orders and coefficients together by joint output error."""
-    records = prepare(runs, structure, m, power_of_two=False)
+    records = prepare(runs, replace(structure, free_delays={}), m, power_of_two=False)
     decided = replace(structure, initial=records[0].initial)
     joint = fit_output_error(runs, decided, threads=check_threads(threads), progress=progress)
     problem = FreeProblem.of(decided)
     model = Model(
-        structure.with_orders(joint.orders).with_coefficients(problem.named(list(joint.coefficients.values()))),
+        structure.with_orders(joint.orders)
+        .with_coefficients(problem.named(list(joint.coefficients.values())))
+        .with_delays(joint.delays),
         orders=joint.orders,
         units={n: u for n, u in runs[0].units.items() if n in structure.signals},
         m=records[0].m,
@@ -553,6 +565,14 @@ def _uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             warnings.append(f"order {name} cannot be told from these runs: its standard error exceeds its bounds")
         elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
             warnings.append(f"order {name} = {value:g} is on its bound; widen it")
+    for signal, value in joint.delays.items():
+        low, high = problem.structure.free_delays[signal]
+        if not errors[delay_name(signal)] <= high - low:
+            warnings.append(
+                f"the delay of {signal} cannot be told from these runs: its standard error exceeds its bounds"
+            )
+        elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
+            warnings.append(f"the delay of {signal} = {value:g} s is on its bound; widen it")
     for name, value in joint.coefficients.items():
         if not errors[name] <= abs(value):
             warnings.append(

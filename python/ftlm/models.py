@@ -399,7 +399,7 @@ def equation(
     *,
     orders: Mapping[str, Values] | None = None,
     fixed: Mapping[str, float] | None = None,
-    delay: Mapping[str, float] | None = None,
+    delay: Mapping[str, float | tuple[float, float]] | None = None,
     initial: str | Iterable[float] = "auto",
     sensor_filter: SensorFilter | None = None,
 ) -> Structure:
@@ -416,7 +416,7 @@ def equation(
     fixed
         Known coefficients, by name.
     delay
-        Delay of inputs [s], by name, not negative.
+        Delay of inputs [s], by name, not negative: a number is known, (least, largest) is estimated by output error.
     initial
         Initial terms: ``"auto"`` (Caputo's if the record does not start at rest), ``"rest"``, ``"caputo"``, or the
         exponents of t to use.
@@ -445,9 +445,11 @@ def equation(
         if not math.isfinite(real_number(f"fixed coefficient {name}", value)):
             raise ModelError(f"fixed coefficient {name} = {value} is not finite; give a number")
     equations = [e.with_coefficients(fixed) for e in equations]
-    return Structure(
-        equations=tuple(equations), delay=dict(delay or {}), initial=check_initial(initial), sensor_filter=sensor_filter
-    ).with_orders(orders or {})
+    return (
+        Structure(equations=tuple(equations), initial=check_initial(initial), sensor_filter=sensor_filter)
+        .with_delays(delay or {})
+        .with_orders(orders or {})
+    )
 
 
 def _known(what: str, given: Iterable[str], known: Sequence[str]) -> None:
@@ -685,7 +687,9 @@ class Structure:
         ``"measured"``: each equation is driven by the measured other outputs. ``"simulated"``: all outputs follow
         together from the inputs alone.
     delay
-        Delay of inputs [s].
+        Known delay of inputs [s].
+    free_delays
+        Least and largest delay of inputs whose delay is to be estimated [s].
     initial
         Initial terms, see :func:`equation`.
     sensor_filter
@@ -702,6 +706,7 @@ class Structure:
     order_values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     coupling: Literal["measured", "simulated"] = "measured"
     delay: Mapping[str, float] = field(default_factory=dict)
+    free_delays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     initial: Initial = "auto"
     sensor_filter: SensorFilter | None = None
     coefficient_law: tuple[tuple[str, float, tuple[str, ...]], ...] = ()
@@ -722,10 +727,16 @@ class Structure:
         if twice is not None:
             raise ModelError(f"coefficient {twice} stands in two equations; give each its own name")
         external = [s for s in self.signals if s not in outputs]
-        _known("delayed input", self.delay, external)
+        _known("delayed input", [*self.delay, *self.free_delays], external)
         for name, delay in self.delay.items():
             if not 0 <= real_number(f"delay of {name}", delay) < math.inf:
                 raise ModelError(f"delay of {name} = {delay} s is not a non-negative number; give seconds")
+        for name, (low, high) in self.free_delays.items():
+            numbers = real_number(f"least delay of {name}", low), real_number(f"largest delay of {name}", high)
+            if not 0 <= numbers[0] < numbers[1] < math.inf:
+                raise ModelError(f"delay of {name} from {low} to {high} s is no interval; give two rising times from 0")
+            if delay_name(name) in names or delay_name(name) in self.order_names:
+                raise ModelError(f"{delay_name(name)} is the delay of {name}; call the coefficient otherwise")
         if self.sensor_filter is not None:
             _known("filtered output", self.sensor_filter.outputs, self.signals)
 
@@ -789,6 +800,7 @@ class Structure:
             order_values={n: v for n, v in self.order_values.items() if n in single.order_names},
             coupling="measured",
             delay={n: v for n, v in self.delay.items() if n in single.signals},
+            free_delays={n: v for n, v in self.free_delays.items() if n in single.signals},
             sensor_filter=_narrowed(self.sensor_filter, single.signals),
             coefficient_law=(),
             name=f"{self.name}, {output}",
@@ -825,6 +837,26 @@ class Structure:
         _known("coefficient", values, self.coefficient_names)
         return replace(self, equations=tuple(e.with_coefficients(values) for e in self.equations))
 
+    def with_delays(self, delays: Mapping[str, float | tuple[float, float]]) -> Structure:
+        """Set delays of inputs [s]: a number is known, (least, largest) is to be estimated.
+
+        Raises
+        ------
+        ModelError
+            A name that is no input, a delay that is negative, or no interval.
+        """
+        known, free = dict(self.delay), dict(self.free_delays)
+        for name, delay in delays.items():
+            known.pop(name, None)
+            free.pop(name, None)
+            if isinstance(delay, (tuple, list)):
+                if len(delay) != 2:
+                    raise ModelError(f"delay of {name} = {delay!r} is neither a number nor (least, largest) [s]")
+                free[name] = (delay[0], delay[1])
+            else:
+                known[name] = delay
+        return replace(self, delay=known, free_delays=free)
+
     def __str__(self) -> str:
         return "\n".join(str(e) for e in self.equations)
 
@@ -832,6 +864,11 @@ class Structure:
         from html import escape  # noqa: PLC0415 — only notebooks need it
 
         return f"<pre>{escape(str(self))}</pre>"
+
+
+def delay_name(signal: str) -> str:
+    """Name under which the estimated delay of an input stands among the parameters."""
+    return f"delay_{signal}"
 
 
 ORDER_OF_COEFFICIENT = re.compile(r"^([abd])(\d+)$")
@@ -939,6 +976,9 @@ class Model:
     def __post_init__(self) -> None:
         if self.m is not None and not 1 <= (whole_number(self.m) or 0) < 1 << 62:
             raise ModelError(f"m = {self.m!r} is no number of pulses; give a whole number, at least 1")
+        if self.structure.free_delays:
+            late = ", ".join(self.structure.free_delays)
+            raise ModelError(f"the delay of {late} is still free; identify it first, or set it by with_delays")
         for item in self.structure.equations:
             if not item.is_identified:
                 free = [*item.order_names, *item.coefficient_names]

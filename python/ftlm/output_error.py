@@ -7,6 +7,7 @@ until it no longer matters, and turns the optimum into numbers with intervals.
 
 from __future__ import annotations
 
+import itertools
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.errors import ConvergenceError, FtlmError
-from ftlm.models import MAX_ORDER, Order, Structure
+from ftlm.models import MAX_ORDER, Order, Structure, delay_name
 from ftlm.records import initial_tuple, noise_of, record, sensor_series
 from ftlm.resonance_scan import scan_equation
 
@@ -78,6 +79,10 @@ NOTICED = 0.3
 FINEST = 16
 #: Own bounds of orders where the structure gives none.
 ALPHA_BOUNDS = (0.05, MAX_ORDER)
+#: Starts along the interval of a free delay: one for this phase of the frequency below which 90 % of the power lies,
+#: and at most so many over all delayed inputs.
+DELAY_PHASE = 1.0
+DELAY_STARTS = 12
 #: Lags of the residuals' autocovariance that the robust covariance takes in, as a power of the sample count.
 LAG_POWER = 1.0 / 3.0
 
@@ -91,7 +96,7 @@ class JointFit:
     orders, coefficients
         Free orders and free coefficients by name; under a coefficient law the free ones of the law.
     covariance
-        Of orders, then coefficients, robust to coloured residuals.
+        Of orders, coefficients, then delays, robust to coloured residuals.
     noise
         Standard deviation of the residuals by output.
     cost
@@ -110,6 +115,8 @@ class JointFit:
         By run and output.
     products
         Coefficients that the coefficient law gives: sign and factors by name.
+    delays
+        Estimated delays [s] by input; in covariance and errors they stand last, as ``delay_`` and the input's name.
     """
 
     orders: dict[str, float]
@@ -124,11 +131,13 @@ class JointFit:
     starts: list[tuple[float, str]]
     residuals: list[dict[str, Floats]]
     products: Mapping[str, tuple[float, tuple[str, ...]]] = field(default_factory=dict)
+    delays: dict[str, float] = field(default_factory=dict)
 
     @property
     def derived_errors(self) -> dict[str, float]:
         """Standard errors of the coefficients that the coefficient law gives, to first order."""
-        out, spread = {}, self.covariance[len(self.orders) :, len(self.orders) :]
+        kept = slice(len(self.orders), len(self.orders) + len(self.coefficients))
+        out, spread = {}, self.covariance[kept, kept]
         for name, (sign, factors) in self.products.items():
             value = sign * math.prod(self.coefficients[f] for f in factors)
             slope = np.array([factors.count(n) * value / v if v else 0.0 for n, v in self.coefficients.items()])
@@ -138,12 +147,12 @@ class JointFit:
     @property
     def names(self) -> list[str]:
         """Parameters in the order of the covariance."""
-        return [*self.orders, *self.coefficients]
+        return [*self.orders, *self.coefficients, *map(delay_name, self.delays)]
 
     @property
     def values(self) -> Floats:
         """Parameters in the order of the covariance."""
-        return np.array([*self.orders.values(), *self.coefficients.values()])
+        return np.array([*self.orders.values(), *self.coefficients.values(), *self.delays.values()])
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -179,6 +188,24 @@ class FreeProblem:
     coefficients: tuple[str, ...]
     bounds: tuple[tuple[float, float], ...]
     products: Mapping[str, tuple[float, tuple[str, ...]]]
+    delays: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> list[str]:
+        """Everything that is free: orders, coefficients, then delays."""
+        return [*self.orders, *self.coefficients, *map(delay_name, self.delays)]
+
+    @property
+    def all_bounds(self) -> list[tuple[float, float]]:
+        """Bounds of everything that is free; those of coefficients are infinite."""
+        ends = [self.structure.free_delays[n] for n in self.delays]
+        return [*self.bounds, *[(-math.inf, math.inf)] * len(self.coefficients), *ends]
+
+    def split(self, values: Sequence[float]) -> tuple[list[float], list[float], list[float]]:
+        """Values of orders, coefficients and delays."""
+        flat = list(map(float, values))
+        first, second = len(self.orders), len(self.orders) + len(self.coefficients)
+        return flat[:first], flat[first:second], flat[second:]
 
     @classmethod
     def of(cls, structure: Structure) -> FreeProblem:
@@ -196,7 +223,10 @@ class FreeProblem:
                 bounds.append((values[0], values[-1]))
             else:
                 bounds.append(ALPHA_BOUNDS if name in highest else (0.0, MAX_ORDER))
-        return cls(structure, structure.order_names, tuple(dict.fromkeys(free)), tuple(bounds), products)
+        coefficients = tuple(dict.fromkeys(free))
+        return cls(
+            structure, structure.order_names, coefficients, tuple(bounds), products, tuple(structure.free_delays)
+        )
 
     def coordinates(self, start: Sequence[float], *, plain: bool) -> list[str]:
         """Logarithms where the start allows them."""
@@ -244,22 +274,22 @@ class FreeProblem:
         return out
 
     def number_jacobian(self, orders: Sequence[float], coefficients: Sequence[float]) -> Floats:
-        """Derivatives of a model's numbers (rows) with respect to free orders, then free coefficients (columns).
+        """Derivatives of a model's numbers (rows) with respect to everything that is free (columns).
 
-        Rows are, equation by equation, alpha, then order and coefficient of each term.
+        Rows are, equation by equation, alpha, then order and coefficient of each term; delays are none of them.
         """
         free = dict(zip(self.coefficients, coefficients, strict=True))
-        count = len(self.orders)
+        count, idle = len(self.orders), len(self.delays)
         rows = []
 
         def of_order(order: Order) -> Floats:
             weights = dict(order.weights)
-            return np.array([weights.get(n, 0.0) for n in self.orders] + [0.0] * len(free))
+            return np.array([weights.get(n, 0.0) for n in self.orders] + [0.0] * (len(free) + idle))
 
         for item in self.structure.equations:
             rows.append(of_order(item.order))
             for term in item.terms:
-                row = np.zeros(count + len(free))
+                row = np.zeros(count + len(free) + idle)
                 if isinstance(term.coefficient, str):
                     sign, factors = self.products.get(term.coefficient, (1.0, (term.coefficient,)))
                     for k, name in enumerate(factors):
@@ -294,7 +324,8 @@ def experiment(
     run: Run, problem: FreeProblem, initial: Any, weights: Sequence[float], *, every: int = 1, decimation: int = 1
 ) -> tuple[Any, ...]:
     """A run as the core compares with it: ``every`` pulses a sample interval, each ``decimation``-th sample."""
-    structure = replace(problem.structure, initial=initial)
+    # Free delays are the core's to apply, to inputs as they were given.
+    structure = replace(problem.structure, initial=initial, free_delays={})
     rows = (run.length - 1) // decimation * decimation + 1
     if rows != run.length:
         run = run.slice(None, rows * run.step - run.step / 2)
@@ -324,6 +355,12 @@ class Attempt:
     coefficients: list[float]
     origin: str
     found: Any
+    delays: list[float] = field(default_factory=list)
+
+    @property
+    def values(self) -> Floats:
+        """Orders, coefficients, delays."""
+        return np.array(self.orders + self.coefficients + self.delays)
 
     @property
     def level(self) -> float:
@@ -352,10 +389,14 @@ def descend(
         initial_tuple(initial),
         attempt.orders,
         attempt.coefficients,
+        [
+            (signals.index(n), problem.structure.free_delays[n], delay)
+            for n, delay in zip(problem.delays, attempt.delays, strict=True)
+        ],
         evaluations,
         tolerance,
     )
-    return Attempt(list(found["orders"]), list(found["coefficients"]), attempt.origin, found)
+    return Attempt(list(found["orders"]), list(found["coefficients"]), attempt.origin, found, list(found["delays"]))
 
 
 def lowest(problem: FreeProblem, *arguments: Any, evaluations: int) -> Attempt:
@@ -419,6 +460,26 @@ def natural_axes(problem: FreeProblem) -> dict[str, list[float]] | None:
             return None
         axes[name] = values
     return axes
+
+
+def delayed_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, threads: int) -> list[Attempt]:
+    """Starts at several delays where some are free: a fit from too far away in time ends on a wrong oscillation."""
+    if not problem.delays:
+        return start_attempts(runs, problem, initial, threads)
+    fastest = max(power_frequency(run, o) for run in runs for o in problem.structure.outputs)
+    axes = []
+    for name in problem.delays:
+        low, high = problem.structure.free_delays[name]
+        wanted = math.ceil((high - low) * fastest / DELAY_PHASE) + 1
+        most = max(2, int(DELAY_STARTS ** (1.0 / len(problem.delays))))
+        axes.append(np.linspace(low, high, min(max(wanted, 2), most)).tolist())
+    attempts = []
+    for point in itertools.product(*axes):
+        known = problem.structure.with_delays(dict(zip(problem.delays, point, strict=True)))
+        for attempt in start_attempts(runs, FreeProblem.of(known), initial, threads):
+            words = ", ".join(f"{1e3 * v:.3g} ms" for v in point)
+            attempts.append(replace(attempt, origin=f"{attempt.origin}, delay {words}", delays=list(point)))
+    return attempts
 
 
 def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, threads: int) -> list[Attempt]:
@@ -631,7 +692,7 @@ def fit_output_error(
     threads
         Threads of the start's lattice.
     start
-        Values of all free orders and coefficients by name, instead of the automatic start.
+        Values of all free orders, coefficients and delays by name, instead of the automatic start.
     refine
         Whether to refine the grid below the samples until it does not matter.
     progress
@@ -663,7 +724,7 @@ def fit_output_error(
     starts: list[tuple[float, str]] = []
     if start is None:
         coarse: list[Any] = []
-        attempts = start_attempts(runs, problem, initial, threads)
+        attempts = delayed_attempts(runs, problem, initial, threads)
 
         def tried(attempt: Attempt, evaluations: int) -> Attempt | None:
             try:
@@ -705,10 +766,8 @@ def fit_output_error(
         if progress is not None:
             progress(len(attempts), len(attempts))
     else:
-        known = {n: float(start[n]) for n in (*problem.orders, *problem.coefficients)}
-        finalists = [
-            Attempt([known[n] for n in problem.orders], [known[n] for n in problem.coefficients], "given start", {})
-        ]
+        orders, coefficients, delays = problem.split([start[n] for n in problem.names])
+        finalists = [Attempt(orders, coefficients, "given start", {}, delays)]
     if not finalists:
         raise ConvergenceError(
             f"no start of {', '.join(structure.outputs)} has a finite free run; "
@@ -734,27 +793,24 @@ def fit_output_error(
             weights = [w / max(levels[o], 1e-300) for w, o in zip(weights, structure.outputs, strict=True)]
         return attempt, weights
 
-    def values(attempt: Attempt) -> Floats:
-        return np.array(attempt.orders + attempt.coefficients)
-
     best, weights = weighed(best, weights, every)
-    estimate, settled = values(best), not refine
+    estimate, settled = best.values, not refine
     while not settled and every < FINEST:
         # On a finer grid residuals may shrink to their noise, so weights follow anew.
         finer, weights = weighed(best, weights, 2 * every)
         errors = np.sqrt(np.diag(covariance(finer, experiments(weights, 2 * every), structure)))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
-        limit = values(finer) + (values(finer) - values(best)) / 3.0
+        limit = finer.values + (finer.values - best.values) / 3.0
         settled = bool(np.all(np.abs(limit - estimate) <= REFINED * errors))
         best, every, estimate = finer, 2 * every, limit
-    low, high = np.array([*problem.bounds, *[(-np.inf, np.inf)] * len(problem.coefficients)]).T
-    estimate = np.clip(estimate, low, high)
+    low, high = np.array(problem.all_bounds).T
+    orders, coefficients, delays = problem.split(np.clip(estimate, low, high).tolist())
     full = experiments(weights, every)
     levels = residual_levels(best, full, structure)
     residuals = split_residuals(best, full, structure)
     return JointFit(
-        orders=dict(zip(problem.orders, estimate.tolist(), strict=False)),
-        coefficients=dict(zip(problem.coefficients, estimate.tolist()[len(problem.orders) :], strict=True)),
+        orders=dict(zip(problem.orders, orders, strict=True)),
+        coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
         covariance=covariance(best, full, structure),
         noise={o: levels[o] / w for (o, w) in zip(structure.outputs, weights, strict=True)},
         cost=float(best.found["cost"]),
@@ -765,6 +821,7 @@ def fit_output_error(
         starts=starts,
         residuals=residuals,
         products=dict(problem.products),
+        delays=dict(zip(problem.delays, delays, strict=True)),
     )
 
 

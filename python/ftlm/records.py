@@ -154,7 +154,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     DataError
         A signal that the run does not have.
     ModelError
-        A delay of a signal that is no input.
+        A delay of a signal that is no input, or a free delay.
     """
     initial = structure.initial
     if initial == "auto":
@@ -195,6 +195,10 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
             f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs="
         )
     samples = run[name]
+    if name in structure.free_delays:
+        raise ModelError(
+            f"the delay of {name} is free: only method='output-error' estimates delays; give its value in seconds"
+        )
     delay = structure.delay.get(name, 0.0)
     if name not in run.inputs:
         if delay:

@@ -2,14 +2,15 @@
 //!
 //! For white noise on the outputs this is maximum likelihood. The free run solves A y = b in series, by exact division.
 //! Its sensitivity to a parameter is A⁻¹(∂b − ∂A y), a sum of products of three series: with the spectra of A⁻¹ at hand,
-//! one inverse transform a parameter and output. Rejected steps cost no Jacobian. Initial terms are linear and projected out (variable projection, Kaufman's form,
-//! doi:10.1007/BF01932995). Records are compared sample by sample: y_k with the mean of the pulses on either side of kh,
+//! one inverse transform a parameter and output. Rejected steps cost no Jacobian. Initial terms are linear and projected
+//! out (variable projection, Kaufman's form, doi:10.1007/BF01932995). Records are compared sample by sample: y_k with the mean of the pulses on either side of kh,
 //! on a grid that may be finer than the samples.
 
 use crate::dense;
 use crate::equation::{AffineOrder, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::fractional::kernel_with_derivative;
+use crate::means::delayed;
 use crate::regressors::Record;
 use crate::series::{self, Buffers, Kernel, Solver, SumOfProducts};
 use crate::small::back_substitute;
@@ -65,6 +66,26 @@ pub struct FreeEquation {
     pub terms: Vec<(usize, AffineOrder, Monomial)>,
 }
 
+/// A free delay of an input.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FreeDelay {
+    /// Index of the input in the record; no equation's output.
+    pub signal: usize,
+    /// Least and largest delay \[s\].
+    pub bounds: (f64, f64),
+}
+
+/// Values of all that is free.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Point {
+    /// Free orders.
+    pub orders: Vec<f64>,
+    /// Free coefficients.
+    pub coefficients: Vec<f64>,
+    /// Free delays \[s\].
+    pub delays: Vec<f64>,
+}
+
 /// What is estimated.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FreeModel {
@@ -74,6 +95,8 @@ pub struct FreeModel {
     pub order_bounds: Vec<(f64, f64)>,
     /// Coordinate of each free coefficient.
     pub coordinates: Vec<Coordinate>,
+    /// Free delays of inputs.
+    pub delays: Vec<FreeDelay>,
     /// Whether the equations' outputs drive each other as simulated, or as measured.
     pub coupled: bool,
     /// Initial terms of each record.
@@ -137,15 +160,14 @@ pub enum Status {
 /// The optimum and what describes it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
-    /// Free orders.
-    pub orders: Vec<f64>,
-    /// Free coefficients.
-    pub coefficients: Vec<f64>,
+    /// Free orders, coefficients and delays.
+    pub point: Point,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
     /// Weighted residuals (y − ŷ)/σ, records one after the other, outputs within.
     pub residuals: Vec<f64>,
-    /// Their derivatives with respect to orders, then coefficients (plain coordinates), initial terms projected out.
+    /// Their derivatives with respect to orders, coefficients (plain coordinates), then delays, initial terms projected
+    /// out.
     pub jacobian: Vec<Vec<f64>>,
     /// Coefficients of the initial terms per record and equation.
     pub initial: Vec<Vec<Vec<f64>>>,
@@ -181,12 +203,33 @@ struct Part {
     response: Vec<Vec<f64>>,
     /// Orthonormal basis of the sampled responses to the initial terms.
     basis: Vec<Vec<f64>>,
+    /// Pulse means of each freely delayed input after its delay, and their derivative with respect to it \[1/s\].
+    shifted: Vec<(Vec<f64>, Vec<f64>)>,
 }
 
 /// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
 const FACTORS: usize = 3;
 
 impl FreeModel {
+    /// Place of a signal's delay among the free ones, if it has one.
+    fn delay_of(&self, signal: usize) -> Option<usize> {
+        self.delays.iter().position(|d| d.signal == signal)
+    }
+
+    /// Pulse means of a signal after a delay \[s\], and their derivative with respect to it.
+    ///
+    /// Held inputs are shifted exactly; an input that is linear in between to second order in the step. The derivative
+    /// is that towards longer delays where the delay is a whole number of steps.
+    fn shifted(&self, record: &Record, signal: usize, delay: f64) -> Result<(Vec<f64>, Vec<f64>)> {
+        let means = record.signal(signal);
+        let before = if self.initial == Initial::Rest { 0.0 } else { means.first().copied().unwrap_or(0.0) };
+        let steps = delay / record.step();
+        let whole = steps.floor();
+        let (near, far) = (delayed(means, whole, before)?, delayed(means, whole + 1.0, before)?);
+        let slope = near.iter().zip(&far).map(|(near, far)| (far - near) / record.step()).collect();
+        Ok((delayed(means, steps, before)?, slope))
+    }
+
     fn structures(&self, orders: &[f64]) -> Vec<Structure> {
         self.equations
             .iter()
@@ -207,9 +250,9 @@ impl FreeModel {
         }
     }
 
-    /// Residuals at given orders and coefficients.
-    fn evaluate(&self, experiments: &[Experiment], orders: &[f64], coefficients: &[f64]) -> Result<Evaluation> {
-        let structures = self.structures(orders);
+    /// Residuals at a point.
+    fn evaluate(&self, experiments: &[Experiment], point: &Point) -> Result<Evaluation> {
+        let structures = self.structures(&point.orders);
         let mut out = Evaluation {
             cost: 0.0,
             residuals: Vec::new(),
@@ -218,7 +261,7 @@ impl FreeModel {
             parts: Vec::with_capacity(experiments.len()),
         };
         for experiment in experiments {
-            self.evaluate_one(experiment, &structures, coefficients, &mut out)?;
+            self.evaluate_one(experiment, &structures, point, &mut out)?;
         }
         out.cost = 0.5 * out.residuals.iter().map(|e| e * e).sum::<f64>();
         Ok(out)
@@ -228,10 +271,13 @@ impl FreeModel {
         &self,
         experiment: &Experiment,
         structures: &[Structure],
-        coefficients: &[f64],
+        point: &Point,
         out: &mut Evaluation,
     ) -> Result<()> {
         let record = &experiment.record;
+        let shifted = (self.delays.iter().zip(&point.delays))
+            .map(|(d, &delay)| self.shifted(record, d.signal, delay))
+            .collect::<Result<Vec<_>>>()?;
         let (m, n) = (record.m(), structures.len());
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
@@ -250,12 +296,14 @@ impl FreeModel {
                     // pass: under an order law the truth may lie on that edge, and estimates scatter to both sides.
                     return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
                 }
-                let c = self.equations[i].terms[k].2.at(coefficients);
+                let c = self.equations[i].terms[k].2.at(&point.coefficients);
                 let (kernel, slope) = kernel_with_derivative(eta, m, record.step());
                 if let Some(j) = self.unknown(i, term.signal) {
                     matrix[i][j].iter_mut().zip(&kernel).for_each(|(a, v)| *a -= c * v);
                 } else {
-                    let driver = drivers[term.signal].get_or_insert_with(|| Kernel::new(record.signal(term.signal)));
+                    let driver = drivers[term.signal].get_or_insert_with(|| {
+                        Kernel::new(self.delay_of(term.signal).map_or(record.signal(term.signal), |d| &shifted[d].0))
+                    });
                     sum.add(c, &Kernel::new(&kernel), driver);
                 }
                 row.push((c, kernel, slope));
@@ -314,22 +362,17 @@ impl FreeModel {
         }
         out.residuals.extend(residuals);
         out.initial.push(initial);
-        out.parts.push(Part { matrix, inverse, operators, response, basis });
+        out.parts.push(Part { matrix, inverse, operators, response, basis, shifted });
         Ok(())
     }
 
-    /// Derivatives of the residuals at an evaluated point with respect to orders, then coefficients (plain
-    /// coordinates), initial terms projected out.
-    fn jacobian(
-        &self,
-        experiments: &[Experiment],
-        orders: &[f64],
-        coefficients: &[f64],
-        at: &Evaluation,
-    ) -> Result<Vec<Vec<f64>>> {
-        let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); orders.len() + coefficients.len()];
+    /// Derivatives of the residuals at an evaluated point with respect to orders, coefficients (plain coordinates),
+    /// then delays, initial terms projected out.
+    fn jacobian(&self, experiments: &[Experiment], point: &Point, at: &Evaluation) -> Result<Vec<Vec<f64>>> {
+        let count = point.orders.len() + point.coefficients.len() + point.delays.len();
+        let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
         for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
-            self.sensitivities(experiment, part, orders, coefficients, &at.initial[index], &mut jacobian)?;
+            self.sensitivities(experiment, part, point, &at.initial[index], &mut jacobian)?;
         }
         if jacobian.iter().flatten().any(|v| !v.is_finite()) {
             return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
@@ -342,12 +385,13 @@ impl FreeModel {
         &self,
         experiment: &Experiment,
         part: &Part,
-        orders: &[f64],
-        coefficients: &[f64],
+        point: &Point,
         initial: &[Vec<f64>],
         jacobian: &mut [Vec<f64>],
     ) -> Result<()> {
         let record = &experiment.record;
+        let (orders, coefficients) = (&point.orders, &point.coefficients);
+        let numbers = orders.len() + coefficients.len();
         let (m, n) = (record.m(), self.equations.len());
         let total = FACTORS * m;
         let spectrum = |series: &[f64]| Kernel::with_length(series, total);
@@ -373,6 +417,16 @@ impl FreeModel {
                 for (k, (signal, order, monomial)) in equation.terms.iter().enumerate() {
                     let (c, kernel, slope) = &part.operators[i][k];
                     let (kept, kept_slope) = &mut spectra[i][k];
+                    if parameter >= numbers {
+                        // A delay moves only what it delays: kernel and coefficient stay, the driver is its slope.
+                        let delay = parameter - numbers;
+                        if self.delays[delay].signal == *signal && *c != 0.0 {
+                            moves[i] = true;
+                            let slope = spectrum(&part.shifted[delay].1);
+                            rights[i].add(*c, kept.get_or_insert_with(|| spectrum(kernel)), &slope);
+                        }
+                        continue;
+                    }
                     let (weight, operator) = if parameter < orders.len() {
                         let d_eta = equation.order.weights.get(parameter).unwrap_or(&0.0)
                             - order.weights.get(parameter).unwrap_or(&0.0);
@@ -387,7 +441,9 @@ impl FreeModel {
                     let operator = operator.0.get_or_insert_with(|| spectrum(operator.1));
                     let driver = match self.unknown(i, *signal) {
                         Some(j) => &responses[j],
-                        None => drivers[*signal].get_or_insert_with(|| spectrum(record.signal(*signal))),
+                        None => drivers[*signal].get_or_insert_with(|| {
+                            spectrum(self.delay_of(*signal).map_or(record.signal(*signal), |d| &part.shifted[d].0))
+                        }),
                     };
                     rights[i].add(weight, operator, driver);
                 }
@@ -506,15 +562,10 @@ impl Default for Settings {
 ///
 /// # Errors
 /// A start whose free run is not finite ([`Error::Diverged`]), or that lies outside its bounds or coordinates.
-pub fn fit(
-    model: &FreeModel,
-    experiments: &[Experiment],
-    start_orders: &[f64],
-    start_coefficients: &[f64],
-    settings: Settings,
-) -> Result<Fit> {
-    check_length("orders", model.order_bounds.len(), start_orders.len())?;
-    check_length("coefficients", model.coordinates.len(), start_coefficients.len())?;
+pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+    check_length("orders", model.order_bounds.len(), start.orders.len())?;
+    check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
+    check_length("delays", model.delays.len(), start.delays.len())?;
     for experiment in experiments {
         check_length("outputs", model.equations.len(), experiment.samples.len())?;
         check_length("weights", model.equations.len(), experiment.weights.len())?;
@@ -522,7 +573,7 @@ pub fn fit(
             check_length("samples", experiment.record.m() / experiment.every + 1, samples.len())?;
         }
     }
-    for (i, (&c, coordinate)) in start_coefficients.iter().zip(&model.coordinates).enumerate() {
+    for (i, (&c, coordinate)) in start.coefficients.iter().zip(&model.coordinates).enumerate() {
         let fits = match coordinate {
             Coordinate::Plain => c.is_finite(),
             Coordinate::Logarithm => c != 0.0 && c.is_finite(),
@@ -537,44 +588,31 @@ pub fn fit(
             });
         }
     }
-    let mut orders: Vec<f64> =
-        start_orders.iter().zip(&model.order_bounds).map(|(&o, &(low, high))| o.clamp(low, high)).collect();
-    let mut coefficients = start_coefficients.to_vec();
-    let mut current = model.evaluate(experiments, &orders, &coefficients)?;
-    let mut jacobian = model.jacobian(experiments, &orders, &coefficients, &current)?;
+    let mut point = start.clone();
+    point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
+    point.delays.iter_mut().zip(&model.delays).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
+    let mut current = model.evaluate(experiments, &point)?;
+    let mut jacobian = model.jacobian(experiments, &point, &current)?;
     let mut evaluations = 1;
     let mut damping = 1e-3;
     let mut status = Status::Exhausted;
     'outer: while evaluations < settings.evaluations {
-        let (r, scales) = scaled_factor(model, &jacobian, &current.residuals, &coefficients);
+        let (r, scales) = scaled_factor(model, &jacobian, &current.residuals, &point);
         let k = scales.len();
         let stride = k + 1;
         loop {
             let step = damped_step(&r, k, stride, damping);
-            let mut next_orders = orders.clone();
-            let mut next = coefficients.clone();
-            let mut moved: f64 = 0.0;
-            for i in 0..k {
-                let delta = if scales[i] > 0.0 { step[i] / scales[i] } else { 0.0 };
-                if i < orders.len() {
-                    let (low, high) = model.order_bounds[i];
-                    next_orders[i] = (orders[i] + delta).clamp(low, high);
-                    moved = moved.max((next_orders[i] - orders[i]).abs());
-                } else {
-                    let j = i - orders.len();
-                    next[j] = shifted(model.coordinates[j], coefficients[j], delta);
-                    let size = coefficients[j].abs().max(f64::MIN_POSITIVE);
-                    moved = moved.max((next[j] - coefficients[j]).abs() / size);
-                }
-            }
+            let deltas: Vec<f64> =
+                step.iter().zip(&scales).map(|(s, scale)| if *scale > 0.0 { s / scale } else { 0.0 }).collect();
+            let (next, moved) = stepped(model, &point, &deltas);
             if moved <= settings.tolerance {
                 status = Status::Converged;
                 break 'outer;
             }
             evaluations += 1;
-            match model.evaluate(experiments, &next_orders, &next) {
+            match model.evaluate(experiments, &next) {
                 Ok(found) if found.cost.is_finite() && found.cost < current.cost => {
-                    let slopes = match model.jacobian(experiments, &next_orders, &next, &found) {
+                    let slopes = match model.jacobian(experiments, &next, &found) {
                         Ok(slopes) => slopes,
                         Err(Error::Diverged { .. }) => {
                             damping *= 10.0;
@@ -587,7 +625,7 @@ pub fn fit(
                         Err(error) => return Err(error),
                     };
                     let gain = (current.cost - found.cost) / current.cost.max(f64::MIN_POSITIVE);
-                    (orders, coefficients, current, jacobian) = (next_orders, next, found, slopes);
+                    (point, current, jacobian) = (next, found, slopes);
                     damping = (damping * 0.1).max(1e-12);
                     if gain <= settings.tolerance {
                         status = Status::Converged;
@@ -611,8 +649,7 @@ pub fn fit(
         }
     }
     Ok(Fit {
-        orders,
-        coefficients,
+        point,
         cost: current.cost,
         residuals: current.residuals,
         jacobian,
@@ -621,6 +658,32 @@ pub fn fit(
         evaluations,
         status,
     })
+}
+
+/// A point moved by steps in its coordinates, within bounds, and how far: orders as they are, coefficients as a share
+/// of themselves, delays as a share of their interval.
+fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
+    let mut next = point.clone();
+    let mut moved: f64 = 0.0;
+    let (orders, rest) = deltas.split_at(point.orders.len());
+    let (coefficients, delays) = rest.split_at(point.coefficients.len());
+    for ((order, &(low, high)), delta) in next.orders.iter_mut().zip(&model.order_bounds).zip(orders) {
+        let before = *order;
+        *order = (before + delta).clamp(low, high);
+        moved = moved.max((*order - before).abs());
+    }
+    for ((value, &coordinate), &delta) in next.coefficients.iter_mut().zip(&model.coordinates).zip(coefficients) {
+        let before = *value;
+        *value = shifted(coordinate, before, delta);
+        moved = moved.max((*value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
+    }
+    for ((delay, FreeDelay { bounds: (low, high), .. }), delta) in next.delays.iter_mut().zip(&model.delays).zip(delays)
+    {
+        let before = *delay;
+        *delay = (before + delta).clamp(*low, *high);
+        moved = moved.max((*delay - before).abs() / (high - low).max(f64::MIN_POSITIVE));
+    }
+    (next, moved)
 }
 
 /// A coefficient moved by `delta` in its coordinate.
@@ -644,17 +707,13 @@ fn stretch(coordinate: Coordinate, value: f64) -> f64 {
 }
 
 /// R of the QR factorisation of [J | e] with J in coordinates and unit columns, and the columns' norms.
-fn scaled_factor(
-    model: &FreeModel,
-    jacobian: &[Vec<f64>],
-    residuals: &[f64],
-    coefficients: &[f64],
-) -> (Vec<f64>, Vec<f64>) {
-    let orders = jacobian.len() - coefficients.len();
+fn scaled_factor(model: &FreeModel, jacobian: &[Vec<f64>], residuals: &[f64], point: &Point) -> (Vec<f64>, Vec<f64>) {
     let mut columns = Vec::with_capacity(jacobian.len() + 1);
     let mut scales = Vec::with_capacity(jacobian.len());
     for (i, column) in jacobian.iter().enumerate() {
-        let factor = if i < orders { 1.0 } else { stretch(model.coordinates[i - orders], coefficients[i - orders]) };
+        let factor = (i.checked_sub(point.orders.len()))
+            .filter(|j| *j < point.coefficients.len())
+            .map_or(1.0, |j| stretch(model.coordinates[j], point.coefficients[j]));
         let norm = column.iter().map(|v| (v * factor) * (v * factor)).sum::<f64>().sqrt();
         let scale = if norm > 0.0 { factor / norm } else { 0.0 };
         columns.push(column.iter().map(|v| v * scale).collect());

@@ -151,6 +151,7 @@ pub fn output_error<'py>(
     terms: InitialArg,
     start_orders: Vec<f64>,
     start_coefficients: Vec<f64>,
+    delays: Vec<(usize, (f64, f64), f64)>,
     evaluations: usize,
     tolerance: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
@@ -182,12 +183,29 @@ pub fn output_error<'py>(
             }),
         })
         .collect::<Result<Vec<_>, _>>()?;
-    let model = joint::FreeModel { equations, order_bounds, coordinates, coupled, initial: initial(terms)? };
+    let mut start = joint::Point { orders: start_orders, coefficients: start_coefficients, delays: Vec::new() };
+    let mut free = Vec::with_capacity(delays.len());
+    for (signal, bounds, delay) in delays {
+        let known = |i: usize| experiments.iter().all(|e| i < e.record.len());
+        if !known(signal) || equations.iter().any(|e| e.output == signal) {
+            let what = format!("signal {signal} has a free delay and is no input");
+            return Err(Error::Structure { what, remedy: "delay inputs only".into() }.into());
+        }
+        if !(0.0 <= bounds.0 && bounds.0 <= bounds.1 && bounds.1.is_finite() && delay.is_finite()) {
+            let what = format!("bounds {} to {} s of a delay", bounds.0, bounds.1);
+            return Err(Error::Structure { what, remedy: "give two rising times from 0".into() }.into());
+        }
+        free.push(joint::FreeDelay { signal, bounds });
+        start.delays.push(delay);
+    }
+    let model =
+        joint::FreeModel { equations, order_bounds, coordinates, delays: free, coupled, initial: initial(terms)? };
     let settings = joint::Settings { evaluations, tolerance };
-    let fit = detached(py, || joint::fit(&model, &experiments, &start_orders, &start_coefficients, settings))?;
+    let fit = detached(py, || joint::fit(&model, &experiments, &start, settings))?;
     let dict = PyDict::new(py);
-    dict.set_item("orders", fit.orders)?;
-    dict.set_item("coefficients", fit.coefficients)?;
+    dict.set_item("orders", fit.point.orders)?;
+    dict.set_item("coefficients", fit.point.coefficients)?;
+    dict.set_item("delays", fit.point.delays)?;
     dict.set_item("cost", fit.cost)?;
     dict.set_item("residuals", PyArray1::from_vec(py, fit.residuals))?;
     dict.set_item("jacobian", stacked(py, &fit.jacobian)?)?;

@@ -49,7 +49,7 @@ def residuals_at(problem: FreeProblem, prepared: list, initial: object, orders: 
     """One evaluation, no step."""
     return _core.output_error(
         prepared, problem.laws(problem.structure.signals), [(0.01, 3.0)] * len(orders), ["plain"] * len(coefficients),
-        problem.structure.coupling == "simulated", initial, orders, coefficients, 1, 1e-12,
+        problem.structure.coupling == "simulated", initial, orders, coefficients, [], 1, 1e-12,
     )  # fmt: skip
 
 
@@ -98,7 +98,7 @@ def test_the_optimum_is_scipys() -> None:
     theirs = least_squares(residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
     ours = _core.output_error(
         prepared, problem.laws(("y", "u")), [(0.01, 3.0)] * 2, ["logarithm"] * 3, False, (False, []),
-        list(start[:2]), list(start[2:]), 100, 1e-12,
+        list(start[:2]), list(start[2:]), [], 100, 1e-12,
     )  # fmt: skip
     assert ours["status"] == "converged"
     assert ours["cost"] == pytest.approx(theirs.cost, rel=1e-8)

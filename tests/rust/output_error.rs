@@ -3,9 +3,9 @@
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimate::output_error::{
-    fit, Coordinate, Experiment, Fit, FreeEquation, FreeModel, Monomial, Settings, Status,
+    fit, Coordinate, Experiment, Fit, FreeDelay, FreeEquation, FreeModel, Monomial, Point, Settings, Status,
 };
-use ftlm::means::point_samples;
+use ftlm::means::{delayed, point_samples};
 use ftlm::regressors::Record;
 use ftlm::{series, simulate};
 
@@ -46,6 +46,7 @@ fn two_link(coupled: bool, initial: Initial) -> FreeModel {
             FreeEquation { output: 1, order, terms: deflection },
         ],
         order_bounds: vec![(0.5, 1.2), (0.0, 0.6), (0.5, 1.2)],
+        delays: Vec::new(),
         coordinates: vec![
             Coordinate::Logarithm,
             Coordinate::Logarithm,
@@ -86,10 +87,14 @@ fn run(intervals: usize, every: usize, initial: &[Vec<(f64, f64)>], noise: f64, 
     Experiment { record, every, samples, filter: None, weights }
 }
 
+fn point(orders: &[f64], coefficients: &[f64]) -> Point {
+    Point { orders: orders.to_vec(), coefficients: coefficients.to_vec(), delays: Vec::new() }
+}
+
 /// Residuals, cost and Jacobian at given parameters, no step taken.
 fn at(model: &FreeModel, experiments: &[Experiment], orders: &[f64], coefficients: &[f64]) -> Fit {
     let settings = Settings { evaluations: 1, ..Settings::default() };
-    let found = fit(model, experiments, orders, coefficients, settings).unwrap();
+    let found = fit(model, experiments, &point(orders, coefficients), settings).unwrap();
     assert_eq!((found.evaluations, found.status), (1, Status::Exhausted));
     found
 }
@@ -175,10 +180,10 @@ fn known_models_are_recovered() {
             vec![run(300, 1, &[vec![(0.0, 0.3)], vec![(0.0, -0.1), (1.0, 0.2)]], 0.0, 414), run(200, 1, &[], 0.0, 415)],
         ),
     ] {
-        let found = fit(&model, &experiments, &START.0, &START.1, Settings::default()).unwrap();
+        let found = fit(&model, &experiments, &point(&START.0, &START.1), Settings::default()).unwrap();
         assert_eq!(found.status, Status::Converged, "{name}");
-        check(&format!("orders, {name}"), relative_distance(&found.orders, &ORDERS), 1e-9);
-        check(&format!("coefficients, {name}"), relative_distance(&found.coefficients, &COEFFICIENTS), 1e-9);
+        check(&format!("orders, {name}"), relative_distance(&found.point.orders, &ORDERS), 1e-9);
+        check(&format!("coefficients, {name}"), relative_distance(&found.point.coefficients, &COEFFICIENTS), 1e-9);
         check(&format!("residuals, {name}"), norm(&found.residuals), 1e-9);
         println!("{name}: {} evaluations", found.evaluations);
         assert_eq!((found.initial.len(), found.exponents.len()), (experiments.len(), 2));
@@ -195,7 +200,7 @@ fn estimates_from_noise_are_as_near_as_their_deviations_say() {
     let (mut sum, mut count) = (0.0, 0);
     for seed in 420..428 {
         let experiments = [run(400, 1, &[], 0.02, seed)];
-        let found = fit(&model, &experiments, &START.0, &START.1, Settings::default()).unwrap();
+        let found = fit(&model, &experiments, &point(&START.0, &START.1), Settings::default()).unwrap();
         assert_eq!(found.status, Status::Converged);
         let rows = found.residuals.len() as f64;
         check_between("chi-squared per sample", 2.0 * found.cost / rows, 0.8, 1.2);
@@ -209,8 +214,13 @@ fn estimates_from_noise_are_as_near_as_their_deviations_say() {
             .iter()
             .flat_map(|a| found.jacobian.iter().map(move |b| a.iter().zip(b).map(|(x, y)| x * y).sum()))
             .collect();
-        for (i, (value, exact)) in
-            found.orders.iter().chain(&found.coefficients).zip(ORDERS.iter().chain(&COEFFICIENTS)).enumerate()
+        for (i, (value, exact)) in found
+            .point
+            .orders
+            .iter()
+            .chain(&found.point.coefficients)
+            .zip(ORDERS.iter().chain(&COEFFICIENTS))
+            .enumerate()
         {
             let mut unit = [0.0; 8];
             unit[i] = 1.0;
@@ -230,14 +240,14 @@ fn bounds_hold_and_the_best_inside_them_is_found() {
     // The true 0.1 of β₂ is out of reach.
     model.order_bounds[1] = (0.2, 0.5);
     let experiments = [run(300, 1, &[], 0.01, 430)];
-    let found = fit(&model, &experiments, &[2.0, -1.0, 0.8], &START.1, Settings::default()).unwrap();
-    assert_eq!(found.orders[1], 0.2);
-    assert!(found.orders.iter().zip(&model.order_bounds).all(|(o, b)| (b.0..=b.1).contains(o)));
+    let found = fit(&model, &experiments, &point(&[2.0, -1.0, 0.8], &START.1), Settings::default()).unwrap();
+    assert_eq!(found.point.orders[1], 0.2);
+    assert!(found.point.orders.iter().zip(&model.order_bounds).all(|(o, b)| (b.0..=b.1).contains(o)));
     // An order without room is fixed.
     model.order_bounds = ORDERS.iter().map(|&o| (o, o)).collect();
-    let found = fit(&model, &experiments, &ORDERS, &START.1, Settings::default()).unwrap();
-    assert_eq!(found.orders, ORDERS);
-    assert!(relative_distance(&found.coefficients, &COEFFICIENTS) < 0.05);
+    let found = fit(&model, &experiments, &point(&ORDERS, &START.1), Settings::default()).unwrap();
+    assert_eq!(found.point.orders, ORDERS);
+    assert!(relative_distance(&found.point.coefficients, &COEFFICIENTS) < 0.05);
 }
 
 #[test]
@@ -245,7 +255,7 @@ fn what_cannot_be_started_is_refused() {
     let model = two_link(true, Initial::Rest);
     let experiments = [run(100, 2, &[], 0.01, 431)];
     let start = |orders: &[f64], coefficients: &[f64]| {
-        fit(&model, &experiments, orders, coefficients, Settings::default()).map(|_| ())
+        fit(&model, &experiments, &point(orders, coefficients), Settings::default()).map(|_| ())
     };
     assert!(matches!(start(&ORDERS[..2], &COEFFICIENTS), Err(Error::Length { .. })));
     assert!(matches!(start(&ORDERS, &COEFFICIENTS[..4]), Err(Error::Length { .. })));
@@ -259,14 +269,20 @@ fn what_cannot_be_started_is_refused() {
     }
     let mut short = experiments[0].clone();
     short.samples[1].pop();
-    assert!(matches!(fit(&model, &[short], &ORDERS, &COEFFICIENTS, Settings::default()), Err(Error::Length { .. })));
+    assert!(matches!(
+        fit(&model, &[short], &point(&ORDERS, &COEFFICIENTS), Settings::default()),
+        Err(Error::Length { .. })
+    ));
     let mut few = experiments[0].clone();
     few.weights.pop();
-    assert!(matches!(fit(&model, &[few], &ORDERS, &COEFFICIENTS, Settings::default()), Err(Error::Length { .. })));
+    assert!(matches!(
+        fit(&model, &[few], &point(&ORDERS, &COEFFICIENTS), Settings::default()),
+        Err(Error::Length { .. })
+    ));
     // A start that explodes.
     let long = [run(3000, 1, &[], 0.01, 432)];
     let wild = [-4e4, -6.0, 1.5, 14.0, 1.4];
-    assert!(matches!(fit(&model, &long, &ORDERS, &wild, Settings::default()), Err(Error::Diverged { .. })));
+    assert!(matches!(fit(&model, &long, &point(&ORDERS, &wild), Settings::default()), Err(Error::Diverged { .. })));
 }
 
 #[test]
@@ -276,7 +292,7 @@ fn few_evaluations_are_said_to_be_too_few() {
     let mut last = f64::INFINITY;
     for evaluations in [1, 3, 6] {
         let settings = Settings { evaluations, ..Settings::default() };
-        let found = fit(&model, &experiments, &START.0, &START.1, settings).unwrap();
+        let found = fit(&model, &experiments, &point(&START.0, &START.1), settings).unwrap();
         assert_eq!((found.status, found.evaluations), (Status::Exhausted, evaluations));
         assert!(found.cost <= last);
         last = found.cost;
@@ -295,9 +311,83 @@ fn a_filter_on_the_outputs_is_part_of_the_model() {
     };
     experiment.record = logged;
     let model = two_link(true, Initial::Rest);
-    let without = fit(&model, std::slice::from_ref(&experiment), &START.0, &START.1, Settings::default()).unwrap();
+    let without =
+        fit(&model, std::slice::from_ref(&experiment), &point(&START.0, &START.1), Settings::default()).unwrap();
     experiment.filter = Some((low_pass(m), vec![false, true]));
-    let with = fit(&model, &[experiment], &START.0, &START.1, Settings::default()).unwrap();
-    check("coefficients through the filter", relative_distance(&with.coefficients, &COEFFICIENTS), 1e-9);
+    let with = fit(&model, &[experiment], &point(&START.0, &START.1), Settings::default()).unwrap();
+    check("coefficients through the filter", relative_distance(&with.point.coefficients, &COEFFICIENTS), 1e-9);
     assert!(without.cost > 1e6 * with.cost);
+}
+
+/// A run whose input acts `delay` seconds late; the record has it as it was given.
+fn late(delay: f64, every: usize, noise: f64, seed: u64) -> Experiment {
+    let mut experiment = run(220, every, &[], 0.0, seed);
+    let given = experiment.record.clone();
+    let arrived = delayed(given.signal(2), delay / given.step(), 0.0).unwrap();
+    let outputs = simulate::respond(&truth(), &with_signal(&given, 2, arrived), &[]).unwrap();
+    let mut random = Random::new(seed + 1);
+    for (i, means) in outputs.into_iter().enumerate() {
+        let clean: Vec<f64> = point_samples(&means).into_iter().step_by(every).collect();
+        let sigma = noise * deviation(&clean);
+        experiment.weights[i] = if noise > 0.0 { 1.0 / sigma } else { 1.0 / deviation(&clean) };
+        experiment.samples[i] = clean.iter().map(|y| y + sigma * random.normal()).collect();
+        experiment.record = with_signal(&experiment.record, i, means);
+    }
+    experiment
+}
+
+fn with_delay(coupled: bool) -> FreeModel {
+    FreeModel { delays: vec![FreeDelay { signal: 2, bounds: (0.0, 0.2) }], ..two_link(coupled, Initial::Rest) }
+}
+
+#[test]
+fn the_slope_towards_a_delay_is_that_of_the_residuals() {
+    for coupled in [true, false] {
+        let (model, experiments) = (with_delay(coupled), [late(0.057, 2, 0.02, 500)]);
+        let settings = Settings { evaluations: 1, ..Settings::default() };
+        let here = |delay: f64| {
+            let start = Point { delays: vec![delay], ..point(&START.0, &START.1) };
+            fit(&model, &experiments, &start, settings).unwrap()
+        };
+        // Inside a step residuals are linear in the delay, so the difference is exact; 0.057 s is 5.7 steps.
+        let (at, up, down) = (here(0.057), here(0.0575), here(0.0565));
+        let size = norm(&at.jacobian[8]);
+        assert!(size > 0.0);
+        let slope: Vec<f64> = up.residuals.iter().zip(&down.residuals).map(|(u, d)| (u - d) / 1e-3).collect();
+        check("slope towards a delay", relative_distance(&at.jacobian[8], &slope), 1e-9);
+    }
+}
+
+#[test]
+fn a_delay_is_found_with_the_rest() {
+    for (coupled, every, delay) in [(true, 1, 0.05), (true, 2, 0.033), (false, 1, 0.11), (true, 1, 0.0), (true, 1, 0.2)]
+    {
+        let model = with_delay(coupled);
+        let start = Point { delays: vec![0.08], ..point(&START.0, &START.1) };
+        let found = fit(&model, &[late(delay, every, 0.0, 510)], &start, Settings::default()).unwrap();
+        let miss = (found.point.delays[0] - delay).abs();
+        assert!(miss < 1e-6, "delay {delay}: {} s", found.point.delays[0]);
+        check("orders beside a delay", relative_distance(&found.point.orders, &ORDERS), 1e-5);
+        check("coefficients beside a delay", relative_distance(&found.point.coefficients, &COEFFICIENTS), 1e-5);
+    }
+}
+
+#[test]
+fn a_delay_is_estimated_as_well_as_its_slope_says() {
+    let (model, delay) = (with_delay(true), 0.047);
+    let start = Point { delays: vec![0.08], ..point(&START.0, &START.1) };
+    let mut scores = Vec::new();
+    for seed in 0..40 {
+        let found = fit(&model, &[late(delay, 1, 0.02, 600 + 2 * seed)], &start, Settings::default()).unwrap();
+        let normal: Vec<f64> = (0..9)
+            .flat_map(|i| (0..9).map(move |j| (i, j)))
+            .map(|(i, j)| found.jacobian[i].iter().zip(&found.jacobian[j]).map(|(a, b)| a * b).sum())
+            .collect();
+        let last: Vec<f64> = (0..9).map(|i| f64::from(i == 8)).collect();
+        scores.push((found.point.delays[0] - delay) / dense_solve(&normal, &last)[8].sqrt());
+    }
+    let mean = scores.iter().sum::<f64>() / scores.len() as f64;
+    // Of forty standard normal numbers: the mean scatters by 0.16, the deviation by 0.11.
+    assert!(mean.abs() < 0.6, "mean {mean}");
+    check_between("deviation of the scores", deviation(&scores), 0.6, 1.4);
 }

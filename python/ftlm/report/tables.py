@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from markupsafe import Markup, escape
 
 from ftlm.errors import ModelError
+from ftlm.models import delay_name
 from ftlm.output_error import NORMAL_95
 
 if TYPE_CHECKING:
@@ -316,7 +317,11 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
             shown.add(term.name)
             # + 0.0 makes the negative zero of a product of signs a plain zero.
             rows.append(row(term.name, float(term.coefficient), None if stated is None else stated + 0.0, place))
-    rows += [row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown]
+    delays = {delay_name(n): (n, v) for n, v in model.structure.delay.items() if delay_name(n) in errors}
+    rows += [
+        row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown and n not in delays
+    ]
+    rows += [row(n, v, None, f"delay of {symbol(signal)} in s") for n, (signal, v) in delays.items()]
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "what it is"]
     if known:
         note = "A coefficient without an interval follows from the law. Intervals hold as far as the model does."
