@@ -516,6 +516,9 @@ def _identify_output_error(
     progress: Callable[[int, int], None] | None,
 ) -> Identification:
     """Orders and coefficients together by joint output error."""
+    # An order with one value is known.
+    known = {n: v[0] for n, v in structure.order_values.items() if len(v) == 1}
+    structure = structure.with_orders(known)
     records = prepare(runs, replace(structure, free_delays={}), m, power_of_two=False)
     decided = replace(structure, initial=records[0].initial)
     joint = fit_output_error(runs, decided, threads=check_threads(threads), progress=progress)
@@ -524,7 +527,7 @@ def _identify_output_error(
         structure.with_orders(joint.orders)
         .with_coefficients(problem.named(list(joint.coefficients.values())))
         .with_delays(joint.delays),
-        orders=joint.orders,
+        orders={**known, **joint.orders},
         units={n: u for n, u in runs[0].units.items() if n in structure.signals},
         m=records[0].m,
         about={"method": "output-error", "runs": ", ".join(r.name for r in runs)},

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from ftlm import _core
 from ftlm.checks import real_number, whole_number
-from ftlm.errors import ModelError
+from ftlm.errors import DataError, ModelError
 from ftlm.models import MAX_ORDER, Equation, Model, Order, Structure, Values, grid, parse_values
 from ftlm.progress import Progress
-from ftlm.records import check_m, default_m, initial_tuple, record
+from ftlm.records import check_m, default_m, initial_tuple, named_signals, record
 from ftlm.validation import as_runs
 
 if TYPE_CHECKING:
@@ -357,7 +356,7 @@ def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_o
     Raises
     ------
     DataError
-        A signal that a run lacks, or a constant output.
+        A signal that a run lacks, a constant output, or a signal with a free coefficient that is 0 in all runs.
     ModelError
         An m that the runs do not carry.
     """
@@ -369,6 +368,13 @@ def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_o
     if any(r.initial == "caputo" for r in records):
         # One rule for all runs of a fit: initial terms that a run at rest does not need are estimated as zero.
         records = [record(run, replace(structure, initial="caputo"), m) for run in runs]
+    for item in structure.equations:
+        for term in item.terms:
+            if term.fixed is None and term.signal != item.output and not any(r.of(term.signal).any() for r in records):
+                raise DataError(
+                    f"{term.signal} is 0 throughout, so its coefficient in the equation of {item.output} cannot be "
+                    "identified; leave the term out, fix its coefficient, or add a run in which it moves"
+                )
     return records
 
 
@@ -519,8 +525,7 @@ def _search_one(job: _Job) -> SearchResult:
             job.progress,
         )
     except ModelError as error:
-        # The core knows signals by number.
-        raise ModelError(re.sub(r"signal (\d+)", lambda m: f"signal {signals[int(m[1])]!r}", str(error))) from None
+        raise named_signals(error, signals) from None
 
     def named(alpha: float, orders: list[float]) -> dict[str, float]:
         pairs = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)

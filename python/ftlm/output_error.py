@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ftlm import _core
-from ftlm.errors import ConvergenceError, FtlmError
+from ftlm.errors import ConvergenceError, DataError, FtlmError, ModelError
 from ftlm.models import MAX_ORDER, Order, Structure, delay_name
-from ftlm.records import initial_tuple, noise_of, record, sensor_series
+from ftlm.records import initial_tuple, named_signals, noise_of, record, sensor_series
 from ftlm.resonance_scan import scan_equation
 
 if TYPE_CHECKING:
@@ -494,7 +494,11 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, thre
     axes = start_axes(problem)
     natural = natural_axes(problem)
     attempts: list[Attempt] = []
+    fastest = math.pi / max(run.duration / m for run in runs)
     for multiple in PREFILTERS:
+        if multiple is not None and multiple * frequency >= fastest:
+            # Nothing on these pulses lies above it.
+            continue
         records = [prefiltered(record(run, structure, m), multiple and multiple * frequency) for run in runs]
         origin = "no prefilter" if multiple is None else f"prefilter {multiple * frequency:.3g} rad/s"
         lattices = [(axes, APART)]
@@ -650,7 +654,10 @@ def lattice_rows(
 
         terms = [(signals.index(t.signal), axis(t.order), bool(t.order.names) and t.fixed is None) for t in item.terms]
         lattice = (signals.index(item.output), axis(item.order), terms)
-        found = _core.search(cores, lattice, inputs, [t.fixed for t in item.terms], initial, settings, None)
+        try:
+            found = _core.search(cores, lattice, inputs, [t.fixed for t in item.terms], initial, settings, None)
+        except ModelError as error:
+            raise named_signals(error, signals) from None
         table = []
         for _, _, alpha, orders, raw, _ in found["rows"]:
             every = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
@@ -705,12 +712,20 @@ def fit_output_error(
 
     Raises
     ------
+    DataError
+        Fewer samples than free numbers.
     ConvergenceError
         No start has a finite free run.
     """
     problem = FreeProblem.of(structure)
     initial = structure.initial
     signals = structure.signals
+    samples = sum(run.length - 2 for run in runs) * len(structure.outputs)
+    if samples <= len(problem.names):
+        raise DataError(
+            f"{samples} samples between the first and the last do not tell {len(problem.names)} free numbers; use "
+            "longer runs, or fix orders or coefficients"
+        )
     noise = first_noise(runs, structure)
     decimation = max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES)
 

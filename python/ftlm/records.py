@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -236,3 +237,8 @@ def initial_tuple(initial: Initial) -> tuple[bool, list[float]]:
     if initial == "caputo":
         return True, []
     return False, [] if isinstance(initial, str) else list(initial)
+
+
+def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
+    """The core knows signals by number; people know them by name."""
+    return ModelError(re.sub(r"signal (\d+)", lambda m: f"signal {signals[int(m[1])]!r}", str(error)))

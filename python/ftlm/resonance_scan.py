@@ -66,9 +66,10 @@ def scan_equation(
     list
         (root mean square output error as a share of the output's size, coefficients by name), best first.
     """
-    rest = replace(item, terms=tuple(t for t in item.terms if t.signal != item.output))
-    if not rest.terms or len(rest.terms) == len(item.terms):
+    others = tuple(t for t in item.terms if t.signal != item.output)
+    if not others or len(others) == len(item.terms):
         return []
+    rest = replace(item, terms=others)
     found = []
     for share in FREQUENCIES:
         best: tuple[float, dict[str, float]] | None = None

@@ -710,7 +710,7 @@ pub fn project(record: &Record, signal: usize, inputs: &[usize], at_rest: bool) 
     let (low, high) = (std::f64::consts::PI / duration, std::f64::consts::PI / (4.0 * h));
     let decades = libm::log10(high / low);
     #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    let count = ((decades * RESONATORS as f64) as usize).clamp(2, m / (8 * inputs.len()).max(1)).max(2);
+    let count = ((decades * RESONATORS as f64) as usize).clamp(2, (m / (8 * inputs.len())).max(2));
     let mut columns = Vec::new();
     if !at_rest {
         columns.extend([0.0, 1.0].map(|e| record.initial_term(e)));
