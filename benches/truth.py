@@ -1,8 +1,8 @@
 """Truth under noise, measured: bias against step, Monte-Carlo of the joint fit, the three-term table, random plants.
 
-``python benches/truth.py bias | intervals | orders | three-terms | random-plants | arm [--seeds 100] [--plants A,A2,3T]
-[--levels 20,40,60,80] [--write]`` prints tables; ``--write`` appends them to benches/RESULTS.md. Seeds are 0 to
-``--seeds`` less one, and are never changed.
+``python benches/truth.py WHAT [--seeds 100] [--plants A,A2,3T] [--levels 20,40,60,80] [--outputs theta11,…] [--write]``
+prints tables; ``--write`` appends them to benches/RESULTS.md. WHAT is bias, intervals, orders, three-terms,
+random-plants, arm or heating. Seeds are 0 to ``--seeds`` less one, and are never changed.
 """
 
 from __future__ import annotations
@@ -242,60 +242,111 @@ def measured(name: str, first: float, last: float) -> ftlm.Run:
     )  # fmt: skip
 
 
-#: Own terms, then every other signal, of each equation of the arm.
+#: Every other signal of each equation of the arm: the stage's own ones, then the other stage's.
 ARM = {
     "theta11": ("theta12", "I1", "theta21", "theta22", "I2"),
     "theta12": ("theta11", "I1", "theta21", "theta22", "I2"),
     "theta21": ("theta22", "I2", "theta11", "theta12", "I1"),
     "theta22": ("theta21", "I2", "theta11", "theta12", "I1"),
 }
+#: Whole orders with the other angles as they are, with their rates, and all orders free.
+KINDS = ("angles", "rates", "fractional")
 
 
-def arm_structure(output: str, *, whole: bool) -> ftlm.Structure:
-    """One equation with all measured signals: whole orders (2; 1, 0), or all of them free."""
-    others = ARM[output]
-    if whole:
-        terms = [f"a1 D^1 {output}", f"a0 {output}", *[f"c{i} {s}" for i, s in enumerate(others)]]
-        words = f"D^2 {output} = " + " + ".join(terms)
-    else:
-        terms = [f"a1 D^beta {output}", f"a0 D^mu {output}", *[f"c{i} D^nu{i} {s}" for i, s in enumerate(others)]]
+def arm_structure(output: str, kind: str) -> ftlm.Structure:
+    """One equation with all measured signals: second order, or all orders free; the terms are the same."""
+    if kind == "fractional":
+        terms = [f"a1 D^beta {output}", f"a0 D^mu {output}"]
+        terms += [f"c{i} D^nu{i} {s}" for i, s in enumerate(ARM[output])]
         words = f"D^alpha {output} = " + " + ".join(terms)
+    else:
+        order = {"angles": "0", "rates": "1"}[kind]
+        terms = [f"a1 D^1 {output}", f"a0 {output}"]
+        terms += [f"c{i} D^{'0' if s.startswith('I') else order} {s}" for i, s in enumerate(ARM[output])]
+        words = f"D^2 {output} = " + " + ".join(terms)
     return replace(ftlm.equation(words), coupling="measured", initial=(0.0, 1.0))
 
 
-def arm_row(task: tuple[str, bool, str]) -> str:
+def arm_row(task: tuple[str, str, str]) -> tuple[tuple[str, str, str], dict[str, float], str]:
     """Fit of one equation on some of the two runs, and its fit on each."""
-    output, whole, used = task
+    output, kind, used = task
     runs = {"psf": measured("psf", 1.1, 19.5), "lqr": measured("lqr", 0.1, 19.9)}
-    chosen = [runs[u] for u in used.split("+")]
     start = time.process_time()
-    kind = "whole" if whole else "fractional"
     try:
-        found = ftlm.identify(chosen, arm_structure(output, whole=whole), threads=1)
+        found = ftlm.identify([runs[u] for u in used.split("+")], arm_structure(output, kind), threads=1)
     except ftlm.FtlmError as error:
-        return f"{output} {kind} on {used}: {error}"
+        return task, dict.fromkeys(runs, -np.inf), f"{output} {kind} on {used}: {error}"
     fits = {n: found.model.compare(r).fit_percent[output] for n, r in runs.items()}
     orders = ", ".join(f"{n} {v:.2f}±{found.standard_errors[n]:.2g}" for n, v in found.orders.items())
-    return (
+    words = (
         f"{output} {kind} on {used}: psf {fits['psf']:.1f} %, lqr {fits['lqr']:.1f} %"
         f"{'; ' + orders if orders else ''} ({time.process_time() - start:.0f} s)"
     )
+    return task, fits, words
 
 
-def arm() -> Iterator[str]:
+def arm(outputs: Iterable[str]) -> Iterator[str]:
     """Whole against fractional orders on the real arm, on both runs and each predicting the other."""
-    tasks = [(o, w, u) for o in ARM for w in (True, False) for u in ("psf+lqr", "psf", "lqr")]
+    tasks = [(o, k, u) for o in outputs for u in ("psf+lqr", "psf", "lqr") for k in KINDS]
+    fits: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
     with ProcessPoolExecutor(workers()) as pool:
-        yield from pool.map(arm_row, tasks)
+        for (output, kind, used), found, words in pool.map(arm_row, tasks):
+            yield words
+            rows = fits.setdefault((output, used), {})
+            rows[kind] = found
+            if len(rows) == len(KINDS) and "+" not in used:
+                other = "lqr" if used == "psf" else "psf"
+                whole = max(("angles", "rates"), key=lambda k, r=rows, u=used: r[k][u])  # type: ignore[misc]
+                gain = rows["fractional"][other] - rows[whole][other]
+                yield (
+                    f"**{output} from {used} on {other}**: whole orders ({whole}) {rows[whole][other]:.1f} %, "
+                    f"fractional {rows['fractional'][other]:.1f} %: fractional validates "
+                    f"{'better' if gain > 0 else 'NOT better'}"
+                )
+
+
+# ------------------------------------------------------------------------------------------------ the heating system
+
+HEATING = {
+    "order 1": ("D T = a0 T + b0 u + c0 one", (0.0,)),
+    "order 2": ("D^2 T = a1 D T + a0 T + b0 u + c0 one", (0.0, 1.0)),
+    "order alpha": ("D^alpha T = a0 T + b0 u + c0 one", (0.0,)),
+    "orders alpha, nu": ("D^alpha T = a1 D^nu T + a0 T + b0 u + c0 one", (0.0,)),
+}
+
+
+def heating() -> Iterator[str]:
+    """A diffusive system that does not start at rest: T(0) as an initial term, the surroundings as a constant input."""
+    folder = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+    table = np.loadtxt(folder / "heating" / "heating_system.dat")
+    run = ftlm.Run.from_arrays(
+        step=2.0, inputs={"u": table[:, 1], "one": np.ones(len(table))}, outputs={"T": table[:, 2]},
+        units={"T": "degC", "u": "V"}, name="heating",
+    )  # fmt: skip
+    for name, (words, initial) in HEATING.items():
+        structure = replace(ftlm.equation(words), initial=initial)
+        found = ftlm.identify(run, structure)
+        part = ftlm.identify(run.slice(0, 1000), structure)
+        numbers = ", ".join(f"{n} {v:.3f} ± {found.standard_errors[n]:.2g}" for n, v in found.orders.items())
+        finer = found.joint.noise["T"] if found.joint is not None else np.nan
+        yield (
+            f"{name}: fit {found.fit_percent['T']:.2f} %, residuals {finer:.2f} degC, BIC {found.information.bic:.0f}"
+            f"{'; ' + numbers if numbers else ''}; identified from the first 1000 of 1600 s: "
+            f"{part.model.compare(run).fit_percent['T']:.2f} % of all"
+        )
+        yield from (f"  {name}: {w}" for w in found.warnings)
 
 
 def main() -> None:
     """Measure and print; append with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("bias", "intervals", "orders", "three-terms", "random-plants", "arm"))
+    parser.add_argument(
+        "what", choices=("bias", "intervals", "orders", "three-terms", "random-plants", "arm", "heating")
+    )
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--plants", default="A,A2,3T")
     parser.add_argument("--levels", default="20,40,60,80")
+    parser.add_argument("--outputs", default=",".join(ARM))
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     arguments = parser.parse_args()
     names = arguments.plants.split(",")
@@ -305,7 +356,8 @@ def main() -> None:
         "orders": lambda: orders([n for n in names if n in LATTICES], arguments.seeds),
         "three-terms": lambda: three_terms_table(arguments.seeds),
         "random-plants": lambda: random_plants(arguments.seeds),
-        "arm": arm,
+        "arm": lambda: arm(arguments.outputs.split(",")),
+        "heating": heating,
     }[arguments.what]()
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     command = " ".join(["python benches/truth.py", *[a for a in sys.argv[1:] if a != "--write"]])

@@ -524,6 +524,57 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, thre
     return attempts + scanned_attempts(runs, problem, structure, m, attempts)
 
 
+@dataclass(frozen=True)
+class Simpler:
+    """A problem with one own term less.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    coefficient
+        What is 0 in it.
+    order
+        Highest order of the equation that lacks the term.
+    """
+
+    problem: FreeProblem
+    coefficient: str
+    order: Order
+
+    def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
+        """The same point of the whole problem; the order of a term that is 0 may be any, so it is half the highest."""
+        known = dict(zip(self.problem.orders, attempt.orders, strict=True))
+        highest = self.order.constant + sum(w * known[n] for n, w in self.order.weights)
+        values = dict(zip(self.problem.coefficients, attempt.coefficients, strict=True))
+        return replace(
+            attempt,
+            orders=[known.get(n, 0.5 * highest) for n in whole.orders],
+            coefficients=[values.get(n, 0.0) for n in whole.coefficients],
+            origin=f"{attempt.origin}, from {self.coefficient} = 0",
+        )
+
+
+def simpler(problem: FreeProblem) -> list[Simpler]:
+    """Problems with one own term less; none under a law, where no coefficient can be 0 by itself."""
+    structure = problem.structure
+    if structure.has_order_law or problem.products:
+        return []
+    out = []
+    for place, item in enumerate(structure.equations):
+        own = [t for t in item.terms if t.signal == item.output]
+        for term in own if len(own) > 1 else []:
+            if not isinstance(term.coefficient, str):
+                continue
+            rest = replace(item, terms=tuple(t for t in item.terms if t is not term))
+            equations = (*structure.equations[:place], rest, *structure.equations[place + 1 :])
+            names = {n for e in equations for n in e.order_names}
+            values = {n: v for n, v in structure.order_values.items() if n in names}
+            reduced = replace(structure, equations=equations, order_values=values)
+            out.append(Simpler(FreeProblem.of(reduced), term.coefficient, item.order))
+    return out
+
+
 def scanned_attempts(
     runs: Sequence[Run], problem: FreeProblem, structure: Structure, m: int, attempts: Sequence[Attempt]
 ) -> list[Attempt]:
@@ -741,22 +792,22 @@ def fit_output_error(
         coarse: list[Any] = []
         attempts = delayed_attempts(runs, problem, initial, threads)
 
-        def tried(attempt: Attempt, evaluations: int) -> Attempt | None:
+        def tried(attempt: Attempt, evaluations: int, of: FreeProblem) -> Attempt | None:
             try:
-                return descend(problem, coarse, signals, initial, attempt, evaluations=evaluations)
+                return descend(of, coarse, signals, initial, attempt, evaluations=evaluations)
             except FtlmError:
                 # A start whose free run is not finite is no start; if none is left, that is said below.
                 return None
 
-        def race(runners: list[Attempt], evaluations: int) -> list[Attempt]:
-            ended = []
+        def race(runners: list[Attempt], evaluations: int, of: FreeProblem = problem) -> list[Attempt]:
+            ended, count = [], len(runners)
             with ThreadPoolExecutor(threads) as pool:
                 try:
-                    for done, attempt in enumerate(pool.map(tried, runners, [evaluations] * len(runners))):
+                    for done, attempt in enumerate(pool.map(tried, runners, [evaluations] * count, [of] * count)):
                         if attempt is not None:
                             ended.append(attempt)
                         if progress is not None:
-                            progress(done, len(attempts))
+                            progress(min(done, len(attempts) - 1), len(attempts))
                 except BaseException:
                     pool.shutdown(cancel_futures=True)
                     raise
@@ -773,6 +824,11 @@ def fit_output_error(
                 break
             # The coarse grid has optima of its own: once more from the same starts, on half the step.
             level *= 2
+        # Whatever a simpler equation reaches, this one reaches too: it starts there with the term's coefficient at 0.
+        for less in simpler(problem) if reached else []:
+            laps = race(delayed_attempts(runs, less.problem, initial, threads), FIRST_LAP, less.problem)
+            laps = race(laps[:FINALISTS], SECOND_LAP, less.problem)
+            reached = sorted(reached + [less.embedded(a, problem) for a in laps[:1]], key=lambda a: a.level)
         ahead = max(FEWEST, len(reached) // RUNNERS)
         reached = sorted(race(reached[:ahead], SECOND_LAP) + reached[ahead:], key=lambda a: a.level)
         starts = [(a.level, a.origin) for a in reached]
@@ -815,7 +871,9 @@ def fit_output_error(
         finer, weights = weighed(best, weights, 2 * every)
         errors = np.sqrt(np.diag(covariance(finer, experiments(weights, 2 * every), structure)))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
-        limit = finer.values + (finer.values - best.values) / 3.0
+        # Of a flat valley in which neither stood still they tell nothing.
+        still = finer.found["status"] == "converged" and best.found["status"] == "converged"
+        limit = finer.values + (finer.values - best.values) / 3.0 if still else finer.values
         settled = bool(np.all(np.abs(limit - estimate) <= REFINED * errors))
         best, every, estimate = finer, 2 * every, limit
     low, high = np.array(problem.all_bounds).T

@@ -180,7 +180,7 @@ def test_estimates_do_not_depend_on_the_grid() -> None:
     assert np.max(np.abs(biased)) > 5
 
 
-@pytest.mark.parametrize("seed", [0, 5, 26, 44, 100, 150])
+@pytest.mark.parametrize("seed", [0, 5, 26, 44, 78, 100, 150, 169])
 def test_random_plants_are_found_from_the_automatic_start(seed: int) -> None:
     _, excess, _, words = truth.random_plant(seed)
     assert excess < truth.SAME_OPTIMUM, words
@@ -222,3 +222,19 @@ def test_random_plants_end_in_the_global_optimum() -> None:
     rows = list(truth.random_plants(200))
     print("\n".join(rows))
     assert int(rows[0].split("40 dB: ")[1].split(" ")[0]) >= 198
+
+
+def test_a_richer_equation_never_fits_worse_than_a_simpler_one() -> None:
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.choice([-1.0, 1.0], 40), 20)
+    blank = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": 0 * u})
+    clean = ftlm.Model(ftlm.equation("D^0.7 y = -0.5 y + u")).simulate(blank, tolerance=1e-6)["y"]
+    noisy = clean + 0.05 * np.std(clean) * rng.standard_normal(u.size)
+    run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": noisy})
+    rest = {"initial": "rest"}
+    simple = ftlm.identify(run, ftlm.equation("D^alpha y = a0 y + b0 u", **rest))
+    rich = ftlm.identify(run, ftlm.equation("D^alpha y = a2 D^kappa y + a1 D^nu y + a0 y + b0 u", **rest))
+    assert rich.joint.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-4)
+    # What it does not need it cannot tell, and says so.
+    assert any("cannot be told" in w or "not different from 0" in w for w in rich.warnings)
+    assert any("from a" in origin and "= 0" in origin for _, origin in rich.joint.starts)
