@@ -20,7 +20,16 @@ from ftlm.operators import (
     haar_transform,
     operational_matrix,
 )
-from ftlm.order_search import Lattice, SearchResult, SearchRow, lattice, search_orders
+from ftlm.order_search import (
+    Lattice,
+    SearchResult,
+    SearchRow,
+    StoreStatus,
+    lattice,
+    resume_search,
+    search_orders,
+    search_status,
+)
 from ftlm.physical import PhysicalParameter, physical_parameters
 from ftlm.residuals import CorrelationTest, InformationCriteria, OutputResiduals, Residuals, information_criteria, resid
 from ftlm.runs import Run
@@ -53,6 +62,7 @@ __all__ = [
     "SearchResult",
     "SearchRow",
     "SensorFilter",
+    "StoreStatus",
     "Structure",
     "Term",
     "Trace",
@@ -79,8 +89,10 @@ __all__ = [
     "order_law",
     "physical_parameters",
     "resid",
+    "resume_search",
     "rig",
     "search_orders",
+    "search_status",
     "simulate",
 ]
 

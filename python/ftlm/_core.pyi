@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 __all__ = [
     "SIMD",
     "Guard",
+    "OrderSearch",
     "Streaming",
     "VirtualArm",
     "__version__",
@@ -42,6 +43,8 @@ __all__ = [
     "respond",
     "respond_with_initial",
     "search",
+    "search_join",
+    "search_plan",
     "search_stage",
     "series_divide",
     "series_multiply",
@@ -83,6 +86,13 @@ _Counts = TypedDict(
     "_Counts",
     {"candidates": int, "kept": int, "beaten": int, "stopped early": int, "singular": int, "diverged": int},
 )
+
+_Part: TypeAlias = tuple[
+    Sequence[tuple[int, float, Sequence[float], Sequence[Sequence[float]]]],
+    tuple[int, int, int, int, int, int, int],
+    Sequence[tuple[int, bool]],
+]
+_Checkpoint: TypeAlias = tuple[tuple[int, int, int, int, float], _Part]
 
 class _Found(TypedDict):
     #: (index, score, alpha, orders, coefficients, initial terms per record)
@@ -219,6 +229,40 @@ def search(
     settings: _Options,
     progress: _Progress | None,
 ) -> _Found: ...
+def search_plan(
+    orders: _Lattice, inputs: Sequence[bool], terms: _Initial, settings: _Options
+) -> tuple[int, list[int]]: ...
+def search_join(
+    orders: _Lattice,
+    inputs: Sequence[bool],
+    terms: _Initial,
+    settings: _Options,
+    samples: int,
+    parts: Sequence[_Part],
+) -> _Found: ...
+
+@final
+class OrderSearch:
+    def __new__(
+        cls,
+        runs: Sequence[_Record],
+        orders: _Lattice,
+        inputs: Sequence[bool],
+        fixed: Sequence[float | None],
+        terms: _Initial,
+        settings: _Options,
+    ) -> OrderSearch: ...
+    def rounds(
+        self,
+        first: int,
+        last: int,
+        seed: Sequence[tuple[int, float]],
+        start: _Checkpoint | None,
+        threads: int,
+        progress: _Progress | None,
+        save: Callable[[_Checkpoint | None], object] | None,
+    ) -> _Part: ...
+
 def search_stage(
     runs: Sequence[_Record],
     axes: Sequence[Sequence[float]],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import os
@@ -19,11 +20,12 @@ from ftlm.errors import DataError, FtlmError, InternalError, ModelError, RigFaul
 from ftlm.rig.commands import record
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
 
     from ftlm.models import Structure
-    from ftlm.order_search import Lattice
+    from ftlm.order_search import Job, Lattice, SearchResult
     from ftlm.runs import Run
+    from ftlm.store import Store
 
 __all__ = ["app", "main"]
 
@@ -603,10 +605,15 @@ def search(
     m: M = None,
     keep: Keep = 20,
     threads: Threads = None,
+    store: Annotated[
+        str | None, typer.Option("--store", metavar="FILE", help="Keep finished work there; go on with ftlm resume.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
+    from ftlm.order_search import make_job, run_job  # noqa: PLC0415
     from ftlm.progress import Progress  # noqa: PLC0415
+    from ftlm.store import Store  # noqa: PLC0415
 
     wanted = structure_of(
         structure, only=only, coupling=coupling, cross_stage=cross_stage, friction=friction, laws=laws,
@@ -623,20 +630,92 @@ def search(
         if name not in known:
             free = ", ".join(wanted.order_names) or "none"
             raise ModelError(f"--lattice {name!r} is no free order; free are {free}")
-    found = {}
+    jobs: dict[str, Callable[..., Job]] = {}
     for name, part in parts.items():
         own = {n: v for n, v in chosen.orders.items() if n == "alpha" or n in part.order_names}
-        with Progress(f"searching orders of {name}", quiet=as_json) as progress:
-            found[name] = ftlm.search_orders(
-                runs, part, replace(chosen, orders=own), criterion=criterion.value,
-                coefficients=coefficients.value, norm=norm.value, innovation_length=p, prior_covariance=k0,
-                rows=rows.value, m=m, keep=keep, threads=threads, progress=progress,
-            )  # fmt: skip
+        jobs[name] = functools.partial(
+            make_job, runs, part, replace(chosen, orders=own), criterion=criterion.value,
+            coefficients=coefficients.value, norm=norm.value, innovation_length=p, prior_covariance=k0,
+            rows=rows.value, m=m, keep=keep, threads=threads,
+        )  # fmt: skip
+    found = {}
+    with resumable(store), contextlib.ExitStack() as stack:
+        kept = None
+        if store is not None:
+            ready = {name: make() for name, make in jobs.items()}
+            for job in ready.values():
+                job.check_rounds()
+            kept = stack.enter_context(Store(store, [job.request(name) for name, job in ready.items()]))
+            show_notes(kept)
+        for number, (name, make) in enumerate(jobs.items()):
+            with Progress(f"searching orders of {name}", quiet=as_json) as progress:
+                found[name] = run_job(make(progress=progress), store=kept, number=number)
+    show_searches(found, as_json=as_json)
+
+
+def show_searches(found: dict[str, SearchResult], *, as_json: bool) -> None:
+    """Searches by output, for people or as JSON."""
     if as_json:
         data = {n: r.to_dict() for n, r in found.items()}
         print(json.dumps(data, indent=1, ensure_ascii=False, allow_nan=False, default=plain))
     else:
         print("\n\n".join(f"{name}\n{result}" for name, result in found.items()))
+
+
+@contextlib.contextmanager
+def resumable(path: str | None) -> Iterator[None]:
+    """Say after Ctrl-C how to go on with a store, if there is one."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if path is None or not Path(path).exists():
+            raise
+        print(f"ftlm: interrupted; go on with: ftlm resume {path}", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def show_notes(store: Store) -> None:
+    """What was mended in a store."""
+    for note in store.notes:
+        print(f"ftlm: {store.path}: {note}", file=sys.stderr)
+
+
+StoreFile = Annotated[str, typer.Argument(metavar="STORE", help="A file written with --store.")]
+
+
+@app.command()
+@guarded
+def resume(
+    store: StoreFile,
+    salvage: Annotated[
+        bool, typer.Option("--salvage", help="Go on with a damaged store; the damaged file is kept beside it.")
+    ] = False,
+    threads: Threads = None,
+    as_json: Json = False,
+) -> None:
+    """Go on with the searches of a store, and show them; it needs no other file."""
+    from ftlm.order_search import resume_job  # noqa: PLC0415
+    from ftlm.progress import Progress  # noqa: PLC0415
+    from ftlm.store import Store  # noqa: PLC0415
+
+    found = {}
+    with resumable(store), Store(store, salvage=salvage) as kept:
+        show_notes(kept)
+        for number, request in enumerate(kept.contents.requests):
+            with Progress(f"searching orders of {request.name}", quiet=as_json) as progress:
+                found[request.name] = resume_job(kept, number, threads=threads, progress=progress)
+    show_searches(found, as_json=as_json)
+
+
+@app.command()
+@guarded
+def status(store: StoreFile, as_json: Json = False) -> None:
+    """Show how far the searches of a store are; it may be in use."""
+    found = ftlm.search_status(store)
+    if as_json:
+        print(json.dumps({n: s.to_dict() for n, s in found.items()}, indent=1, ensure_ascii=False, allow_nan=False))
+    else:
+        print("\n".join(str(s) for s in found.values()))
 
 
 @app.command()

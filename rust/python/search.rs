@@ -1,5 +1,6 @@
 //! Order searches, watched for Ctrl-C while they run.
 
+use std::borrow::Cow;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{channel, RecvTimeoutError};
 use std::time::Duration;
@@ -15,7 +16,9 @@ use crate::estimate::instrumental_variables::{with_projections, Settings};
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::regressors::Record;
 use crate::search::lattice::{Lattice, LawEquation, LawLattice, TermAxis};
-use crate::search::run::{self, Control, Counts, Criterion, Estimator, Failure, Norm, Options};
+use crate::search::run::{
+    self, Checkpoint, Control, Counts, Criterion, Estimator, Failure, Norm, Options, Outcome, Part, Place, Row,
+};
 use crate::search::stage;
 
 /// How often Python is asked for signals: well under the half second after which Ctrl-C must have ended a search.
@@ -27,7 +30,18 @@ fn watched<T: Send>(
     progress: Option<&Py<PyAny>>,
     work: impl FnOnce(&Control) -> Result<T, Error> + Send,
 ) -> PyResult<T> {
+    saved(py, progress, None, work)
+}
+
+/// As [`watched`]; whenever Python is asked for signals, `save` is called with the latest checkpoint, or with None.
+fn saved<T: Send>(
+    py: Python<'_>,
+    progress: Option<&Py<PyAny>>,
+    save: Option<&Py<PyAny>>,
+    work: impl FnOnce(&Control) -> Result<T, Error> + Send,
+) -> PyResult<T> {
     let control = Control::default();
+    control.saving.store(save.is_some(), Ordering::Relaxed);
     let result = py.detach(|| {
         std::thread::scope(|scope| {
             let (finished, wait) = channel::<()>();
@@ -42,6 +56,9 @@ fn watched<T: Send>(
                     py.check_signals()?;
                     if let Some(progress) = progress {
                         progress.call1(py, state(&control))?;
+                    }
+                    if let Some(save) = save {
+                        save.call1(py, (control.take().map(checkpoint_of),))?;
                     }
                     Ok::<_, PyErr>(())
                 });
@@ -176,6 +193,11 @@ pub fn search<'py>(
         let outcome = run::search(&records, &lattice, &fixed, &options, control)?;
         Ok((lattice, outcome))
     })?;
+    found(py, &lattice, outcome)
+}
+
+/// A table, counts and failures with the orders of each index.
+fn found<'py>(py: Python<'py>, lattice: &Lattice, outcome: Outcome) -> PyResult<Bound<'py, PyDict>> {
     let rows: Vec<_> = outcome
         .rows
         .into_iter()
@@ -199,6 +221,150 @@ pub fn search<'py>(
     dict.set_item("counts", counted(py, &outcome.counts)?)?;
     dict.set_item("failures", failures)?;
     Ok(dict)
+}
+
+/// (index, raw score, coefficients, initial terms by record).
+type RowArg = (u64, f64, Vec<f64>, Vec<Vec<f64>>);
+/// Candidates, kept, beaten, bounded, stopped, singular, diverged.
+type CountsArg = (u64, u64, u64, u64, u64, u64, u64);
+/// Rows, counts, (index, whether diverged rather than singular) of failures.
+type PartArg = (Vec<RowArg>, CountsArg, Vec<(u64, bool)>);
+/// (round, followed, end, size, limit) and what the stretch came to.
+type CheckpointArg = ((u64, u64, u64, u64, f64), PartArg);
+
+fn part_of(part: Part) -> PartArg {
+    let c = part.counts;
+    (
+        part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients, r.initial)).collect(),
+        (c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged),
+        part.failures.into_iter().map(|(index, f)| (index, f == Failure::Diverged)).collect(),
+    )
+}
+
+fn part((rows, counts, failures): PartArg) -> Part {
+    let (candidates, kept, beaten, bounded, stopped, singular, diverged) = counts;
+    Part {
+        rows: rows
+            .into_iter()
+            .map(|(index, score, coefficients, initial)| Row { index, score, coefficients, initial })
+            .collect(),
+        counts: Counts { candidates, kept, beaten, bounded, stopped, singular, diverged },
+        failures: failures
+            .into_iter()
+            .map(|(index, diverged)| (index, if diverged { Failure::Diverged } else { Failure::Singular }))
+            .collect(),
+    }
+}
+
+fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
+    let p = checkpoint.place;
+    ((p.round, p.followed, p.end, p.size, p.limit), part_of(checkpoint.part))
+}
+
+/// Candidates of a search, and where each wave of its rounds ends.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn search_plan(
+    py: Python<'_>,
+    orders: LatticeArg,
+    inputs: Vec<bool>,
+    terms: InitialArg,
+    settings: OptionsArg,
+) -> PyResult<(u64, Vec<u64>)> {
+    let options = options(settings, terms)?;
+    super::errors::detached(py, || {
+        let count = lattice(orders, &inputs)?.count();
+        Ok((count, run::waves(run::rounds(count, &options))))
+    })
+}
+
+/// The result of a search from the parts that its rounds came to, over records of so many samples.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn search_join<'py>(
+    py: Python<'py>,
+    orders: LatticeArg,
+    inputs: Vec<bool>,
+    terms: InitialArg,
+    settings: OptionsArg,
+    samples: usize,
+    parts: Vec<PartArg>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let options = options(settings, terms)?;
+    let (lattice, outcome) = super::errors::detached(py, || {
+        let lattice = lattice(orders, &inputs)?;
+        let mut all = Part::default();
+        for argument in parts {
+            let part = part(argument);
+            let index = part.rows.iter().map(|r| r.index).chain(part.failures.iter().map(|f| f.0)).max();
+            if let Some(index) = index.filter(|&i| i >= lattice.count()) {
+                let what = format!("a row has index {index} among {} candidates", lattice.count());
+                return Err(Error::Structure { what, remedy: "start the search again".into() });
+            }
+            all.join(part, options.keep);
+        }
+        if all.counts.candidates != lattice.count() || all.counts.done() != lattice.count() {
+            let what = format!("parts account for {} of {} candidates", all.counts.done(), lattice.count());
+            return Err(Error::Structure { what, remedy: "start the search again".into() });
+        }
+        Ok((lattice, all.outcome(options.norm, samples)))
+    })?;
+    found(py, &lattice, outcome)
+}
+
+/// A search made ready for its rounds: on this machine, or on one of many.
+#[pyclass(frozen, module = "ftlm._core")]
+pub struct OrderSearch {
+    ready: run::Search<'static>,
+}
+
+#[pymethods]
+impl OrderSearch {
+    #[new]
+    #[allow(clippy::needless_pass_by_value)]
+    fn new(
+        py: Python<'_>,
+        runs: Vec<RecordArg<'_>>,
+        orders: LatticeArg,
+        inputs: Vec<bool>,
+        fixed: Vec<Option<f64>>,
+        terms: InitialArg,
+        settings: OptionsArg,
+    ) -> PyResult<Self> {
+        let records = records(&runs)?;
+        let options = options(settings, terms)?;
+        let ready = watched(py, None, |control| {
+            let lattice = lattice(orders, &inputs)?;
+            let records = prepared(records, &inputs, &options)?;
+            let pool = run::pool(options.threads)?;
+            run::Search::new(&records, Cow::Owned(lattice), &fixed, &options, &pool, control)
+        })?;
+        Ok(Self { ready })
+    }
+
+    /// Rounds `first … last − 1` of one wave: the part they come to.
+    #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+    fn rounds(
+        &self,
+        py: Python<'_>,
+        first: u64,
+        last: u64,
+        seed: Vec<(u64, f64)>,
+        start: Option<CheckpointArg>,
+        threads: usize,
+        progress: Option<Py<PyAny>>,
+        save: Option<Py<PyAny>>,
+    ) -> PyResult<PartArg> {
+        let start = start.map(|((round, followed, end, size, limit), argument)| Checkpoint {
+            place: Place { round, followed, end, size, limit },
+            part: part(argument),
+        });
+        let found = saved(py, progress.as_ref(), save.as_ref(), |control| {
+            let pool = run::pool(threads)?;
+            self.ready.rounds(first, last, &seed, start, &pool, control)
+        })?;
+        Ok(part_of(found))
+    }
 }
 
 /// (constant, weight of each free order).

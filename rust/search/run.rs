@@ -2,9 +2,13 @@
 //!
 //! Candidates stream by in rounds. All of a round get coefficients, several side by side, and those that a proved lower
 //! bound excludes are done; the others are followed, likely ones first, each until its partial sum passes the worst
-//! score kept. That score is looked at between rounds only: what is left out cannot be among the kept ones, so the table
-//! is that of brute force, ties by index, for any number of threads, and so are the counts.
+//! score kept: what is left out cannot be among the kept ones, so the table is that of brute force, ties by index.
+//!
+//! Rounds form waves of 1, 2, 4, … A round knows the rows kept before its wave and what it finds itself, nothing else,
+//! so it comes to the same bits, counts too, wherever and whenever it is done: on any number of threads, on another
+//! machine, or continued from a checkpoint.
 
+use std::borrow::Cow;
 use std::collections::HashSet;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
@@ -25,12 +29,17 @@ use crate::search::lattice::{Cursor, Lattice};
 use crate::series::{Division, BLOCK};
 use crate::small::{packed, solve_lanes};
 
-/// Candidates screened in one round: their bounds take 6 MB, and one look at the kept scores serves them all.
-const ROUND: u64 = 1 << 18;
+/// Candidates of one round where the Gram matrix alone ranks (16 ns each), where bounds screen (a microsecond or so), and
+/// where every candidate is followed: a round is long enough to be worth sending away, and short enough to be lost.
+const ROUND_PLAIN: u64 = 1 << 18;
+const ROUND_BOUNDED: u64 = 1 << 16;
+const ROUND_FOLLOWED: u64 = 1 << 12;
+/// Pulses of all candidates followed between two checkpoints: a tenth of a second or so of one core.
+const PIECE: usize = 1 << 21;
 /// Candidates that a thread screens at a time.
 const CHUNK: u64 = 512;
 /// First and largest number of candidates followed between two looks at the kept scores.
-const FOLLOWED: (usize, usize) = (256, 16_384);
+const FOLLOWED: (u64, u64) = (256, 16_384);
 /// Candidates tried beforehand, spread over the lattice: they choose the test vectors and give the first good score.
 const SCOUTS: u64 = 2048;
 /// Test vectors that a search works with.
@@ -102,6 +111,26 @@ pub struct Control {
     pub total: AtomicU64,
     /// Candidates among those done that were left before the end of the record.
     pub pruned: AtomicU64,
+    /// Set by a caller that takes checkpoints.
+    pub saving: AtomicBool,
+    /// The latest checkpoint that the caller has not taken yet.
+    pub checkpoint: Mutex<Option<Checkpoint>>,
+}
+
+impl Control {
+    /// Leaves a checkpoint; rows of one that was not taken are passed on.
+    fn save(&self, mut checkpoint: Checkpoint) {
+        let mut slot = self.checkpoint.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some(missed) = slot.take() {
+            checkpoint.part.rows.extend(missed.part.rows);
+        }
+        *slot = Some(checkpoint);
+    }
+
+    /// Takes the latest checkpoint.
+    pub fn take(&self) -> Option<Checkpoint> {
+        self.checkpoint.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
 }
 
 /// Why a candidate has no score.
@@ -154,6 +183,101 @@ pub struct Outcome {
     pub counts: Counts,
     /// The first failures by index, at most 100.
     pub failures: Vec<(u64, Failure)>,
+}
+
+/// What some rounds came to.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Part {
+    /// Their best rows, as many as are kept; scores are raw sums (Σ|e| or Σe²).
+    pub rows: Vec<Row>,
+    /// What became of their candidates. None is kept yet: the rows count as beaten.
+    pub counts: Counts,
+    /// Their first failures by index, at most 100.
+    pub failures: Vec<(u64, Failure)>,
+}
+
+impl Part {
+    /// Takes in what other rounds came to.
+    pub fn join(&mut self, other: Self, keep: usize) {
+        self.rows.extend(other.rows);
+        trim(&mut self.rows, keep);
+        self.counts.add(&other.counts);
+        self.failures.extend(other.failures);
+        self.failures.sort_unstable();
+        self.failures.truncate(LISTED);
+    }
+
+    /// Index and raw score of each row: what later rounds need to know.
+    #[must_use]
+    pub fn seed(&self) -> Vec<(u64, f64)> {
+        self.rows.iter().map(|row| (row.index, row.score)).collect()
+    }
+
+    /// The result of a search, from all of its rounds over records of so many samples.
+    #[must_use]
+    pub fn outcome(mut self, norm: Norm, samples: usize) -> Outcome {
+        self.counts.kept = self.rows.len() as u64;
+        self.counts.beaten = self.counts.beaten.saturating_sub(self.counts.kept);
+        for row in &mut self.rows {
+            row.score = score(norm, row.score, samples);
+        }
+        Outcome { rows: self.rows, counts: self.counts, failures: self.failures }
+    }
+}
+
+impl Counts {
+    fn add(&mut self, other: &Self) {
+        for (sum, n) in [
+            (&mut self.candidates, other.candidates),
+            (&mut self.kept, other.kept),
+            (&mut self.beaten, other.beaten),
+            (&mut self.bounded, other.bounded),
+            (&mut self.stopped, other.stopped),
+            (&mut self.singular, other.singular),
+            (&mut self.diverged, other.diverged),
+        ] {
+            *sum = sum.saturating_add(n);
+        }
+    }
+
+    /// Candidates dealt with.
+    #[must_use]
+    pub fn done(&self) -> u64 {
+        [self.kept, self.beaten, self.bounded, self.stopped, self.singular, self.diverged]
+            .iter()
+            .fold(0, |sum, n| sum.saturating_add(*n))
+    }
+}
+
+/// Where a stretch of rounds stands.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Place {
+    /// Number of the round; those of the stretch before it are done.
+    pub round: u64,
+    /// How many of its open candidates have been followed, in order of visiting.
+    pub followed: u64,
+    /// End and length of the batch that this lies in; 0 if the round has not been screened.
+    pub end: u64,
+    /// See `end`.
+    pub size: u64,
+    /// The limit of that batch.
+    pub limit: f64,
+}
+
+impl Place {
+    fn start(round: u64) -> Self {
+        Self { round, followed: 0, end: 0, size: 0, limit: f64::INFINITY }
+    }
+}
+
+/// A stretch of rounds, half done.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Checkpoint {
+    /// Where it stands.
+    pub place: Place,
+    /// What it came to so far. A checkpoint that is taken holds only the rows found since the one before; one to go on
+    /// from must hold all of them.
+    pub part: Part,
 }
 
 /// What one candidate came to, in raw sums (Σ|e| or Σe²).
@@ -699,12 +823,8 @@ impl Problem {
     }
 
     /// A raw sum in the norm asked for.
-    #[allow(clippy::cast_precision_loss)]
     pub(crate) fn score(&self, raw: f64) -> f64 {
-        match self.options.norm {
-            Norm::L1 => raw,
-            Norm::L2 => (raw / self.samples as f64).sqrt(),
-        }
+        score(self.options.norm, raw, self.samples)
     }
 
     fn row(&self, index: u64, raw: f64, initial: usize, scratch: &Scratch) -> Row {
@@ -937,6 +1057,16 @@ fn gcd(a: u64, b: u64) -> u64 {
     }
 }
 
+/// A raw sum in the norm asked for.
+#[allow(clippy::cast_precision_loss)]
+#[must_use]
+pub fn score(norm: Norm, raw: f64, samples: usize) -> f64 {
+    match norm {
+        Norm::L1 => raw,
+        Norm::L2 => (raw / samples as f64).sqrt(),
+    }
+}
+
 /// The kept rows so far.
 struct Kept {
     rows: Vec<Row>,
@@ -950,10 +1080,20 @@ impl Kept {
         Self { rows: Vec::new(), keep, limit }
     }
 
-    /// Takes rows in and lowers the limit where `stopping` allows it.
-    fn take(&mut self, rows: impl Iterator<Item = Row>, stopping: bool) {
+    /// Takes rows in.
+    fn take(&mut self, rows: impl Iterator<Item = Row>) {
         self.rows.extend(rows);
         trim(&mut self.rows, self.keep);
+    }
+
+    /// Whether this row is among them.
+    fn holds(&self, row: &Row) -> bool {
+        let place = self.rows.partition_point(|r| r.score.total_cmp(&row.score).then(r.index.cmp(&row.index)).is_lt());
+        self.rows.get(place).is_some_and(|r| r.index == row.index)
+    }
+
+    /// Lowers the limit to the worst row where `stopping` allows it.
+    fn lower(&mut self, stopping: bool) {
         if stopping && self.rows.len() == self.keep {
             self.limit = self.limit.min(self.rows[self.keep - 1].score);
         }
@@ -969,18 +1109,28 @@ struct Open {
     guess: f64,
 }
 
-/// One search over a lattice.
-struct Hunt<'a> {
+/// A search over a lattice, ready for its rounds.
+pub struct Search<'a> {
     problem: Problem,
-    lattice: &'a Lattice,
+    lattice: Cow<'a, Lattice>,
     /// Column of each value of each term, per block of the lattice.
     tables: Vec<Vec<Vec<usize>>>,
+    options: Options,
+    /// No candidate above this raw score can be kept, as far as scouts can tell.
+    limit: f64,
+}
+
+/// Some rounds of a search at work.
+struct Hunt<'a> {
+    problem: &'a Problem,
+    lattice: &'a Lattice,
+    tables: &'a [Vec<Vec<usize>>],
     options: &'a Options,
     control: &'a Control,
     pool: &'a rayon::ThreadPool,
     scratches: Scratches,
-    counts: Counts,
-    failures: Vec<(u64, Failure)>,
+    /// Of the rounds done, and of the candidates done in this one but for its rows.
+    part: Part,
 }
 
 /// [`Hunt::screen`] as a kernel.
@@ -1122,80 +1272,115 @@ impl Hunt<'_> {
         cursor.each(changed, |term, digit| terms[term] = table[term][digit]);
     }
 
-    /// Follows open candidates in this order; what is learnt goes to `kept`, and to the counts if `counted`.
-    fn follow(&mut self, open: &[Open], kept: &mut Kept, counted: bool) -> Result<()> {
-        let (mut start, mut size) = (0, FOLLOWED.0);
-        while start < open.len() {
-            let end = open.len().min(start + size);
-            let limit = kept.limit;
-            let this = &*self;
-            let visit = |candidate: &Open| {
-                if this.control.stop.load(Ordering::Relaxed) {
-                    return None;
-                }
-                if candidate.bound > limit {
-                    return Some((candidate.index, Verdict::Bounded(candidate.bound), None));
-                }
-                this.scratches.with(|scratch| {
-                    let mut positions = std::mem::take(&mut scratch.positions);
-                    let mut initial = std::mem::take(&mut scratch.initial);
-                    let cursor = Cursor::at(this.lattice, candidate.index);
-                    positions.clear();
-                    positions.resize(this.lattice.width(), 0);
-                    this.positions(&cursor, &mut positions);
-                    this.initial(&cursor, &mut initial);
-                    let verdict = this.problem.evaluate(&positions, &initial, limit, false, scratch, this.control);
-                    let row = match verdict {
-                        Verdict::Score(raw) if raw <= limit => {
-                            Some(this.problem.row(candidate.index, raw, initial.len(), scratch))
-                        }
-                        _ => None,
-                    };
-                    scratch.positions = positions;
-                    scratch.initial = initial;
-                    if counted {
-                        this.done(1, u64::from(matches!(verdict, Verdict::Stopped(_))));
-                    }
-                    Some((candidate.index, verdict, row))
-                })
-            };
-            let results: Vec<_> =
-                self.pool.install(|| open[start..end].par_iter().with_min_len(4).map(visit).collect());
-            self.check_stop()?;
-            let mut rows = Vec::new();
-            for (index, verdict, row) in results.into_iter().flatten() {
-                if counted {
-                    self.count(index, verdict);
-                }
-                rows.extend(row);
-            }
-            kept.take(rows.into_iter(), self.options.early_stopping);
-            start = end;
-            size = (2 * size).min(FOLLOWED.1);
+    /// Follows open candidates in this order from a place on; what is learnt goes to `kept`, and to the counts and
+    /// checkpoints if `counted`.
+    fn follow(&mut self, open: &[Open], kept: &mut Kept, mut place: Place, counted: bool) -> Result<()> {
+        if open.is_empty() {
+            return Ok(());
         }
-        Ok(())
+        let saving = counted && self.control.saving.load(Ordering::Relaxed);
+        let piece =
+            if saving { (PIECE / self.problem.samples.max(1)).max(4 * self.scratches.0.len()) } else { usize::MAX };
+        let batch = |at: u64| usize::try_from(at).unwrap_or(usize::MAX).min(open.len());
+        if place.end == 0 {
+            place.size = FOLLOWED.0;
+            place.end = batch(place.size) as u64;
+            place.limit = kept.limit;
+        }
+        loop {
+            let limit = place.limit;
+            kept.limit = limit;
+            while place.followed < place.end {
+                let (start, end) = (batch(place.followed), batch(place.end));
+                let end = end.min(start.saturating_add(piece));
+                let rows = self.follow_some(&open[start..end], limit, counted)?;
+                place.followed = end as u64;
+                if saving {
+                    kept.take(rows.iter().cloned());
+                    self.part.failures.sort_unstable();
+                    self.part.failures.truncate(LISTED);
+                    let rows = rows.into_iter().filter(|row| kept.holds(row)).collect();
+                    let part = Part { rows, counts: self.part.counts, failures: self.part.failures.clone() };
+                    self.control.save(Checkpoint { place, part });
+                } else {
+                    kept.take(rows.into_iter());
+                }
+            }
+            kept.lower(self.options.early_stopping);
+            if batch(place.end) == open.len() {
+                return Ok(());
+            }
+            place.size = place.size.saturating_mul(2).min(FOLLOWED.1);
+            place.end = batch(place.end.saturating_add(place.size)) as u64;
+            place.limit = kept.limit;
+        }
+    }
+
+    /// Follows these candidates up to a limit: the rows they make.
+    fn follow_some(&mut self, open: &[Open], limit: f64, counted: bool) -> Result<Vec<Row>> {
+        let this = &*self;
+        let visit = |candidate: &Open| {
+            if this.control.stop.load(Ordering::Relaxed) {
+                return None;
+            }
+            if candidate.bound > limit {
+                return Some((candidate.index, Verdict::Bounded(candidate.bound), None));
+            }
+            this.scratches.with(|scratch| {
+                let mut positions = std::mem::take(&mut scratch.positions);
+                let mut initial = std::mem::take(&mut scratch.initial);
+                let cursor = Cursor::at(this.lattice, candidate.index);
+                positions.clear();
+                positions.resize(this.lattice.width(), 0);
+                this.positions(&cursor, &mut positions);
+                this.initial(&cursor, &mut initial);
+                let verdict = this.problem.evaluate(&positions, &initial, limit, false, scratch, this.control);
+                let row = match verdict {
+                    Verdict::Score(raw) if raw <= limit => {
+                        Some(this.problem.row(candidate.index, raw, initial.len(), scratch))
+                    }
+                    _ => None,
+                };
+                scratch.positions = positions;
+                scratch.initial = initial;
+                if counted {
+                    this.done(1, u64::from(matches!(verdict, Verdict::Stopped(_))));
+                }
+                Some((candidate.index, verdict, row))
+            })
+        };
+        let results: Vec<_> = self.pool.install(|| open.par_iter().with_min_len(4).map(visit).collect());
+        self.check_stop()?;
+        let mut rows = Vec::new();
+        for (index, verdict, row) in results.into_iter().flatten() {
+            if counted {
+                self.count(index, verdict);
+            }
+            rows.extend(row);
+        }
+        Ok(rows)
     }
 
     fn count(&mut self, index: u64, verdict: Verdict) {
         match verdict {
-            Verdict::Score(_) => self.counts.beaten += 1,
+            Verdict::Score(_) => self.part.counts.beaten += 1,
             Verdict::Bounded(_) => {
-                self.counts.bounded += 1;
+                self.part.counts.bounded += 1;
                 self.done(1, 1);
             }
-            Verdict::Stopped(_) => self.counts.stopped += 1,
+            Verdict::Stopped(_) => self.part.counts.stopped += 1,
             Verdict::Failed(failure) => {
                 match failure {
-                    Failure::Singular => self.counts.singular += 1,
-                    Failure::Diverged => self.counts.diverged += 1,
+                    Failure::Singular => self.part.counts.singular += 1,
+                    Failure::Diverged => self.part.counts.diverged += 1,
                 }
-                self.failures.push((index, failure));
+                self.part.failures.push((index, failure));
             }
         }
     }
 
     /// Tries some candidates all over the lattice: the first limit, and the test vectors that exclude most.
-    fn scout(&mut self) -> Result<f64> {
+    fn scout(&mut self) -> Result<(f64, Option<Vec<usize>>)> {
         let count = self.lattice.count();
         let order = visit(count);
         let indices: Vec<u64> = (0..count.min(SCOUTS)).map(order).collect();
@@ -1239,14 +1424,56 @@ impl Hunt<'_> {
         by_guess(&mut likely);
         likely.truncate(4 * self.options.keep.max(16));
         let mut kept = Kept::new(self.options.keep, f64::INFINITY);
-        self.follow(&likely, &mut kept, false)?;
+        self.follow(&likely, &mut kept, Place::start(0), false)?;
         let limit = kept.limit;
-        if let Some(bound) = self.problem.bound.take() {
+        let which = self.problem.bound.as_ref().map(|bound| {
             let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
-            let which = choose(&each, bound.len(), limit);
-            self.problem.bound = Some(bound.chosen(&which));
+            choose(&each, bound.len(), limit)
+        });
+        Ok((limit, which))
+    }
+
+    /// Screens a round and follows what is open, from a place on: its rows.
+    fn round(&mut self, bounds: (u64, u64), kept: &mut Kept, place: Place) -> Result<()> {
+        let (start, end) = bounds;
+        let (limit, resumed) = (kept.limit, place.end > 0);
+        let this = &*self;
+        let parts: Vec<(Vec<Open>, Vec<u64>)> = self.pool.install(|| {
+            (0..(end - start).div_ceil(CHUNK))
+                .into_par_iter()
+                .map(|chunk| {
+                    let (lo, hi) = (start + chunk * CHUNK, end.min(start + (chunk + 1) * CHUNK));
+                    if this.control.stop.load(Ordering::Relaxed) {
+                        return Default::default();
+                    }
+                    let found = lanes::widest(Screening { hunt: this, lo, hi, limit });
+                    let closed = hi - lo - (found.0.len() + found.1.len()) as u64;
+                    if !resumed {
+                        this.done(closed + found.1.len() as u64, closed);
+                    }
+                    found
+                })
+                .collect()
+        });
+        self.check_stop()?;
+        let mut open: Vec<Open> = Vec::new();
+        let mut singular: Vec<u64> = Vec::new();
+        for (found, failed) in parts {
+            open.extend(found);
+            singular.extend(failed);
         }
-        Ok(limit)
+        if !resumed {
+            let failed = singular.len() as u64;
+            self.part.counts.singular += failed;
+            self.part.counts.bounded += end - start - open.len() as u64 - failed;
+            self.part.failures.extend(singular.into_iter().take(LISTED).map(|index| (index, Failure::Singular)));
+        }
+        if place.end > open.len() as u64 || place.followed > place.end {
+            let what = format!("a checkpoint stands at {} of {} candidates to follow", place.followed, open.len());
+            return Err(Error::Structure { what, remedy: "start the search again".into() });
+        }
+        by_guess(&mut open);
+        self.follow(&open, kept, place, true)
     }
 }
 
@@ -1318,85 +1545,168 @@ pub fn search(
     options: &Options,
     control: &Control,
 ) -> Result<Outcome> {
-    check_length("fixed coefficients", lattice.width(), fixed.len())?;
-    for record in records {
-        lattice.structure(0).check(record.len(), |_| true)?;
-    }
     let pool = pool(options.threads)?;
-    let mut index = Index::default();
-    let mut seen = HashSet::new();
-    for block in lattice.blocks() {
-        index_alpha(&mut index, block.alpha, &options.initial);
-        for (group, slice) in lattice.groups().iter().zip(&block.slices) {
-            for (axis, &first) in group.axes.iter().zip(&slice.first) {
-                for &order in &axis[first..] {
-                    index_orders(&mut index, &mut seen, block.alpha, group.signal, order, &options.initial);
+    let ready = Search::new(records, Cow::Borrowed(lattice), fixed, options, &pool, control)?;
+    let mut all = Part::default();
+    let mut first = 0;
+    for last in waves(rounds(lattice.count(), options)) {
+        let seed = all.seed();
+        all.join(ready.rounds(first, last, &seed, None, &pool, control)?, options.keep);
+        first = last;
+    }
+    Ok(all.outcome(options.norm, ready.problem.samples))
+}
+
+/// Candidates in a round of a search with these options.
+fn round_length(options: &Options) -> u64 {
+    let refined = matches!(options.estimator, Estimator::InstrumentalVariables(_));
+    if refined || !options.early_stopping {
+        ROUND_FOLLOWED
+    } else if options.criterion == Criterion::EquationError
+        && options.norm == Norm::L2
+        && options.initial == Initial::Rest
+    {
+        ROUND_PLAIN
+    } else {
+        ROUND_BOUNDED
+    }
+}
+
+/// Rounds of a search over so many candidates.
+#[must_use]
+pub fn rounds(candidates: u64, options: &Options) -> u64 {
+    candidates.div_ceil(round_length(options))
+}
+
+/// Where each wave of so many rounds ends: 1, 3, 7, …
+#[must_use]
+pub fn waves(rounds: u64) -> Vec<u64> {
+    let mut ends = Vec::new();
+    let mut end: u64 = 0;
+    while end < rounds {
+        end = end.saturating_mul(2).saturating_add(1).min(rounds);
+        ends.push(end);
+    }
+    ends
+}
+
+impl<'a> Search<'a> {
+    /// Builds what all rounds share: regressors, their products, test vectors and a first limit from scouts.
+    ///
+    /// # Errors
+    /// As [`search`].
+    pub fn new(
+        records: &[Record],
+        lattice: Cow<'a, Lattice>,
+        fixed: &[Option<f64>],
+        options: &Options,
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<Self> {
+        check_length("fixed coefficients", lattice.width(), fixed.len())?;
+        for record in records {
+            lattice.structure(0).check(record.len(), |_| true)?;
+        }
+        let mut index = Index::default();
+        let mut seen = HashSet::new();
+        for block in lattice.blocks() {
+            index_alpha(&mut index, block.alpha, &options.initial);
+            for (group, slice) in lattice.groups().iter().zip(&block.slices) {
+                for (axis, &first) in group.axes.iter().zip(&slice.first) {
+                    for &order in &axis[first..] {
+                        index_orders(&mut index, &mut seen, block.alpha, group.signal, order, &options.initial);
+                    }
                 }
             }
         }
-    }
-    index.sort();
-    let problem = Problem::new(records, lattice.output(), index, fixed, options)?;
-    let problem = pool.install(|| problem.with_bound(lattice.count()));
-    let tables = tables(lattice, &problem)?;
-    let count = lattice.count();
-    control.total.store(count, Ordering::Relaxed);
-    let mut hunt = Hunt {
-        problem,
-        lattice,
-        tables,
-        options,
-        control,
-        pool: &pool,
-        scratches: Scratches::new(options.threads),
-        counts: Counts { candidates: count, ..Counts::default() },
-        failures: Vec::new(),
-    };
-    hunt.check_stop()?;
-    let screened = hunt.problem.bound.is_some() || hunt.problem.plain.is_some();
-    let limit = if screened { hunt.scout()? } else { f64::INFINITY };
-    let mut kept = Kept::new(options.keep, limit);
-    for start in (0..count).step_by(ROUND as usize) {
-        let end = count.min(start + ROUND);
-        let limit = kept.limit;
-        let this = &hunt;
-        let parts: Vec<(Vec<Open>, Vec<u64>)> = pool.install(|| {
-            (0..(end - start).div_ceil(CHUNK))
-                .into_par_iter()
-                .map(|chunk| {
-                    let (lo, hi) = (start + chunk * CHUNK, end.min(start + (chunk + 1) * CHUNK));
-                    if this.control.stop.load(Ordering::Relaxed) {
-                        return Default::default();
-                    }
-                    let found = lanes::widest(Screening { hunt: this, lo, hi, limit });
-                    let closed = hi - lo - (found.0.len() + found.1.len()) as u64;
-                    this.done(closed + found.1.len() as u64, closed);
-                    found
-                })
-                .collect()
-        });
+        index.sort();
+        let problem = Problem::new(records, lattice.output(), index, fixed, options)?;
+        let problem = pool.install(|| problem.with_bound(lattice.count()));
+        let tables = tables(&lattice, &problem)?;
+        control.total.store(lattice.count(), Ordering::Relaxed);
+        let mut ready = Self { problem, lattice, tables, options: options.clone(), limit: f64::INFINITY };
+        let screened = ready.problem.bound.is_some() || ready.problem.plain.is_some();
+        let mut hunt = ready.hunt(pool, control);
         hunt.check_stop()?;
-        let mut open: Vec<Open> = Vec::new();
-        let singular_before = hunt.counts.singular;
-        for (found, singular) in parts {
-            open.extend(found);
-            hunt.counts.singular += singular.len() as u64;
-            let room = LISTED.saturating_sub(hunt.failures.len());
-            hunt.failures.extend(singular.into_iter().take(room).map(|index| (index, Failure::Singular)));
+        if screened {
+            let (limit, which) = hunt.scout()?;
+            ready.limit = limit;
+            if let (Some(bound), Some(which)) = (ready.problem.bound.take(), which) {
+                ready.problem.bound = Some(bound.chosen(&which));
+            }
         }
-        hunt.counts.bounded += end - start - open.len() as u64 - (hunt.counts.singular - singular_before);
-        by_guess(&mut open);
-        hunt.follow(&open, &mut kept, true)?;
-        hunt.failures.sort_unstable();
-        hunt.failures.truncate(LISTED);
+        Ok(ready)
     }
-    let Hunt { problem, mut counts, failures, .. } = hunt;
-    counts.kept = kept.rows.len() as u64;
-    counts.beaten -= counts.kept;
-    for row in &mut kept.rows {
-        row.score = problem.score(row.score);
+
+    fn hunt<'b>(&'b self, pool: &'b rayon::ThreadPool, control: &'b Control) -> Hunt<'b> {
+        Hunt {
+            problem: &self.problem,
+            lattice: &self.lattice,
+            tables: &self.tables,
+            options: &self.options,
+            control,
+            pool,
+            scratches: Scratches::new(pool.current_num_threads()),
+            part: Part::default(),
+        }
     }
-    Ok(Outcome { rows: kept.rows, counts, failures })
+
+    /// Does rounds `first … last − 1` of one wave.
+    ///
+    /// `seed` gives index and raw score of the rows kept before the wave. `from` goes on from a checkpoint of the same
+    /// stretch and seed that holds all rows found since its start.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`], or rounds, seed or checkpoint that do not fit this search.
+    pub fn rounds(
+        &self,
+        first: u64,
+        last: u64,
+        seed: &[(u64, f64)],
+        from: Option<Checkpoint>,
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<Part> {
+        let count = self.lattice.count();
+        let (all, length) = (rounds(count, &self.options), round_length(&self.options));
+        let from = from.unwrap_or_else(|| Checkpoint { place: Place::start(first), part: Part::default() });
+        if !(first <= from.place.round && from.place.round <= last && last <= all) {
+            let what = format!("rounds {first} to {last} from {} on are not among {all}", from.place.round);
+            return Err(Error::Structure { what, remedy: "start the search again".into() });
+        }
+        // Rounds are spread over the lattice, so that early waves see all of it and later ones get a good limit.
+        let order = visit(all);
+        let mut hunt = self.hunt(pool, control);
+        let Checkpoint { mut place, part } = from;
+        control.total.store(count, Ordering::Relaxed);
+        hunt.done(part.counts.done(), 0);
+        hunt.part = part;
+        let width = self.lattice.width();
+        if hunt.part.rows.iter().any(|row| row.coefficients.len() != width || row.index >= count) {
+            let what = "a checkpoint holds rows of another search".into();
+            return Err(Error::Structure { what, remedy: "start the search again".into() });
+        }
+        while place.round < last {
+            let start = order(place.round) * length;
+            let bounds = (start, count.min(start + length));
+            let own = |row: &Row| bounds.0 <= row.index && row.index < bounds.1;
+            let mut kept = Kept::new(self.options.keep, self.limit);
+            let seeds = seed.iter().map(|&(index, score)| Row { index, score, coefficients: vec![], initial: vec![] });
+            kept.take(seeds);
+            kept.lower(self.options.early_stopping);
+            kept.take(hunt.part.rows.iter().filter(|row| own(row)).cloned());
+            hunt.part.rows.retain(|row| !own(row));
+            hunt.round(bounds, &mut kept, place)?;
+            let part = Part {
+                rows: kept.rows.into_iter().filter(own).collect(),
+                counts: Counts { candidates: bounds.1 - bounds.0, ..Counts::default() },
+                failures: Vec::new(),
+            };
+            hunt.part.join(part, self.options.keep);
+            place = Place::start(place.round + 1);
+        }
+        Ok(hunt.part)
+    }
 }
 
 /// The column of every value of every term, per block, so that a candidate costs no look-up.

@@ -666,3 +666,58 @@ proptest! {
         prop_assert!(best(make(&[1.2, 1.6, 2.0])) <= best(make(&[1.2, 1.6])) * (1.0 + 1e-6));
     }
 }
+
+#[test]
+fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
+    use ftlm::search::run::{Part, Search};
+    use std::borrow::Cow;
+    use std::sync::atomic::Ordering::Relaxed;
+
+    let mut stopped = 0;
+    for (seed, early_stopping) in [(1, false), (2, true), (3, false)] {
+        let problem = long_problem();
+        let lattice = &problem.lattice;
+        let options = Options { early_stopping, keep: 7, ..problem.options.clone() };
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(2).build().unwrap();
+        let run = |ready: &Search<'_>, from, control: &Control| ready.rounds(0, 1, &[], from, &pool, control);
+        let control = Control::default();
+        let fixed = vec![None; lattice.width()];
+        let ready = Search::new(&problem.records, Cow::Borrowed(lattice), &fixed, &options, &pool, &control).unwrap();
+        let whole = run(&ready, None, &control).unwrap();
+        let mut random = Random::new(seed);
+        for _ in 0..3 {
+            let mut rows = Vec::new();
+            let mut from = None;
+            let part: Part = loop {
+                let control = Control::default();
+                control.saving.store(true, Relaxed);
+                let end = 1 + random.below(6000) as u64;
+                let finished = std::sync::atomic::AtomicBool::new(false);
+                let (finished, watched) = (&finished, &control);
+                let found = std::thread::scope(|scope| {
+                    scope.spawn(move || {
+                        while watched.done.load(Relaxed) < end && !finished.load(Relaxed) {
+                            std::thread::yield_now();
+                        }
+                        watched.stop.store(true, Relaxed);
+                    });
+                    let found = run(&ready, from.clone(), &control);
+                    finished.store(true, Relaxed);
+                    found
+                });
+                match found {
+                    Ok(part) => break part,
+                    Err(error) => assert_eq!(error, ftlm::error::Error::Interrupted),
+                }
+                stopped += 1;
+                if let Some(mut checkpoint) = control.take() {
+                    rows.append(&mut checkpoint.part.rows);
+                    checkpoint.part.rows.clone_from(&rows);
+                    from = Some(checkpoint);
+                }
+            };
+            assert_eq!(part, whole);
+        }
+    }
+    assert!(stopped > 0);
+}

@@ -1,0 +1,425 @@
+"""The search store: the same bytes after any interruption, and never a wrong row out of a cut or damaged file."""
+
+import contextlib
+import errno
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+
+import ftlm
+import store as bench
+from ftlm import _core
+from ftlm.store import MAGIC, Store, read_store
+
+EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
+COARSE = ftlm.lattice(step=0.1)
+
+
+@pytest.fixture(scope="module")
+def run(small_run, with_noise):
+    return with_noise(small_run, 0.003, 1)
+
+
+def search(run, path=None, *, lattice=COARSE, **options):
+    """Brute force has the shortest rounds: five of them, in three waves."""
+    options = {"m": 32, "early_stopping": False, **options}
+    return ftlm.search_orders(run, ftlm.equation(EQUATION, initial="rest"), lattice, store=path, **options)
+
+
+def bytes_of(found):
+    return json.dumps(found.to_dict()) + str(found.model) + repr(found.failures)
+
+
+@pytest.fixture(scope="module")
+def expected(run):
+    return bytes_of(search(run))
+
+
+@pytest.fixture(scope="module")
+def whole(run, tmp_path_factory):
+    """Bytes of a complete store."""
+    path = tmp_path_factory.mktemp("store") / "whole.ftlm"
+    search(run, path)
+    return path.read_bytes()
+
+
+def rows_of(contents):
+    parts = [part for _, part in contents.sections[0].done.values()]
+    parts += [half.checkpoint[1] for half in contents.sections[0].open.values()]
+    return [row for rows, _, _ in parts for row in rows]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The same table
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"early_stopping": True},
+        {"early_stopping": True, "criterion": "equation-error", "norm": "l2", "rows": "time"},
+        {"coefficients": "least-squares", "norm": "l2", "keep": 3, "threads": 3},
+        {"early_stopping": True, "coefficients": "instrumental-variables", "lattice": ftlm.lattice(step=0.2)},
+    ],
+)
+def test_a_search_with_a_store_is_the_search_without(run, tmp_path, options):
+    path = tmp_path / "s.ftlm"
+    expected = bytes_of(search(run, **options))
+    assert bytes_of(search(run, path, **options)) == expected
+    size = path.stat().st_size
+    assert bytes_of(search(run, path, **options)) == expected
+    assert bytes_of(ftlm.resume_search(path)["y"]) == expected
+    assert path.stat().st_size == size
+    status = ftlm.search_status(path)["y"]
+    assert status.complete
+    assert status.candidates == search(run, **options).candidates
+    assert status.best == pytest.approx(search(run, **options).score, rel=1e-15)
+
+
+def test_several_runs_a_delay_and_a_sensor_filter_survive_in_a_store(run, tmp_path):
+    structure = ftlm.equation(
+        "D^alpha y = a D^beta y + b u", delay={"u": 0.01}, sensor_filter=ftlm.SensorFilter.low_pass(["y"])
+    )
+    path = tmp_path / "s.ftlm"
+    runs = [run, run.slice(1.0, 6.0)]
+    found = ftlm.search_orders(runs, structure, m=128, store=path)
+    assert bytes_of(found) == bytes_of(ftlm.search_orders(runs, structure, m=128))
+    assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(found)
+
+
+def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
+    """R4: any number of threads, any stretch of rounds, in any order."""
+    from ftlm.order_search import make_job
+
+    job = make_job(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
+    work, _ = job.work()
+    count, ends = work.plan()
+    assert count == 19_295
+    assert ends == [1, 3, 5]
+    ready = work.ready()
+    tables = []
+    for threads, cuts in ((1, [1, 3, 5]), (2, [1, 2, 3, 4, 5]), (3, [1, 3, 4, 5]), (8, [1, 3, 5])):
+        parts, seed, first = [], [], 0
+        waves = []
+        for last in cuts:
+            waves.append(ready.rounds(first, last, seed, None, threads, None, None))
+            if last in ends:
+                parts += waves[::-1]
+                waves = []
+                seed = sorted([(r[0], r[1]) for p in parts for r in p[0]], key=lambda r: r[::-1])[:20]
+            first = last
+        tables.append(work.join(parts))
+    assert all(repr(t) == repr(tables[0]) for t in tables)
+
+
+def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, clean_a, monkeypatch):
+    from typer.testing import CliRunner
+
+    from ftlm.cli import app
+
+    data, path = tmp_path / "a.csv", str(tmp_path / "s.ftlm")
+    clean_a.to_csv(data)
+    common = ["--structure", "flexible-link:1", "--step", "0.25", "--m", "128", "--json"]
+    call = ["search", str(data), *common]
+    plain = CliRunner().invoke(app, call)
+    kept = CliRunner().invoke(app, [*call, "--store", path])
+    resumed = CliRunner().invoke(app, ["resume", path, "--json"])
+    assert [r.exit_code for r in (plain, kept, resumed)] == [0, 0, 0], kept.output + resumed.output
+    assert plain.stdout == kept.stdout == resumed.stdout
+    status = CliRunner().invoke(app, ["status", path, "--json"])
+    assert {n: s["complete"] for n, s in json.loads(status.stdout).items()} == {"theta11": True, "theta12": True}
+    assert "100.0 %" in CliRunner().invoke(app, ["status", path]).stdout
+    other = CliRunner().invoke(app, [*call, "--store", path, "--keep", "5"])
+    assert other.exit_code == 3
+    assert "other settings: keep = 5" in other.stderr
+    law = CliRunner().invoke(app, [*call, "--laws", "orders", "--store", str(tmp_path / "l.ftlm")])
+    assert law.exit_code == 2
+    assert "joined from tables in memory" in law.stderr
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Interruptions
+
+
+def test_kill_loses_no_finished_work_and_changes_no_byte():
+    lost, _, same = bench.kills(3)
+    assert len(lost) == 3
+    assert same
+
+
+@pytest.mark.slow
+def test_fifty_kills():
+    lost, ended, same = bench.kills(50)
+    print(f"\n{len(lost)} kills, {ended} searches ended, worst loss {max(lost):.3f} s")
+    assert same
+
+
+def test_control_c_leaves_a_store_that_goes_on(tmp_path):
+    data, path = tmp_path / "a.csv", tmp_path / "s.ftlm"
+    bench.run().to_csv(data)
+    # With the handler that a terminal's shell leaves.
+    start = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); import ftlm.cli; ftlm.cli.main()"
+    call = [sys.executable, "-c", start, "search", str(data), "--structure", EQUATION, "--step", "0.1", "--m", "2048"]
+    call += ["--coefficients", "least-squares", "--norm", "l2", "--initial", "rest"]
+    environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+    with subprocess.Popen(
+        [*call, "--store", str(path)], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment,
+    ) as child:  # fmt: skip
+        try:
+            while child.poll() is None and not (path.exists() and path.stat().st_size > len(MAGIC)):
+                pass
+            child.send_signal(signal.SIGINT)
+            _, errors = child.communicate(timeout=60)
+        finally:
+            child.kill()
+    # A search that was faster than the signal has ended well.
+    assert child.returncode in (0, 130), errors
+    if child.returncode == 130:
+        assert f"interrupted; go on with: ftlm resume {path}" in errors
+    resumed = subprocess.run([sys.executable, "-m", "ftlm", "resume", path, "--json"], capture_output=True, check=True)
+    plain = subprocess.run([*call, "--json"], capture_output=True, check=True)
+    assert resumed.stdout == plain.stdout
+
+
+def test_a_store_cut_at_any_byte_holds_only_right_rows_and_goes_on(run, whole, expected, tmp_path):
+    path = tmp_path / "cut.ftlm"
+    path.write_bytes(whole)
+    rows = set(rows_of(read_store(path)))
+    begun = 0
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        if not begun:
+            with contextlib.suppress(ftlm.DataError):
+                read_store(path)
+                begun = size
+        if not begun:
+            with pytest.raises(ftlm.DataError, match="before its first frame"):
+                read_store(path)
+            continue
+        found = read_store(path)
+        assert set(rows_of(found)) <= rows
+        assert found.damage is None
+        assert found.end + found.torn == size
+    for size in [0, 7, len(MAGIC), begun - 1, *range(begun, len(whole), 311)]:
+        path.write_bytes(whole[:size])
+        assert bytes_of(search(run, path)) == expected
+        if size >= begun:
+            path.write_bytes(whole[: size - 1] if size > begun else whole[:size])
+            assert bytes_of(ftlm.resume_search(path)["y"]) == expected
+
+
+@pytest.mark.parametrize("mask", [0xFF, 0x01])
+def test_a_store_flipped_at_any_byte_never_gives_a_wrong_row(whole, tmp_path, mask):
+    path = tmp_path / "flipped.ftlm"
+    path.write_bytes(whole)
+    rows = rows_of(read_store(path))
+    for at in range(len(whole)):
+        flipped = bytearray(whole)
+        flipped[at] ^= mask
+        path.write_bytes(flipped)
+        try:
+            found = read_store(path)
+        except ftlm.DataError:
+            continue
+        got = rows_of(found)
+        assert got == rows[: len(got)]
+        assert len(got) < len(rows)
+        assert found.end <= at
+        if found.damage is None:
+            assert found.torn == len(whole) - found.end
+        else:
+            assert f"at byte {found.end}" in found.damage
+
+
+def test_damage_is_reported_with_its_offset_and_salvaged_on_demand(run, whole, expected, tmp_path):
+    path = tmp_path / "s.ftlm"
+    path.write_bytes(whole)
+    with Store(path) as kept:
+        second = kept.contents.sections[0].done[1]
+    assert second[0] == 3
+    damaged = bytearray(whole)
+    # Within the first round's frame: the last two frames follow it.
+    at = len(whole) - len(whole) // 3
+    damaged[at] ^= 4
+    path.write_bytes(damaged)
+    end = read_store(path).end
+    for again in (lambda: search(run, path), lambda: ftlm.resume_search(path)):
+        with pytest.raises(ftlm.DataError, match=f"is damaged: the frame at byte {end} .*--salvage"):
+            again()
+    assert path.read_bytes() == damaged
+    assert "damaged" in str(ftlm.search_status(path)["y"])
+    assert bytes_of(ftlm.resume_search(path, salvage=True)["y"]) == expected
+    assert (tmp_path / "s.ftlm.damaged").read_bytes() == damaged
+    assert bytes_of(ftlm.resume_search(path)["y"]) == expected
+
+
+def test_zeros_behind_the_last_frame_are_a_torn_tail(run, whole, expected, tmp_path):
+    path = tmp_path / "s.ftlm"
+    path.write_bytes(whole + bytes(4096))
+    assert ftlm.search_status(path)["y"].torn == 4096
+    with Store(path) as kept:
+        assert kept.notes == [f"4096 bytes of an unfinished write at byte {len(whole)} were dropped"]
+    assert path.read_bytes() == whole
+    assert bytes_of(search(run, path)) == expected
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What a store refuses
+
+
+def another(text):
+    equation = ftlm.equation(text, initial="rest")
+    return lambda run, path: ftlm.search_orders(run, equation, COARSE, m=32, early_stopping=False, store=path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda run, path: search(run.slice(0.0, 8.0), path), "asked is other data"),
+        (lambda run, path: search(run, path, m=64), "asked is other data"),
+        (lambda run, path: search(run, path, lattice=ftlm.lattice(step=0.2)), "asked is another lattice"),
+        (lambda run, path: search(run, path, norm="l2"), "asked is other settings: norm = l2"),
+        (another("D^alpha y = a D^beta y + c D^mu y + b u"), "asked is another equation"),
+        (another("D^alpha y = a D^beta y + c D^mu y + 5 D^nu u"), "asked is another equation"),
+    ],
+)
+def test_another_search_is_refused_and_leaves_the_store(run, whole, tmp_path, change, message):
+    path = tmp_path / "s.ftlm"
+    path.write_bytes(whole)
+    with pytest.raises(ftlm.DataError, match=message):
+        change(run, path)
+    assert path.read_bytes() == whole
+
+
+def test_a_second_writer_is_refused_and_readers_are_not(run, whole, expected, tmp_path):
+    path = tmp_path / "s.ftlm"
+    path.write_bytes(whole)
+    with Store(path):
+        for again in (lambda: search(run, path), lambda: ftlm.resume_search(path)):
+            with pytest.raises(ftlm.DataError, match="is in use by another search"):
+                again()
+        call = [sys.executable, "-m", "ftlm", "resume", str(path)]
+        other = subprocess.run(call, capture_output=True, text=True, check=False)
+        assert other.returncode == 3
+        assert "is in use by another search" in other.stderr
+        assert ftlm.search_status(path)["y"].complete
+    assert path.read_bytes() == whole
+    assert bytes_of(search(run, path)) == expected
+
+
+@pytest.mark.parametrize("room", [0, 40, 700])
+def test_a_full_disk_leaves_the_store_whole(run, expected, tmp_path, monkeypatch, room):
+    path = tmp_path / "s.ftlm"
+    begun = _header(run, path)
+    left = [room]
+    write = os.write
+
+    def full(handle, data):
+        if left[0] <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        written = write(handle, bytes(data)[: left[0]])
+        left[0] -= written
+        return written
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ftlm.store.os.write", full)
+        with pytest.raises(ftlm.DataError, match=r"cannot be written: No space left on device; what it holds is whole"):
+            search(run, path)
+    assert read_store(path).torn == 0
+    assert path.stat().st_size >= begun
+    assert bytes_of(search(run, path)) == expected
+
+
+def _header(run, path):
+    """A store whose search has only begun: its size."""
+    from ftlm.order_search import make_job
+
+    job = make_job(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
+    Store(path, [job.request("y")]).close()
+    return path.stat().st_size
+
+
+def test_a_limit_of_the_system_on_file_sizes_leaves_the_store_whole(run, expected, tmp_path):
+    path = tmp_path / "s.ftlm"
+    begun = _header(run, path)
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (begun + 100, before[1]))
+    try:
+        with pytest.raises(ftlm.DataError, match="File too large; what it holds is whole"):
+            search(run, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert path.stat().st_size == begun
+    assert bytes_of(search(run, path)) == expected
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"t,y\n0,1\n", "is no ftlm search store"),
+        (b"ftlm search store 2\n", "is no ftlm search store"),
+        (b"", "ends before its first frame"),
+        (MAGIC[:9], "ends before its first frame"),
+        (MAGIC + b"\x07\x00\x00\x00zzzz", "cannot be used: the frame at byte 20 has a damaged length"),
+    ],
+)
+def test_what_is_no_store_is_refused_and_kept(run, tmp_path, content, message):
+    path = tmp_path / "s.ftlm"
+    path.write_bytes(content)
+    calls = [lambda: ftlm.resume_search(path), lambda: ftlm.search_status(path)]
+    # An empty file and what is left of a store that never began may become one.
+    calls += [lambda: search(run, path)] if message.startswith(("is no", "cannot")) else []
+    for call in calls:
+        with pytest.raises(ftlm.DataError, match=message):
+            call()
+        assert path.read_bytes() == content
+
+
+def test_paths_that_hold_no_store_are_refused(run, tmp_path):
+    for path in (tmp_path / "missing.ftlm", tmp_path / "no" / "folder.ftlm", "nul\0"):
+        for call in (ftlm.resume_search, ftlm.search_status):
+            with pytest.raises(ftlm.DataError):
+                call(path)
+    for path in (tmp_path, tmp_path / "no" / "folder.ftlm", "nul\0"):
+        with pytest.raises(ftlm.DataError, match="cannot be opened"):
+            search(run, path)
+
+
+def test_the_core_refuses_checkpoints_and_parts_of_another_search(run):
+    from ftlm.order_search import make_job
+
+    job = make_job(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
+    work, _ = job.work()
+    ready = work.ready()
+    counts = (0, 0, 0, 0, 0, 0, 0)
+    row = (3, 1.0, (1.0, 2.0, 3.0), ((),))
+    for first, last, start in (
+        (0, 6, None),
+        (3, 2, None),
+        (0, 1, ((2, 0, 0, 0, 1.0), ((), counts, ()))),
+        (0, 1, ((0, 5, 4, 256, 1.0), ((), counts, ()))),
+        (0, 1, ((0, 0, 5000, 256, 1.0), ((), counts, ()))),
+        (0, 1, ((0, 0, 0, 0, 1.0), (((3, 1.0, (1.0,), ((),)),), counts, ()))),
+        (0, 1, ((0, 0, 0, 0, 1.0), (((1 << 60, 1.0, (1.0, 2.0, 3.0), ((),)),), counts, ()))),
+    ):
+        with pytest.raises(ftlm.ModelError, match="start the search again"):
+            ready.rounds(first, last, [], start, 1, None, None)
+    part = ready.rounds(0, 1, [], None, 1, None, None)
+    for parts in ([], [part], [part] * 5, [(((1 << 40, *row[1:]),), counts, ())], [((), (19_295, *counts[1:]), ())]):
+        with pytest.raises(ftlm.ModelError, match="start the search again"):
+            work.join(parts)
+    with pytest.raises(ftlm.ModelError, match="threads"):
+        ready.rounds(0, 1, [], None, 0, None, None)
+    assert isinstance(ready, _core.OrderSearch)
+    with ThreadPoolExecutor(2) as pool:
+        again = list(pool.map(lambda _: ready.rounds(0, 1, [], None, 1, None, None), range(4)))
+    assert all(a == part for a in again)
+    assert np.isfinite(part[0][0][1])
