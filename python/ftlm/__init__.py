@@ -10,6 +10,7 @@ from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, M
 from ftlm.files import load
 from ftlm.flexible_link import PARAMETERS, LinkParameters, flexible_link, link_model, order_law
 from ftlm.identification import Identification, Trace, identify, multi_innovation_trace
+from ftlm.many import Identified, identify_many
 from ftlm.models import Equation, Estimate, Model, Order, SensorFilter, Structure, Term, equation, load_model
 from ftlm.operators import (
     block_pulse_matrix,
@@ -46,6 +47,7 @@ __all__ = [
     "Estimate",
     "FtlmError",
     "Identification",
+    "Identified",
     "InformationCriteria",
     "InternalError",
     "Lattice",
@@ -78,6 +80,7 @@ __all__ = [
     "haar_matrix",
     "haar_transform",
     "identify",
+    "identify_many",
     "information_criteria",
     "lattice",
     "link_model",

@@ -833,11 +833,15 @@ class _Answers:
         try:
             for entry in header.get("arrays", []):
                 rows, columns = int(entry["rows"]), int(entry["columns"])
+                if rows < 0 or columns < 0:
+                    return None
                 flat = np.frombuffer(self._content, dtype="<f8", count=rows * columns, offset=at)
                 matrix = flat.reshape((rows, columns), order="F").astype(np.float64, copy=False)
                 arrays.append((str(entry["name"]), str(entry["type"]), matrix))
                 at += 8 * rows * columns
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, TypeError, OverflowError):
+            return None
+        if not isinstance(header.get("skipped", {}), dict) or ("error" in header and "way_out" not in header):
             return None
         self._at = at
         return header, arrays

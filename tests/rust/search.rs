@@ -674,7 +674,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
     use std::sync::atomic::Ordering::Relaxed;
 
     let mut stopped = 0;
-    for (seed, early_stopping) in [(1, false), (2, true), (3, false)] {
+    for (seed, early_stopping) in [(1, false), (2, true)] {
         let problem = long_problem();
         let lattice = &problem.lattice;
         let options = Options { early_stopping, keep: 7, ..problem.options.clone() };
@@ -685,7 +685,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
         let ready = Search::new(&problem.records, Cow::Borrowed(lattice), &fixed, &options, &pool, &control).unwrap();
         let whole = run(&ready, None, &control).unwrap();
         let mut random = Random::new(seed);
-        for _ in 0..2 {
+        {
             let mut rows = Vec::new();
             let mut from = None;
             let part: Part = loop {
