@@ -820,7 +820,9 @@ def fit_output_error(
         while True:
             coarse = thinned(alike, level)
             reached = race(attempts, FIRST_LAP)
-            if not reached or level >= FINEST or not grid_matters(problem, thinned, alike, initial, reached[0], level):
+            # A stiff equation may have no stable scheme, and so no start, on a coarse grid.
+            settled = bool(reached) and not grid_matters(problem, thinned, alike, initial, reached[0], level)
+            if settled or level >= FINEST:
                 break
             # The coarse grid has optima of its own: once more from the same starts, on half the step.
             level *= 2
