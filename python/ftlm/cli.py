@@ -621,9 +621,7 @@ def search(
     )  # fmt: skip
     options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
     runs = load_runs(files, sliced, **options)
-    parts = {"stage": wanted} if wanted.has_order_law else {
-        e.output: wanted.equation(e.output) for e in wanted.equations
-    }  # fmt: skip
+    parts = wanted.parts() or {e.output: wanted.equation(e.output) for e in wanted.equations}
     chosen = lattice_of(lattice, step)
     known = {"alpha", *wanted.order_names}
     for name in chosen.orders:

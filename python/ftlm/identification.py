@@ -423,10 +423,7 @@ def identify(
     searches: dict[str, SearchResult] = {}
     orders: dict[str, float] = {}
     if structure.order_names:
-        parts = {"stage": structure} if structure.has_order_law else {
-            e.output: structure.equation(e.output) for e in structure.equations if e.order_names
-        }  # fmt: skip
-        for name, part in parts.items():
+        for name, part in structure.parts().items():
             searches[name] = search_orders(
                 found, part, _lattice_of(lattice, part), criterion=criterion, coefficients=method, norm=norm,
                 innovation_length=innovation_length, prior_covariance=prior_covariance, rows=rows, m=m, keep=keep,

@@ -769,6 +769,49 @@ class Structure:
         names = [o.names[0] for o in orders]
         return any(not o.is_single for o in orders) or len(set(names)) < len(names)
 
+    def parts(self) -> dict[str, Structure]:
+        """What an order search takes one by one: equations that share no free order do not wait for one another.
+
+        Equations that an order law ties stay together, as ``"stage"`` where that is all of the structure, else under
+        the names of their outputs; any other equation is by itself, with measured coupling. Equations without free
+        orders are left out.
+        """
+        groups: list[tuple[set[str], list[Equation]]] = []
+        for item in self.equations:
+            names, together = set(item.order_names), [item]
+            for group in [g for g in groups if g[0] & names]:
+                names |= group[0]
+                together = group[1] + together
+                groups.remove(group)
+            groups.append((names, together))
+        out = {}
+        for names, together in groups:
+            single = len(together) == 1
+            if not names:
+                continue
+            if single and not replace(self, equations=tuple(together), coefficient_law=()).has_order_law:
+                out[together[0].output] = self.equation(together[0].output)
+                continue
+            if len(together) == len(self.equations):
+                return {"stage": self}
+            kept = replace(
+                self,
+                equations=tuple(together),
+                order_values={n: v for n, v in self.order_values.items() if n in names},
+                delay={},
+                free_delays={},
+                sensor_filter=None,
+                coefficient_law=(),
+            )
+            out[", ".join(e.output for e in together)] = replace(
+                kept,
+                delay={n: v for n, v in self.delay.items() if n in kept.signals},
+                free_delays={n: v for n, v in self.free_delays.items() if n in kept.signals},
+                sensor_filter=_narrowed(self.sensor_filter, kept.signals),
+                name=f"{self.name}, {', '.join(kept.outputs)}",
+            )
+        return out
+
     def equation(self, output: str) -> Structure:
         """One equation of this structure alone, with measured coupling and free of order laws.
 

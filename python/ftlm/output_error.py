@@ -674,6 +674,16 @@ def lattice_rows(
         terms = zip(item.terms, raw, strict=True)
         return {t.coefficient: c / t.factor for t, c in terms if isinstance(t.coefficient, str)}
 
+    stages = list(structure.parts().values()) if structure.has_order_law else []
+    if len(stages) > 1:
+        # Stages that share no order are searched one by one; the best of each belong together.
+        tables = [
+            lattice_rows(
+                problem, part, records, {n: v for n, v in axes.items() if n in part.order_names}, threads, keep=keep
+            )
+            for part in stages
+        ]
+        return merged_rows(tables, structure)
     if structure.has_order_law:
         names = list(axes)
 
@@ -714,6 +724,13 @@ def lattice_rows(
             every = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
             table.append(({o.names[0]: v for o, v in every if o.names}, coefficients(item, raw)))
         tables.append(table)
+    return merged_rows(tables, structure)
+
+
+def merged_rows(
+    tables: Sequence[Sequence[tuple[dict[str, float], dict[str, float]]]], structure: Structure
+) -> list[tuple[dict[str, float], dict[str, float]]]:
+    """Rows of independent tables side by side, rank by rank; a table that ends goes on with its last row."""
     rows = []
     for rank in range(max(len(t) for t in tables)):
         merged: tuple[dict[str, float], dict[str, float]] = ({}, {})

@@ -1,5 +1,7 @@
 """The paper's structure: order law, coefficient law, parameter sets and every option of the two-link arm."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -274,3 +276,65 @@ def test_both_stages_simulate_as_each_alone(plant, drive):
         alone = model.simulate(run, tolerance=1e-6)
         for name in model.outputs:
             np.testing.assert_allclose(found[name], alone[name], atol=2e-6 * np.abs(alone[name]).max())
+
+
+def arm_in_motion(rows, noise=0.0):
+    """Both stages under one square current; they do not drive each other in the model."""
+    from ftlm.demo import demo_plant
+
+    step = 0.002
+    current = np.where((np.arange(rows) * step + step / 2) % 2 < 1, 0.3, -0.3)
+    rng = np.random.default_rng(0)
+    outputs = {}
+    for stage in (1, 2):
+        names = [f"theta{stage}{k}" for k in (1, 2)]
+        blank = ftlm.Run.from_arrays(
+            step=step, inputs={f"I{stage}": current}, outputs={n: np.zeros(rows) for n in names}
+        )
+        clean = demo_plant(stage).simulate(blank, tolerance=1e-6)
+        outputs |= {n: clean[n] + noise * np.std(clean[n]) * rng.standard_normal(rows) for n in names}
+    return ftlm.Run.from_arrays(step=step, inputs={"I1": current, "I2": current}, outputs=outputs)
+
+
+def test_stages_that_share_no_order_are_parts_of_their_own():
+    both = ftlm.flexible_link(stage="both").with_delays({"I2": 0.01})
+    parts = both.parts()
+    assert list(parts) == ["theta11, theta12", "theta21, theta22"]
+    for stage, part in zip((1, 2), parts.values(), strict=True):
+        assert part.equations == ftlm.flexible_link(stage=stage).equations
+        assert part.order_names == ftlm.flexible_link(stage=stage).order_names
+    assert [p.delay for p in parts.values()] == [{}, {"I2": 0.01}]
+    assert list(ftlm.flexible_link(stage=1).parts()) == ["stage"]
+    assert list(ftlm.flexible_link(stage=1, laws=()).parts()) == ["theta11", "theta12"]
+    assert list(ftlm.equation("D^2 y = a D y + b u").parts()) == []
+    # One equation may carry a law by itself, and equations may share an order without one.
+    assert list(ftlm.equation("D^alpha y = a D^(alpha-nu) y + b D^nu u").parts()) == ["stage"]
+    mixed = ftlm.equation("D^alpha y = a D^nu x + b u; D^kappa x = c D^nu y + d u; D^rho z = e z + f u")
+    assert list(mixed.parts()) == ["y, x", "z"]
+
+
+def test_the_whole_arm_is_searched_stage_by_stage():
+    run = arm_in_motion(1025)
+    coarse = ftlm.lattice(
+        alpha=(1.9, 2.0), **{f"gamma{h}": (0.9, 1.0) for h in (1, 3)},
+        **{f"{n}{d}": v for d in (2, 4) for n, v in (("beta", (0.1, 0.2)), ("mu", (0.8, 0.9)))},
+    )  # fmt: skip
+    whole = ftlm.identify(run, ftlm.flexible_link(stage="both"), method="least-squares", lattice=coarse)
+    for stage in (1, 2):
+        kept = ("alpha", f"gamma{2 * stage - 1}", f"beta{2 * stage}", f"mu{2 * stage}")
+        own = replace(coarse, orders={n: v for n, v in coarse.orders.items() if n in kept})
+        alone = ftlm.identify(run, ftlm.flexible_link(stage=stage), method="least-squares", lattice=own)
+        assert alone.orders.items() <= whole.orders.items()
+        assert alone.coefficients.items() <= whole.coefficients.items()
+
+
+@pytest.mark.slow
+def test_the_whole_arm_is_one_joint_fit():
+    from ftlm.demo import demo_plant
+
+    found = ftlm.identify(arm_in_motion(5000, 0.01), replace(ftlm.flexible_link(stage="both"), initial="rest"))
+    assert len(found.joint.names) == 20
+    for stage in (1, 2):
+        for name, value in demo_plant(stage).orders.items():
+            assert abs(found.orders[name] - value) < 5 * found.standard_errors[name], name
+    assert min(found.fit_percent.values()) > 99
