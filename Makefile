@@ -5,7 +5,7 @@ PYTHON ?= python3
 CORE := $(shell find rust -name '*.rs') Cargo.toml Cargo.lock pyproject.toml
 export RUSTDOCFLAGS := -D warnings
 
-.PHONY: demo test test-slow test-rust test-python lint docs bench wheel wheel-test clean
+.PHONY: demo test test-slow test-rust test-python lint docs bench fuzz wheel wheel-test clean
 
 demo: $(VENV)/.built
 	$(BIN)/ftlm demo -o demo --force
@@ -49,6 +49,11 @@ bench: $(VENV)/.built
 	$(BIN)/python benches/search.py
 	$(BIN)/python benches/promises.py
 	$(BIN)/python benches/rig.py
+
+# A minute for each parser; FUZZ_SECONDS=600 for more. Inputs that break one are kept in tests/fuzz/regressions.
+FUZZ_SECONDS ?= 60
+fuzz: $(VENV)/.built
+	$(BIN)/python tests/fuzz/fuzz.py --seconds $(FUZZ_SECONDS)
 
 wheel: $(VENV)/.tools
 	rm -rf wheels

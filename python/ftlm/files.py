@@ -858,7 +858,8 @@ class _Answers:
         columns: list[_Column] = []
         for name, kind, matrix in arrays:
             # The time of a single-precision file is exact to its own digits only, which the step must know.
-            values = matrix.astype(np.float32) if kind == "single" else matrix
+            with np.errstate(over="ignore"):  # what overflows is no single; it is refused as infinite
+                values = matrix.astype(np.float32) if kind == "single" else matrix
             if 1 in matrix.shape:
                 columns.append(_Column(variable=name, name=name, source=path, values=values.ravel(order="F")))
                 continue

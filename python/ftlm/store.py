@@ -21,6 +21,7 @@ from __future__ import annotations
 import bisect
 import contextlib
 import hashlib
+import math
 import os
 import struct
 import time
@@ -204,6 +205,9 @@ class Section:
             return
         if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
             raise ModelError(f"rounds {frame.first} to {frame.last} are continued as something else")
+        _, followed, end, size, limit = frame.place
+        if not (0 <= followed <= end and size >= (end > 0) and not math.isnan(limit)):
+            raise ModelError(f"rounds {frame.first} to {frame.last} stand nowhere")
         if half is None:
             half = self.open[frame.first] = Half(frame.last, frame.place, [], frame.counts, ())
         half.place, half.counts = frame.place, frame.counts

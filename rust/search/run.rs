@@ -1468,7 +1468,8 @@ impl Hunt<'_> {
             self.part.counts.bounded += end - start - open.len() as u64 - failed;
             self.part.failures.extend(singular.into_iter().take(LISTED).map(|index| (index, Failure::Singular)));
         }
-        if place.end > open.len() as u64 || place.followed > place.end {
+        let still = place.end > 0 && (place.size == 0 || place.limit.is_nan());
+        if still || place.end > open.len() as u64 || place.followed > place.end {
             let what = format!("a checkpoint stands at {} of {} candidates to follow", place.followed, open.len());
             return Err(Error::Structure { what, remedy: "start the search again".into() });
         }

@@ -1,0 +1,188 @@
+"""Everything of ftlm that reads what others wrote, as functions of bytes that may only end well or in an FtlmError."""
+
+import functools
+import os
+import struct
+import tempfile
+import zlib
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+import ftlm
+from ftlm import files, store
+from ftlm.models import Order, parse_values
+
+#: Files of the fuzzers live in memory where there is such a place.
+FOLDER = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())
+
+
+def _file(suffix, data):
+    path = FOLDER / f"ftlm-fuzz-{os.getpid()}{suffix}"
+    path.write_bytes(data)
+    return path
+
+
+def _used(run):
+    """What a person does next with a run that was taken."""
+    assert run.length >= 3
+    assert all(np.isfinite(run[n]).all() for n in run.signals)
+    str(run)
+
+
+def csv(data):
+    _used(ftlm.load(_file(".csv", data), time=0, inputs={"u": 1}, outputs={"y": 2}))
+
+
+def csv_header(data):
+    """The header that ftlm writes, over good numbers."""
+    _used(ftlm.load(_file(".csv", data + b"\nt,u,y\n0,1,2\n0.1,1,3\n0.2,0,4\n0.3,0,4\n")))
+
+
+def columns(data):
+    table = b"t,u,y\n0,1,2\n0.1,1,3\n0.2,0,4\n0.3,0,4\n"
+    _used(ftlm.load(_file(".csv", table), columns=_file(".toml", data)))
+
+
+def mat(data):
+    _used(ftlm.load(_file(".mat", data), step=0.1, outputs={"y": "y"}))
+
+
+def parquet(data):
+    _used(ftlm.load(_file(".parquet", data), outputs={"y": "y"}))
+
+
+def answer(data):
+    """What the child that reads .mat and parquet files says; it may have been taken over by the file."""
+    answers = files._Answers(data)
+    while answers.table(Path("x.mat")) is not None:
+        pass
+
+
+def model(data):
+    found = ftlm.load_model(_file(".json", data))
+    str(found)
+    found.frequency_response([1.0])
+
+
+def equation(data):
+    found = ftlm.equation(data.decode("utf-8", "replace"))
+    assert ftlm.equation(str(found)).equations == found.equations
+
+
+def order(data):
+    str(Order.parse(data.decode("utf-8", "replace")))
+
+
+def values(data):
+    parse_values("alpha", data.decode("utf-8", "replace"))
+
+
+def sealed(data):
+    """A store whose digests are right, whatever its frames say: what a forger would write.
+
+    The input is a chain of payloads, each behind its length.
+    """
+    frames, at, digest = [store.MAGIC], 0, bytes(store.DIGEST)
+    offset = len(store.MAGIC)
+    while at + 4 <= len(data):
+        (length,) = struct.unpack_from("<I", data, at)
+        payload = data[at + 4 : at + 4 + length]
+        at += 4 + length
+        frame, digest = store._frame(payload, offset, digest)
+        frames.append(frame)
+        offset += len(frame)
+    stored(b"".join(frames))
+
+
+def stored(data):
+    """A store as a file."""
+    path = _file(".ftlm", data)
+    found = ftlm.search_status(path)
+    if all(s.candidates <= 200_000 for s in found.values()):
+        ftlm.resume_search(path, threads=1)
+
+
+TARGETS = {
+    f.__name__: f
+    for f in (csv, csv_header, columns, mat, parquet, answer, model, equation, order, values, sealed, stored)
+}
+#: Those that start a child for every input.
+SLOW = ("mat", "parquet")
+
+
+def unsealed(data):
+    """Payloads of a store, each behind its length: what :func:`sealed` takes."""
+    at, out = len(store.MAGIC), []
+    while at < len(data):
+        (length,) = struct.unpack_from("<I", data, at)
+        assert struct.unpack_from("<I", data, at + 4)[0] == store._check(data[at : at + 4], at) != zlib.crc32(b"")
+        out.append(data[at : at + 4] + data[at + 8 : at + 8 + length])
+        at += 8 + length + store.DIGEST
+    return b"".join(out)
+
+
+@functools.cache
+def seeds(target):
+    """Good inputs, from which mutations start: made here, so that they are always of this version."""
+    with tempfile.TemporaryDirectory() as folder:
+        return _seeds(target, Path(folder))
+
+
+def _seeds(target, folder):
+    n = 24
+    u = np.where(np.arange(n) % 8 < 4, 1.0, -1.0)
+    y = np.cumsum(np.random.default_rng(0).standard_normal(n))
+    run = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": y}, units={"y": "deg"}, name="seed")
+    words = [
+        "D^2.2 y = a1 D^0.9 y + a0 y + b0 u", "D^alpha y = -3.5 D^(alpha-0.5) y + 2 D^nu u; D^1.5 z = c y - 1e-3 z",
+        "D^(2*alpha1 - mu2 + 0.1) y = - k D^beta y + u",
+    ]  # fmt: skip
+    if target in ("csv", "csv_header"):
+        run.to_csv(folder / "a.csv")
+        own = (folder / "a.csv").read_bytes()
+        plain = b"t;u;y\r\n" + b"".join(b"%d,5;1,25;-2e-3\r\n" % i for i in range(9))
+        bare = b"\xef\xbb\xbf# note\n" + b"".join(b"%.2f 1 %d\n" % (i / 100, i) for i in range(9))
+        return (own, plain, bare) if target == "csv" else (own.split(b"\n")[0],)
+    if target == "columns":
+        return (b'time = "t"\nstep = 0.1\n[inputs]\nu = "u"\n[outputs]\ny = 2\n[units]\ny = "deg"\n',)
+    if target == "mat":
+        from scipy.io import savemat
+
+        for name, compressed in (("a", False), ("b", True)):
+            savemat(folder / f"{name}.mat", {"y": y[:, None], "u": u[:, None]}, do_compression=compressed)
+        return tuple((folder / f"{name}.mat").read_bytes() for name in "ab")
+    if target == "parquet":
+        run.to_parquet(folder / "a.parquet")
+        return ((folder / "a.parquet").read_bytes(),)
+    if target == "answer":
+        good = b'{"arrays": [{"name": "y", "type": "double", "rows": 3, "columns": 1}], "skipped": {"a": "text"}}\n'
+        wide = b'{"arrays": [{"name": "y", "type": "single", "rows": 2, "columns": 2}], "text": true}\n'
+        return (good + bytes(24) + wide + bytes(32), b'{"error": "it is damaged", "way_out": "get another"}\n')
+    if target == "model":
+        structure = ftlm.equation(words[0])
+        fixed = structure.with_coefficients({"a1": -1.0, "a0": -2.0, "b0": 1.0})
+        ftlm.Model(fixed, units={"y": "rad"}, m=64, about={"runs": "a"}).save(folder / "a.json")
+        found = ftlm.identify(run, ftlm.equation("D^1.5 y = a y + b u"), method="least-squares", m=16)
+        found.model.save(folder / "b.json")
+        return tuple((folder / f"{name}.json").read_bytes() for name in "ab")
+    if target == "equation":
+        return tuple(w.encode() for w in words)
+    if target == "order":
+        return (b"alpha1 - alpha2 + 2*mu2 - 0.5", b"0.5", b"-(a+b)/2")
+    if target == "values":
+        return (b"0.5:1.5:0.05", b"1", b"0.1:0.2")
+    structure = ftlm.equation("D^alpha y = a D^beta y + b u")
+    ftlm.search_orders(
+        run, structure, ftlm.lattice(step=0.25), m=16, store=folder / "a.ftlm", early_stopping=False, threads=1
+    )
+    whole = (folder / "a.ftlm").read_bytes()
+    halves = unsealed(whole)
+    request = store._decoder.decode(halves[4 : 4 + struct.unpack_from("<I", halves)[0]])
+    half = store.Progress(
+        0, 0, 1, (0, 1, 4, 256, float("inf")), ((0, 1.0, (1.0, 2.0), ((),)),), (0, 0, 1, 0, 0, 0, 0), ()
+    )
+    payloads = [msgspec.msgpack.encode(frame) for frame in (request, half)]
+    half_done = b"".join(struct.pack("<I", len(p)) + p for p in payloads)
+    return (halves, half_done) if target == "sealed" else (whole,)
