@@ -75,7 +75,7 @@ class Finding:
     ----------
     kind
         ``excitation``, ``constant``, ``dead``, ``offset``, ``drift``, ``saturation``, ``spikes``, ``wrap``,
-        ``feedback`` or ``short``.
+        ``feedback``, ``short`` or ``twin``.
     signal
         The signal concerned; empty where it is the whole run.
     sentence
@@ -136,6 +136,7 @@ def advise(run: Run, structure: Structure | None = None) -> Advice:
     for name in run.signals:
         if name not in moving:
             found.append(_constant(run, name))
+    found += _twins(run, moving)
     inputs = [n for n in run.inputs if n in moving]
     outputs = [n for n in run.outputs if n in moving]
     for name in outputs:
@@ -175,6 +176,17 @@ def _stretches(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.i
 
 
 # ------------------------------------------------------------------------------------------------ channels
+
+
+def _twins(run: Run, names: list[str]) -> list[Finding]:
+    return [
+        Finding(
+            "twin", other, f"{one} and {other} hold the same number in every row: one of them is the wrong column"
+        )
+        for position, one in enumerate(names)
+        for other in names[position + 1 :]
+        if np.array_equal(run[one], run[other])
+    ]  # fmt: skip
 
 
 def _constant(run: Run, name: str) -> Finding:

@@ -28,6 +28,8 @@ __all__ = ["Record", "default_m", "equation_tuple", "initial_tuple", "record", "
 PAPER_M = 2048
 #: Most pulses in one record: 2^24 of one signal are 128 MB.
 MAX_M = 1 << 24
+#: A signal that stays below this loses digits of its squares to the end of the range of numbers.
+SMALLEST = 1e-140
 COULOMB = "coulomb_"
 #: A first value beyond this many noise standard deviations is not rest.
 REST_SIGMAS = 5.0
@@ -153,7 +155,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     Raises
     ------
     DataError
-        A signal that the run does not have.
+        A signal that the run does not have, or one so small that its squares vanish.
     ModelError
         A delay of a signal that is no input, or a free delay.
     """
@@ -168,6 +170,12 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         means = _means(run, structure, name, m, at_rest=initial == "rest")
         if sensor is not None and structure.sensor_filter is not None and name not in structure.sensor_filter.outputs:
             means = _core.series_multiply(sensor, means, m)
+        peak = float(np.max(np.abs(means), initial=0.0))
+        if 0 < peak < SMALLEST:
+            raise DataError(
+                f"signal {name!r} of run {run.name!r}: no mean is larger than {peak:.3g}, and squares below "
+                f"{SMALLEST:g} lose their digits; scale the signal"
+            )
         rows.append(means)
     return Record(
         structure.signals,

@@ -213,7 +213,7 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_bytes(run, expected, tmp_p
 
 @pytest.mark.slow
 def test_ten_million_candidates_on_a_cluster_that_loses_a_worker(run, tmp_path):
-    options = {"lattice": ftlm.lattice(step=0.021), "m": 256, "early_stopping": True}
+    options = {"lattice": ftlm.lattice(step=0.0205), "m": 256, "early_stopping": True}
     began = time.monotonic()
     whole = search(run, **options, threads=2)
     alone = time.monotonic() - began
