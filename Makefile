@@ -5,7 +5,7 @@ PYTHON ?= python3
 CORE := $(shell find rust -name '*.rs') Cargo.toml Cargo.lock pyproject.toml
 export RUSTDOCFLAGS := -D warnings
 
-.PHONY: demo test test-slow test-rust test-python lint docs bench fuzz wheel wheel-test clean
+.PHONY: demo test test-slow test-rust test-python lint docs bench fuzz wheel wheel-test sdist-test clean
 
 demo: $(VENV)/.built
 	$(BIN)/ftlm demo -o demo --force
@@ -65,7 +65,18 @@ wheel-test: wheel
 	$(PYTHON) -m venv $(VENV)-wheel
 	$(VENV)-wheel/bin/python -m pip install --quiet --disable-pip-version-check wheels/*.whl
 	cd wheels && ../$(VENV)-wheel/bin/ftlm demo --step 0.1 -o demo
+	$(BIN)/python -m abi3audit --strict wheels/*.whl
+	$(BIN)/python -m auditwheel show wheels/*.whl
 	rm -rf $(VENV)-wheel wheels/demo
 
+# The source distribution alone builds and works, in an environment that has only pip; Rust is needed.
+sdist-test: $(VENV)/.tools
+	rm -rf sdist $(VENV)-sdist
+	. $(BIN)/activate && maturin sdist --quiet --out sdist
+	$(PYTHON) -m venv $(VENV)-sdist
+	$(VENV)-sdist/bin/python -m pip install --quiet --disable-pip-version-check sdist/*.tar.gz
+	cd sdist && ../$(VENV)-sdist/bin/ftlm doctor
+	rm -rf $(VENV)-sdist sdist
+
 clean:
-	rm -rf $(VENV) $(VENV)-wheel wheels demo target docs/_build docs/_pictures
+	rm -rf $(VENV) $(VENV)-wheel $(VENV)-sdist wheels sdist demo target docs/_build docs/_pictures

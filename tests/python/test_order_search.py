@@ -750,3 +750,28 @@ def test_power_means_of_the_oracle_are_those_of_a_power():
     record = Record(ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(65)}, outputs={"y": np.arange(65.0)}))
     np.testing.assert_allclose(record.powers((0.5,))[0, 0], 0.1**0.5 / 1.5)
     assert gamma(2.5) == pytest.approx(0.75 * np.sqrt(np.pi))
+
+
+@pytest.mark.parametrize(("share", "orders"), [(1, 100), (50, 2), (100, 1)])
+@pytest.mark.parametrize("early_stopping", [True, False])
+def test_a_share_of_candidates_that_fail_are_rows_with_a_reason(run, tmp_path, share, orders, early_stopping):
+    """R6: two channels of one current make every candidate singular in which both have one order."""
+    twin = ftlm.Run.from_arrays(
+        step=run.step, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]}, name="twin"
+    )
+    structure = ftlm.equation("D^1.6 y = a D^0.6 y + b D^nu u + c D^mu v", initial="rest")
+    lattice = ftlm.Lattice(orders={"nu": [k / 100 for k in range(orders)], "mu": [0.0]})
+    options = {"coefficients": "least-squares", "m": M, "early_stopping": early_stopping}
+    if share == 100:
+        for more in ({}, {"store": tmp_path / "s.ftlm"}):
+            with pytest.raises(ftlm.ModelError, match="none of 1 candidates has a finite score"):
+                ftlm.search_orders(twin, structure, lattice, **options, **more)
+        return
+    found = ftlm.search_orders(twin, structure, lattice, **options)
+    kept = ftlm.search_orders(twin, structure, lattice, **options, store=tmp_path / "s.ftlm")
+    assert kept.to_dict() == found.to_dict()
+    assert found.candidates == orders
+    assert len(found.table) + sum(found.pruned.values()) == found.candidates
+    assert 100 * found.pruned["singular"] == share * found.candidates
+    assert found.failures == [({"nu": 0.0, "mu": 0.0}, "singular")]
+    assert all(row.orders["nu"] > 0 for row in found.table)
