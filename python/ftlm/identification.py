@@ -294,6 +294,7 @@ class Identification:
             "residuals": None if self.residuals is None else self.residuals.to_dict(),
             "information": None if self.information is None else self.information.to_dict(),
             "searches": {name: s.to_dict() for name, s in self.searches.items()},
+            "choice": None if self.joint is None else self.joint.choice,
             "warnings": list(self.warnings),
         }
 
@@ -308,6 +309,8 @@ class Identification:
             spread = f" ± {errors[name]:<10.3g}" if name in errors else ""
             stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
             lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
+        if self.joint is not None:
+            lines.append(f"  {self.joint.choice}")
         if errors:
             lines.append("  (value ± standard error; 95 % intervals are ± 1.96 of these)")
         lines.append(str(replace(self.comparison, warnings=())))

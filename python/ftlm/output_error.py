@@ -134,6 +134,17 @@ class JointFit:
     delays: dict[str, float] = field(default_factory=dict)
 
     @property
+    def choice(self) -> str:
+        """Why this optimum, in words: which start led to it, and how far behind the next other one was."""
+        if not self.starts:
+            return "from the start that was given"
+        level, origin = self.starts[0]
+        same = [v for v, _ in self.starts if v <= (1.0 + SAME_COST) * level]
+        words = f"{len(same)} of {len(self.starts)} starts ended in the lowest optimum, first that of: {origin}"
+        rest = self.starts[len(same) :]
+        return words + (f"; the next costs {rest[0][0] / level:.3g} times as much" if rest and level > 0 else "")
+
+    @property
     def derived_errors(self) -> dict[str, float]:
         """Standard errors of the coefficients that the coefficient law gives, to first order."""
         kept = slice(len(self.orders), len(self.orders) + len(self.coefficients))

@@ -202,3 +202,19 @@ def test_the_search_is_the_same_for_any_number_of_threads() -> None:
     first, second = (fit_output_error([run], structure(), threads=n) for n in (1, 2))
     assert np.array_equal(first.values, second.values)
     assert first.cost == second.cost
+
+
+def test_the_choice_of_an_optimum_is_given_in_words() -> None:
+    found = ftlm.identify(three_terms(40, 0), structure())
+    joint = found.joint
+    level = joint.starts[0][0]
+    same = sum(v <= 1.001 * level for v, _ in joint.starts)
+    assert joint.choice.startswith(f"{same} of {len(joint.starts)} starts ended in the lowest optimum, first that of: ")
+    assert joint.choice in str(found)
+    assert found.to_dict()["choice"] == joint.choice
+    given = fit_output_error([three_terms(40, 0)], structure(), start=THREE_TERMS)
+    assert given.choice == "from the start that was given"
+    behind = replace(joint, starts=[(1.0, "a"), (1.0005, "b"), (3.0, "c")])
+    assert behind.choice == (
+        "2 of 3 starts ended in the lowest optimum, first that of: a; the next costs 3 times as much"
+    )

@@ -341,7 +341,7 @@ def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic sta
     """Return where the first fits began and how far each came on thinned samples, best first."""
     kept = joint.starts[:rows]
     cells: list[list[Cell]] = [[k + 1, origin, level] for k, (level, origin) in enumerate(kept)]
-    note = f"{len(joint.starts)} starts in all; the best ones went on on all samples." if joint.starts else ""
+    note = f"{joint.choice}. The best ones went on on all samples." if joint.starts else ""
     return Table(title, ("rank", "start from", "cost per residual"), cells, note=note)
 
 
