@@ -6,6 +6,7 @@ order search, simulation and validation.
 
 from ftlm import rig
 from ftlm._core import __version__
+from ftlm.baselines import Genetic
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
 from ftlm.files import load
 from ftlm.flexible_link import PARAMETERS, LinkParameters, flexible_link, link_model, order_law
@@ -46,6 +47,7 @@ __all__ = [
     "Equation",
     "Estimate",
     "FtlmError",
+    "Genetic",
     "Identification",
     "Identified",
     "InformationCriteria",

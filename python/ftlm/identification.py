@@ -10,6 +10,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.advice import excitation_for
+from ftlm.baselines import Genetic, genetic_search
 from ftlm.checks import whole_number
 from ftlm.errors import DataError, InternalError, ModelError
 from ftlm.models import Estimate, Model, Structure, delay_name, numeric
@@ -47,8 +48,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Identification", "Trace", "identify", "multi_innovation_trace"]
 
-METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares")
-LATER = ("genetic",)
+METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
 #: Most steps of refined instrumental variables, and the relative change of a coefficient that ends them.
 REFINEMENTS = 40
 STILL = 1e-8
@@ -58,6 +58,8 @@ PULLED = 0.05
 INSEPARABLE = 0.995
 #: Residuals of an output-error fit below this share of the output are rounding and discretisation.
 ROUNDING = 3e-5
+#: Seeds of the genetic algorithm whose errors differ by more than this factor have not all found the optimum.
+SCATTERED = 1.2
 #: Two coefficients further apart than this share do not obey the coefficient law.
 LAW_BROKEN = 0.05
 
@@ -338,6 +340,9 @@ def _settings_in_words(settings: Mapping[str, Any]) -> str:
     words = f"M = {settings['m']}"
     if "refinement" in settings:
         words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} starts"
+    if "seeds" in settings:
+        seeds = ", ".join(map(str, settings["seeds"]))
+        words += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
     if "innovation_length" in settings:
         words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
         words += f", {settings['rows']} rows"
@@ -358,7 +363,9 @@ def identify(
     runs: Run | Sequence[Run],
     structure: Structure,
     *,
-    method: Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares"] = "output-error",
+    method: Literal[
+        "output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"
+    ] = "output-error",
     criterion: Literal["output-error", "equation-error"] = "output-error",
     lattice: Lattice | None = None,
     norm: Literal["l1", "l2"] = "l1",
@@ -367,6 +374,7 @@ def identify(
     rows: Literal["haar", "time"] = "haar",
     m: int | None = None,
     keep: int = 20,
+    genetic: Genetic | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Identification:
@@ -386,7 +394,8 @@ def identify(
         ``"output-error"``: all equations and runs together, maximum likelihood for white noise.
         ``"instrumental-variables"``: refined instrumental variables, orders from the lattice, coefficients without the
         bias of noise. ``"multi-innovation"``: the paper's (44) in closed form. ``"least-squares"``: its limit for a
-        weak prior.
+        weak prior. ``"genetic"``: orders and coefficients by a genetic algorithm on the free run, the paper's
+        baseline, for comparison only (``pip install 'ftlm[genetic]'``).
     criterion, lattice, norm, keep, threads, progress
         Of the order search; see :func:`ftlm.search_orders`. Not used by ``"output-error"``, whose bounds are the
         structure's own.
@@ -394,6 +403,8 @@ def identify(
         p, K0 and the coordinates of paper (42)-(44). p is a weight of the data against the prior, nothing else.
     m
         Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows).
+    genetic
+        Seeds, evaluations, population and bounds of the genetic algorithm.
 
     Returns
     -------
@@ -410,18 +421,22 @@ def identify(
         Regressors that cannot be told apart at the given orders.
     """
     found = as_runs(runs)
-    if method in LATER:
-        raise ModelError(f"method = {method!r} is not in this version; use {' or '.join(map(repr, METHODS))}")
     if method not in METHODS:
         raise ModelError(f"method = {method!r} is not known; use {' or '.join(map(repr, METHODS))}")
     if not isinstance(structure, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
     check_lattice(lattice)
     _check_lattice_names(lattice, structure)
-    estimator = "least-squares" if method == "output-error" else method
+    if not (genetic is None or isinstance(genetic, Genetic)):
+        raise ModelError(f"genetic is {type(genetic).__name__}, not Genetic; use ftlm.Genetic(seeds=…)")
+    if genetic is not None and method != "genetic":
+        raise ModelError(f"genetic settings are given, but method = {method!r}; use method='genetic'")
+    estimator = "least-squares" if method in ("output-error", "genetic") else method
     settings = Settings.check(criterion, norm, estimator, innovation_length, prior_covariance, rows, keep, threads)
     if method == "output-error":
         return _identify_output_error(found, structure, m, threads, progress)
+    if method == "genetic":
+        return _identify_genetic(found, structure, lattice, genetic or Genetic(), norm, m, threads, progress)
 
     searches: dict[str, SearchResult] = {}
     orders: dict[str, float] = {}
@@ -548,6 +563,76 @@ def _identify_output_error(
     return Identification(
         model, "output-error", comparison, {}, used, tuple(dict.fromkeys(warnings)), joint, tests, criteria,
         Task(tuple(runs), structure),
+    )  # fmt: skip
+
+
+def _identify_genetic(
+    runs: Sequence[Run],
+    structure: Structure,
+    lattice: Lattice | None,
+    settings: Genetic,
+    norm: str,
+    m: int | None,
+    threads: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> Identification:
+    """Orders and coefficients by a genetic algorithm: each equation alone, or all under their order law."""
+    parts = {"stage": structure} if structure.has_order_law else {
+        e.output: structure.equation(e.output) for e in structure.equations
+    }  # fmt: skip
+    strange = [
+        n for n in settings.bounds if all(n not in (*p.order_names, *p.coefficient_names) for p in parts.values())
+    ]
+    if strange:
+        free = ", ".join(n for p in parts.values() for n in (*p.order_names, *p.coefficient_names))
+        raise ModelError(f"bounds of {strange[0]!r}: there is no such number; free are {free}")
+    orders: dict[str, float] = {}
+    coefficients: dict[str, float] = {}
+    about: dict[str, Any] = {"bounds": {}, "errors": {}, "evaluations": {}}
+    records = prepare(runs, structure, m, power_of_two=True)
+    for name, part in parts.items():
+        own = {n: b for n, b in settings.bounds.items() if n in (*part.order_names, *part.coefficient_names)}
+        found = genetic_search(
+            prepare(runs, part, records[0].m, power_of_two=True), part, _lattice_of(lattice, part) or Lattice(),
+            replace(settings, bounds=own), norm=norm, threads=threads, progress=progress,
+        )  # fmt: skip
+        orders |= found.orders
+        coefficients |= found.coefficients
+        about["bounds"] |= {n: list(b) for n, b in found.bounds.items()}
+        about["errors"][name] = {str(seed): error for seed, error in found.errors.items()}
+        about["evaluations"][name] = sum(found.evaluations.values())
+    model = Model(
+        structure.with_orders(orders).with_coefficients(coefficients),
+        orders=orders,
+        units={n: u for n, u in runs[0].units.items() if n in structure.signals},
+        m=records[0].m,
+        about={"method": "genetic", "runs": ", ".join(r.name for r in runs), "seeds": str(list(settings.seeds))},
+    )
+    comparison = compare(model, runs, m=records[0].m)
+    warnings = [*comparison.warnings, *_broken_law(model)]
+    for name, (low, high) in about["bounds"].items():
+        value = {**orders, **coefficients}[name]
+        if min(value - low, high - value) < 1e-3 * (high - low) and value not in (0.0, 2.0):
+            warnings.append(f"{name} = {value:.4g} is on its bound for the genetic algorithm; widen it")
+    for name, errors in about["errors"].items():
+        low, high = min(errors.values()), max(errors.values())
+        if high > SCATTERED * low:
+            warnings.append(
+                f"{name}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}; "
+                "it has not found the optimum of each"
+            )
+    warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings] + _unexcited(runs, structure)
+    warnings += discretisation(model, comparison)
+    tests, criteria = _judged(model, runs, len(orders) + len(coefficients))
+    warnings += [] if tests is None else residual_warnings(tests)
+    used = {
+        "method": "genetic", "norm": norm, "m": records[0].m, "initial": "rest", "seeds": list(settings.seeds),
+        "population": settings.population, **about,
+    }  # fmt: skip
+    model = _kept_with(model, "genetic", runs, comparison, criteria, warnings)
+    return Identification(
+        model, "genetic", comparison, {}, used, tuple(dict.fromkeys(warnings)), residuals=tests,
+        information=criteria, task=Task(tuple(runs), structure, lattice),
     )  # fmt: skip
 
 

@@ -33,7 +33,7 @@ mod _core {
     };
 
     #[pymodule_export]
-    use super::search::{lattice_size, search, search_join, search_plan, search_stage, OrderSearch};
+    use super::search::{lattice_size, search, search_join, search_plan, search_stage, OrderSearch, Points};
 
     #[pymodule_export]
     use super::virtual_arm::{fractional_memory, Guard, VirtualArm};

@@ -5,10 +5,11 @@ use std::sync::atomic::Ordering;
 use std::sync::mpsc::{channel, RecvTimeoutError};
 use std::time::Duration;
 
+use numpy::{PyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
-use super::arrays::{initial, records, InitialArg, RecordArg};
+use super::arrays::{initial, records, rows, InitialArg, RecordArg};
 use super::errors::caught;
 use crate::equation::{AffineOrder, Initial};
 use crate::error::Error;
@@ -16,6 +17,7 @@ use crate::estimate::instrumental_variables::{with_projections, Settings};
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::regressors::Record;
 use crate::search::lattice::{Lattice, LawEquation, LawLattice, TermAxis};
+use crate::search::points::{Point, Points as PointsOf};
 use crate::search::run::{
     self, Checkpoint, Control, Counts, Criterion, Estimator, Failure, Norm, Options, Outcome, Part, Place, Row,
 };
@@ -430,4 +432,51 @@ pub fn search_stage<'py>(
     dict.set_item("failures", failures)?;
     dict.set_item("distinct", outcome.distinct)?;
     Ok(dict)
+}
+
+/// Errors of candidates at orders and coefficients of their own.
+#[pyclass(module = "ftlm._core")]
+pub struct Points {
+    inner: PointsOf,
+    width: usize,
+}
+
+#[pymethods]
+impl Points {
+    #[new]
+    #[allow(clippy::needless_pass_by_value)]
+    fn new(
+        runs: Vec<RecordArg<'_>>,
+        output: usize,
+        signals: Vec<usize>,
+        inputs: Vec<bool>,
+        squares: bool,
+    ) -> PyResult<Self> {
+        let width = signals.len();
+        let norm = if squares { Norm::L2 } else { Norm::L1 };
+        Ok(Self { inner: PointsOf::new(records(&runs)?, output, signals, inputs, norm)?, width })
+    }
+
+    /// Errors of candidates given as rows (alpha, orders, coefficients); infinite beyond the limit.
+    #[allow(clippy::needless_pass_by_value)]
+    fn scores<'py>(
+        &mut self,
+        py: Python<'py>,
+        candidates: PyReadonlyArray2<'py, f64>,
+        limit: f64,
+        threads: usize,
+    ) -> PyResult<Bound<'py, PyArray1<f64>>> {
+        let wanted = 1 + 2 * self.width;
+        let points = rows(&candidates)
+            .into_iter()
+            .map(|row| {
+                crate::error::check_length("a candidate", wanted, row.len())?;
+                let (orders, coefficients) = row[1..].split_at(self.width);
+                Ok(Point { order: row[0], orders: orders.to_vec(), coefficients: coefficients.to_vec() })
+            })
+            .collect::<Result<Vec<_>, Error>>()?;
+        let inner = &mut self.inner;
+        let found = watched(py, None, |control| inner.scores(&points, limit, threads, control))?;
+        Ok(PyArray1::from_vec(py, found))
+    }
 }

@@ -457,7 +457,7 @@ def test_output_error_is_the_default_and_gives_intervals(small_run, with_noise):
     ("options", "message"),
     [
         ({"method": "magic"}, "method = 'magic' is not known; use "),
-        ({"method": "genetic"}, "method = 'genetic' is not in this version; use "),
+        ({"method": "genetics"}, "method = 'genetics' is not known; use "),
         ({"criterion": "error"}, "criterion = 'error' is not known"),
         ({"norm": "l0"}, "norm = 'l0' is not known"),
         ({"rows": "columns"}, "rows = 'columns' is not known"),

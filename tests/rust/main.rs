@@ -15,6 +15,7 @@ mod means;
 mod metrics;
 mod output_error;
 mod plants;
+mod points;
 mod rig;
 mod search;
 mod series;
