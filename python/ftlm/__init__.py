@@ -33,6 +33,7 @@ from ftlm.order_search import (
     search_status,
 )
 from ftlm.physical import PhysicalParameter, physical_parameters
+from ftlm.reproduction import Reproduction, reproduce
 from ftlm.residuals import CorrelationTest, InformationCriteria, OutputResiduals, Residuals, information_criteria, resid
 from ftlm.runs import Run
 from ftlm.simulation import explicit_euler, simulate
@@ -60,6 +61,7 @@ __all__ = [
     "Order",
     "OutputResiduals",
     "PhysicalParameter",
+    "Reproduction",
     "Residuals",
     "RigFault",
     "Run",
@@ -93,6 +95,7 @@ __all__ = [
     "operational_matrix",
     "order_law",
     "physical_parameters",
+    "reproduce",
     "resid",
     "resume_search",
     "rig",

@@ -37,6 +37,9 @@ PARENTS = 0.25
 #: Spread of simulated binary crossover and of polynomial mutation, and the share of children that are crossed: the
 #: values that Deb and Agrawal (Complex Systems 1995) and the libraries that follow them use.
 CROSSOVER_SPREAD, MUTATION_SPREAD, CROSSED = 15.0, 20.0, 0.9
+#: Copies of parents are not evaluated again, so it takes more generations to spend all evaluations: at most this
+#: many times as many.
+MOST_COPIES = 4
 #: Fitness of what diverges or has no chance of being a parent: PyGAD takes finite numbers only.
 HOPELESS = -1e300
 #: Most evaluations that are not asked for by number: the lattice of a stage under its law has millions.
@@ -52,7 +55,7 @@ class Genetic:
     seeds
         One run of the algorithm a seed; the best of all is the result, and the errors of all are kept.
     evaluations
-        Evaluations a seed; by default as many as the lattice has candidates.
+        Evaluations a seed, rounded up to a whole generation; by default as many as the lattice has candidates.
     population
         Candidates of one generation, at least 8.
     bounds
@@ -90,8 +93,8 @@ class GeneticRun:
     orders, coefficients
         Of the best candidate of all seeds, by name.
     errors
-        Error of the best candidate of each seed: (45), or RMSE (46) for the norm ``"l2"``; under an order law the sum of
-        each output's divided by its spread.
+        Error of the best candidate of each seed: (45), or RMSE (46) for the norm ``"l2"``; under an order law the sum
+        of each output's divided by its spread.
     evaluations
         Candidates evaluated for each seed.
     bounds
@@ -280,7 +283,7 @@ def genetic_search(
     changes no generation.
     """
     try:
-        import pygad  # noqa: PLC0415 — an extra; only this baseline needs it
+        import pygad  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this baseline needs it
     except ImportError:
         raise ModelError("the genetic baseline needs PyGAD; pip install 'ftlm[genetic]'") from None
     if initial_tuple(records[0].initial) != (False, []):
@@ -305,13 +308,16 @@ def genetic_search(
         kept = _Kept(parents)
         low, high = np.array([problem.bounds[n] for n in problem.names]).T
 
+        def enough(_: Any, kept: _Kept = kept) -> str | None:
+            return "stop" if kept.count >= wanted else None
+
         def crossover(chosen: Any, size: tuple[int, int], running: Any) -> Floats:
             return simulated_binary(np.asarray(chosen, dtype=np.float64), size, running.numpy_random_generator)
 
         def mutation(children: Any, running: Any, low: Floats = low, high: Floats = high) -> Floats:
             return polynomial(np.asarray(children, dtype=np.float64), low, high, running.numpy_random_generator)
 
-        def fitness(_: Any, genes: Any, __: Any, kept: _Kept = kept) -> list[float]:
+        def fitness(_: Any, genes: Any, __: Any, kept: _Kept = kept, before: int = before) -> list[float]:
             found = problem.errors(np.asarray(genes, dtype=np.float64), kept.limit)
             kept.take(found, np.asarray(genes, dtype=np.float64))
             if progress is not None:
@@ -319,7 +325,8 @@ def genetic_search(
             return np.where(np.isfinite(found), -found, HOPELESS).tolist()  # type: ignore[no-any-return]
 
         algorithm = pygad.GA(
-            num_generations=math.ceil((wanted - settings.population) / (settings.population - parents)),
+            num_generations=MOST_COPIES * math.ceil(wanted / (settings.population - parents)),
+            on_generation=enough,
             num_parents_mating=parents, keep_elitism=parents, sol_per_pop=settings.population,
             num_genes=len(problem.names), fitness_func=fitness, fitness_batch_size=settings.population,
             gene_space=[{"low": low, "high": high} for low, high in (problem.bounds[n] for n in problem.names)],

@@ -45,13 +45,16 @@ class Method(StrEnum):
     """Estimators."""
 
     output_error = "output-error"
+    instrumental_variables = "instrumental-variables"
     multi_innovation = "multi-innovation"
     least_squares = "least-squares"
+    genetic = "genetic"
 
 
 class Coefficients(StrEnum):
     """Estimators of the coefficients in a search."""
 
+    instrumental_variables = "instrumental-variables"
     multi_innovation = "multi-innovation"
     least_squares = "least-squares"
 
@@ -166,6 +169,10 @@ K0 = Annotated[float, typer.Option("--k0", help="Prior covariance of the coeffic
 RowsOption = Annotated[Rows, typer.Option("--rows", help="Coordinates of the rows of (44).")]
 Keep = Annotated[int, typer.Option("--keep", help="Rows of the ranked table.")]
 MethodOption = Annotated[Method, typer.Option("--method", help="Estimator.")]
+Seeds = Annotated[
+    list[int] | None, typer.Option("--seed", min=0, help="Seed of the genetic algorithm; several are several runs.")
+]
+Evaluations = Annotated[int | None, typer.Option("--evaluations", help="Evaluations a seed of the genetic algorithm.")]
 CoefficientsOption = Annotated[Coefficients, typer.Option("--coefficients", help="Estimator of the coefficients.")]
 
 
@@ -392,6 +399,21 @@ def lattice_of(given: list[str] | None, step: float) -> Lattice:
     return found if alpha is None else replace(found, orders={**found.orders, "alpha": alpha})
 
 
+def genetic_of(seeds: list[int] | None, evaluations: int | None, method: str) -> Any:
+    """Settings of the genetic algorithm, or None where they are not asked for.
+
+    Raises
+    ------
+    ModelError
+        Settings for another method.
+    """
+    if seeds is None and evaluations is None:
+        return None
+    if method != "genetic":
+        raise ModelError(f"--seed and --evaluations are of the genetic algorithm, not of --method {method}")
+    return ftlm.Genetic(seeds=tuple(seeds or ftlm.Genetic().seeds), evaluations=evaluations)
+
+
 def check_writable(paths: list[str | None], *, force: bool) -> None:
     """Refuse before any work what could not be written after it.
 
@@ -531,6 +553,8 @@ def identify(
     rows: RowsOption = Rows.haar,
     m: M = None,
     keep: Keep = 20,
+    seeds: Seeds = None,
+    evaluations: Evaluations = None,
     threads: Threads = None,
     out: Out = None,
     report: Annotated[str | None, typer.Option("--report", metavar="HTML", help="Page to write.")] = None,
@@ -553,7 +577,7 @@ def identify(
         found = ftlm.identify(
             runs, wanted, method=method.value, criterion=criterion.value, lattice=lattice_of(lattice, step),
             norm=norm.value, innovation_length=p, prior_covariance=k0, rows=rows.value, m=m, keep=keep,
-            threads=threads, progress=progress,
+            genetic=genetic_of(seeds, evaluations, method.value), threads=threads, progress=progress,
         )  # fmt: skip
     if out is not None:
         found.model.save(out, force=force)
@@ -837,6 +861,64 @@ def report(
     runs = load_runs(validation, sliced, **options) if validation else None
     page = model_page(loaded, out, validation=runs, force=force)
     print(json.dumps({"written": str(page)}, ensure_ascii=False) if as_json else f"written: {page}")
+
+
+@app.command()
+@guarded
+def reproduce(
+    out: Annotated[str, typer.Option("-o", "--out", metavar="HTML", help="Page to write.")] = "paper.html",
+    save: Annotated[
+        str | None, typer.Option("--save", metavar="FOLDER", help="Also write runs, models and the tables' numbers.")
+    ] = None,
+    square: Annotated[
+        str | None, typer.Option("--square", metavar="FILE", help="A measured run to identify from.")
+    ] = None,
+    sine: Annotated[str | None, typer.Option("--sine", metavar="FILE", help="Another one, to validate on.")] = None,
+    time: Time = None,
+    sampling: Step = None,
+    inputs: Inputs = None,
+    outputs: Outputs = None,
+    units: Units = None,
+    columns: Columns = None,
+    between: Between = None,
+    sliced: Slice = None,
+    resample: Resample = None,
+    step: LatticeStep = 0.05,
+    noise: Annotated[float, typer.Option("--noise", help="Noise on every angle of the virtual rig [rad].")] = 1e-4,
+    seed: Annotated[int, typer.Option("--noise-seed", min=0, help="Seed of that noise.")] = 1,
+    seeds: Seeds = None,
+    evaluations: Evaluations = None,
+    threads: Threads = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Recompute the tables and figures of the paper, on the virtual rig or on measured runs, as one page."""
+    from ftlm.progress import Progress  # noqa: PLC0415 — a command imports what it needs when it runs
+    from ftlm.report.page import check_free  # noqa: PLC0415
+    from ftlm.report.reproduction import reproduction_text  # noqa: PLC0415
+    from ftlm.reproduction import check_folder  # noqa: PLC0415
+
+    check_writable([out], force=force)
+    check_free(out, force=force)
+    if save is not None:
+        check_folder(Path(save), {}, force=force)
+    if sine is not None and square is None:
+        raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
+    options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
+    loaded = [load_runs([f], sliced, **options)[0] for f in (square, sine) if f is not None]
+    with Progress("", quiet=as_json) as progress:
+        found = ftlm.reproduce(
+            *loaded, step=step, noise=noise, seed=seed, genetic=genetic_of(seeds, evaluations, "genetic"),
+            threads=threads, say=progress.say, progress=progress,
+        )  # fmt: skip
+        progress.say("writing the page")
+        files = [found.page(out, force=force), *(found.save(save, force=force) if save is not None else [])]
+    if as_json:
+        document = {**found.to_dict(), "files": [str(f) for f in files]}
+        print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False, default=plain))
+    else:
+        print(reproduction_text(found))
+        print("\nwritten: " + ", ".join(str(f) for f in files))
 
 
 @app.command()

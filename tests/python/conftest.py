@@ -104,3 +104,9 @@ def small_run(small_model):
     u = np.where(np.arange(n) % 160 < 90, 1.0, -0.6)
     empty = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": np.zeros(n)}, name="small")
     return small_model.simulate(empty, tolerance=1e-9)
+
+
+@pytest.fixture(scope="session")
+def reproduction():
+    """The paper's section 5 on a coarse lattice, with few evaluations of the genetic algorithm."""
+    return ftlm.reproduce(step=0.25, genetic=ftlm.Genetic(seeds=(0, 1), evaluations=800))

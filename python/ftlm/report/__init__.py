@@ -11,7 +11,7 @@ from ftlm.report.figures import (
     residual_charts,
     trace_chart,
 )
-from ftlm.report.landscape import Landscape, landscape
+from ftlm.report.landscape import Landscape, correlated_orders, landscape, output_error_landscape
 from ftlm.report.page import Section, identification_page, model_page, write_page
 from ftlm.report.tables import (
     Exact,
@@ -39,6 +39,7 @@ __all__ = [
     "Table",
     "bode_charts",
     "comparison_charts",
+    "correlated_orders",
     "equation_html",
     "error_chart",
     "errors_table",
@@ -48,6 +49,7 @@ __all__ = [
     "landscape",
     "line_chart",
     "model_page",
+    "output_error_landscape",
     "paper_row",
     "paper_table",
     "paper_table_text",

@@ -701,6 +701,7 @@ def error_chart(
     run: int = 0,
     title: str = "",
     units: Mapping[str, str] | None = None,
+    points: int = POINTS,
 ) -> Figure:
     """Absolute error of the free runs of several models on one run, as in the paper's Figure 4(a).
 
@@ -716,6 +717,8 @@ def error_chart(
         Default: says what is shown.
     units
         Units of the outputs.
+    points
+        Most points of a line.
     """
     if not compared:
         raise DataError("an error chart needs at least one comparison; give (name, comparison) pairs")
@@ -726,10 +729,11 @@ def error_chart(
         title=title or f"{symbol(output)}: absolute error of the free run",
         x_label="time [s]",
         y_label=_with_unit("|error|", units, output),
+        points=points,
     )
 
 
-def trace_chart(traces: Sequence[tuple[str, Trace]], *, title: str) -> Figure:
+def trace_chart(traces: Sequence[tuple[str, Trace]], *, title: str, log_x: bool = False) -> Figure:
     """Error (45) of the free run after every step of the recursion (44), as in the paper's Figure 4(b).
 
     Parameters
@@ -738,6 +742,8 @@ def trace_chart(traces: Sequence[tuple[str, Trace]], *, title: str) -> Figure:
         (name, trace), such as ("p = 7", …), of one equation and with the same steps.
     title
         What is shown.
+    log_x
+        Whether the axis of steps is logarithmic, which widens the first ones.
 
     Raises
     ------
@@ -752,7 +758,7 @@ def trace_chart(traces: Sequence[tuple[str, Trace]], *, title: str) -> Figure:
             raise DataError(f"trace {name!r} is given at other steps than {traces[0][0]!r}; use the same every=")
     return line_chart(
         steps, [(name, trace.error) for name, trace in traces], title=title, x_label="step of the recursion",
-        y_label="error (45) of the free run", log_y=True,
+        y_label="error (45) of the free run", log_x=log_x, log_y=True,
     )  # fmt: skip
 
 
@@ -897,9 +903,11 @@ def heat_map(landscape: Landscape, *, title: str = "") -> Figure:
     best = np.unravel_index(int(np.argmin(np.where(np.isfinite(landscape.scores), landscape.scores, np.inf))),
                             landscape.scores.shape)  # fmt: skip
     at = f"{symbol(across)} = {landscape.x[best[1]]:g}, {symbol(upward)} = {landscape.y[best[0]]:g}"
-    described = f"Heat map. Best score {number(low)} at {at}; worst {number(high)}."
+    described = f"Heat map of {landscape.score}. Best {number(low)} at {at}; worst {number(high)}."
     left_out = int(np.sum(~np.isfinite(landscape.scores)))
-    caption = f"Best: {at} (ring). Dark is good; colours are steps of the logarithm. Other orders as in the best model."
+    caption = f"Best: {at} (ring). Dark is good; colours are steps of the logarithm. {landscape.others}"
+    if landscape.score != "score":
+        caption += f" Score: {landscape.score}."
     if left_out:
         caption += f" Grey: {left_out} pairs that are no candidate or whose free run diverges."
     drawings = [
@@ -914,8 +922,10 @@ def _heat_drawing(
 ) -> Markup:
     width = NARROW if narrow else SMALL
     rows, columns = landscape.scores.shape
-    left, top, bottom = 46.0, 26.0, 84.0
-    w = width - left - 14
+    marks = [[f"{v:g}" for v in axis] for axis in (landscape.x, landscape.y)]
+    longest = [max(map(len, each)) for each in marks]
+    left, top, bottom = max(46.0, LETTER * longest[1] + 12), 26.0, 84.0
+    w = width - left - max(14.0, LETTER * longest[0] / 2)
     cell_w = w / columns
     h = min(max(rows * 6.0, 140.0), 300.0)
     cell_h = h / rows
@@ -954,10 +964,11 @@ def _heat_drawing(
         )
     out.append(Markup('<g font-size="12" fill="currentColor">'))
     across, upward = landscape.names
-    for k in np.unique(np.linspace(0, columns - 1, min(columns, 5 if narrow else 9)).round().astype(int)).tolist():
-        out.append(_text(left + (k + 0.5) * cell_w, top + h + 16, f"{landscape.x[k]:g}", "middle"))
+    fit = max(2, min(columns, 5 if narrow else 9, int(w / (LETTER * longest[0] + 14))))
+    for k in np.unique(np.linspace(0, columns - 1, fit).round().astype(int)).tolist():
+        out.append(_text(left + (k + 0.5) * cell_w, top + h + 16, marks[0][k], "middle"))
     for k in np.unique(np.linspace(0, rows - 1, min(rows, 7)).round().astype(int)).tolist():
-        out.append(_text(left - 6, top + h - (k + 0.5) * cell_h + 4, f"{landscape.y[k]:g}", "end"))
+        out.append(_text(left - 6, top + h - (k + 0.5) * cell_h + 4, marks[1][k], "end"))
     out.append(_text(4, top - 12, f"order {symbol(upward)}", "start"))
     out.append(_text(left + w, top + h + 34, f"order {symbol(across)}", "end"))
     size = 20.0 if narrow else 26.0

@@ -30,7 +30,7 @@ from ftlm.report.figures import (
     response_frequencies,
     trace_chart,
 )
-from ftlm.report.landscape import landscape
+from ftlm.report.landscape import landscape, output_error_landscape
 from ftlm.report.tables import (
     Table,
     equation_html,
@@ -376,6 +376,15 @@ def _search_sections(result: Identification) -> list[Section]:
         sections.append(
             Section("Order search", tables=[search_summary(result.searches), *tops], figures=maps, small=True)
         )
+    around = output_error_landscape(result)
+    if around is not None:
+        first, second = map(symbol, around.names)
+        words = (
+            f"The two orders that these runs tell apart least are {first} and {second}: the correlation of their "
+            f"estimates is {number(around.correlation, 3)}. For white residuals the 95 % region of both ends at a "
+            "score of 7."
+        )
+        sections.append(Section("Order landscape", words, figures=[heat_map(around)], small=True))
     return sections
 
 

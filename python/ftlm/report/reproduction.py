@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+import re
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
@@ -24,7 +26,7 @@ from ftlm.report.figures import (
 )
 from ftlm.report.landscape import output_error_landscape
 from ftlm.report.page import Section, check_free, write_page
-from ftlm.report.tables import Exact, Table, equation_html, parameter_table, search_summary, symbol, symbol_html
+from ftlm.report.tables import Exact, Table, equation_html, number, search_summary, symbol, symbol_html
 from ftlm.reproduction import TRACE_EVERY, WEAK_PRIOR, implied_spreads, printed_saturation, table_3_coefficients
 from ftlm.validation import metrics
 
@@ -42,6 +44,7 @@ __all__ = ["reproduction_page", "reproduction_text"]
 
 #: Points of a line of these charts: there are some fifty on the page, which stays below 2 MB.
 LINE_POINTS = 500
+WEAK = f"10{str(round(math.log10(WEAK_PRIOR))).translate(str.maketrans('0123456789', '⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
 LETTERS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
 PAPER = (
     "Wang, Li, Li, Liang, Gao: Establishment and Identification of Fractional-Order Model for Structurally Symmetric "
@@ -82,7 +85,7 @@ STEPS = (
 # ------------------------------------------------------------------------------------------------ rows and tables
 
 
-def _letters(found: dict[str, float], output: str) -> dict[str, float]:
+def _letters(found: dict[str, Any], output: str) -> dict[str, Any]:
     """Numbers of one angle's equation without their index: alpha1 is alpha."""
     index = str(printed.OUTPUTS.index(output) + 1)
     return {n.rstrip("0123456789"): v for n, v in found.items() if n[len(n.rstrip("0123456789")) :] == index}
@@ -109,29 +112,27 @@ def _printed_cells(row: Printed) -> list[Cell]:
     orders = [Exact(row.orders[n]) if n in row.orders else None for n in LETTERS[0]]
     coefficients = [Exact(row.coefficients[n]) if n in row.coefficients else None for n in LETTERS[1]]
     criteria: list[Cell] = [None if v is None else Exact(v) for v in (row.error, row.rmse, row.nr)]
-    return [*orders, *coefficients, None, None, None, *criteria, None]
+    return [*orders, *coefficients, *criteria]
 
 
 def model_rows(stage: Stage, output: str) -> list[list[Cell]]:
     """Rows of Table 4 or 5 for one angle, computed and printed in turn."""
-    beside = {"integer, manual, Euler": printed.INTEGER[output]}
+    beside = {"integer, Euler": printed.INTEGER[output]}
     beside |= {f"p = {p}": row for p, row in printed.FRACTIONAL[output].items()}
     rows: list[list[Cell]] = []
     for label, candidate in stage.candidates.items():
         orders, coefficients = _numbers(candidate, output)
-        validation = candidate.validation
         rows.append(
             [
                 label,
                 *(Exact(round(orders[n], 4) + 0.0) if n in orders else None for n in LETTERS[0]),
                 *(coefficients.get(n) for n in LETTERS[1]),
-                *_three(candidate.estimation.equation_error.get(output)),
                 *_three(candidate.estimation.output_error.get(output)),
-                None if validation is None else validation.output_error[output].nr,
             ]
         )
         if label in beside:
-            rows.append([Markup("<em>printed: {}</em>").format(label), *_printed_cells(beside[label])])
+            shown = label.partition(",")[0]
+            rows.append([Markup("<em>printed: {}</em>").format(shown), *_printed_cells(beside[label])])
     return rows
 
 
@@ -145,19 +146,18 @@ def model_table(stage: Stage, title: str) -> Table:
     heads = ("error (45)", "RMSE", "NR")
     return Table(
         title,
-        ("model", *(symbol_html(n) for n in (*LETTERS[0], *LETTERS[1])), *heads, *heads, "NR"),
+        ("model", *(symbol_html(n) for n in (*LETTERS[0], *LETTERS[1])), *heads),
         rows,
-        groups=(("", 1), ("orders", 4), ("coefficients", 4), ("equation error", 3), ("output error (free run)", 3),
-                ("other input", 1)),
+        groups=(("", 1), ("orders", 4), ("coefficients", 4), ("output error (free run)", 3)),
         headings=headings,
         note="Free runs are driven as the method drives them: rows of p, least squares, instrumental variables and the "
-        "identified integer model by the current and the measured other angle; the manual's model and output error by "
-        "the current alone. Errors in rad. " + PRINTED_NOTE,
+        "identified integer model by the current and the measured other angle; the manual's integer model (by explicit "
+        "Euler at the run's step, and exactly) and output error by the current alone. Errors in rad. " + PRINTED_NOTE,
     )  # fmt: skip
 
 
 def fits_table(stage: Stage) -> Table:
-    """Fit of every model on both inputs, as identified and from the current alone."""
+    """Both errors of every model, and its fit on both inputs, as identified and from the current alone."""
     rows: list[list[Cell]] = []
     headings = {}
     for output in stage.outputs:
@@ -168,34 +168,38 @@ def fits_table(stage: Stage) -> Table:
             rows.append(
                 [
                     label,
+                    candidate.estimation.equation_error[output].nr,
+                    candidate.estimation.output_error[output].nr,
                     candidate.estimation.output_error[output].fit,
                     None if validation is None else validation.output_error[output].fit,
-                    *(alone + [None, None])[:2],
+                    *[*alone, None, None][:2],
                 ]
             )
     return Table(
-        "Fit of the free run, percent",
-        ("model", "square", "sine", "square", "sine"),
+        f"Stage {stage.number}: both errors, and the fit of the free run on both inputs",
+        ("model", "equation error", "free run", "square", "sine", "square", "sine"),
         rows,
-        groups=(("", 1), ("driven as identified", 2), ("from the current alone", 2)),
+        groups=(("", 1), ("NR on the square", 2), ("fit %, driven as identified", 2), ("fit %, current alone", 2)),
         headings=headings,
         note="Everything was identified from the square run. 100 is perfect, 0 is as good as the mean.",
     )
 
 
-def claims_table(found: Reproduction) -> Table:
-    """What holds and what does not."""
-    words = {True: "holds", False: "does not hold", None: "cannot be told"}
-    rows: list[list[Cell]] = [
-        [c.claim, Markup("<strong>{}</strong>").format(words[c.holds]), c.evidence] for c in found.claims
+def verdicts(found: Reproduction) -> list[str]:
+    """What holds and what does not, a paragraph each."""
+    words = {True: "Holds.", False: "Does not hold.", None: "Cannot be told."}
+    return [
+        Markup('<span class="verdict"><strong>{} {}</strong><span class="note">{}</span></span>').format(
+            words[c.holds], c.claim, c.evidence[0].upper() + c.evidence[1:]
+        )
+        for c in found.claims
     ]
-    return Table("The paper's claims, and slips, against these numbers", ("claim", "verdict", "numbers"), rows)
 
 
 def symbols_table() -> Table:
     """Table 1."""
     rows: list[list[Cell]] = [list(row) for row in SYMBOLS]
-    return Table("Table 1. Symbols", ("symbol", "what it is", "name here"), rows)
+    return Table("Table 1. Symbols", ("symbol", "what it is", "name here"), rows, wrap=True)
 
 
 def steps_table() -> Table:
@@ -204,7 +208,8 @@ def steps_table() -> Table:
         [f"{k}. {step}", Markup(", ").join(Markup("<code>{}</code>").format(f) for f in functions.split(", ")), how]
         for k, (step, functions, how) in enumerate(STEPS, 1)
     ]
-    return Table("Table 2. The seven steps, and the functions of ftlm that do them", ("step", "function", "how"), rows)
+    title = "Table 2. The seven steps, and the functions of ftlm that do them"
+    return Table(title, ("step", "function", "how"), rows, wrap=True)
 
 
 def parameters_table() -> Table:
@@ -245,32 +250,34 @@ def integer_table() -> Table:
     )  # fmt: skip
 
 
-def saturation_table(stage: Stage) -> Table:
+def saturation_table(found: Reproduction) -> Table:
     """What p does: coefficients with the prior of the paper's kind, and with a weak one."""
-    x, c, _ = printed_saturation()
     rows: list[list[Cell]] = []
     headings = {}
-    for output in stage.outputs:
-        headings[len(rows)] = symbol_html(output)
+    for stage in found.stages.values():
         last = stage.candidates[f"p = {printed.INNOVATION_LENGTHS[-1]}"]
-        name = f"a{printed.OUTPUTS.index(output) + 1}"
-        for p in printed.INNOVATION_LENGTHS:
-            own = stage.candidates[f"p = {p}"]
-            alike = _numbers(own, output)[0] == _numbers(last, output)[0]
-            value = own.model.coefficients[name]
-            printed_value = printed.FRACTIONAL[output][p].coefficients["a"]
-            law = x * p / (p + c) if output == "theta11" else None
-            rows.append(
-                [f"p = {p}", value, "yes" if alike else "no", stage.weak[output][p][name], Exact(printed_value), law]
-            )
+        for output in stage.outputs:
+            headings[len(rows)] = symbol_html(output)
+            x, c, _ = printed_saturation(output)
+            name = f"a{printed.OUTPUTS.index(output) + 1}"
+            for p in printed.INNOVATION_LENGTHS:
+                own = stage.candidates[f"p = {p}"]
+                alike = _numbers(own, output)[0] == _numbers(last, output)[0]
+                value, stated = own.model.coefficients[name], printed.FRACTIONAL[output][p].coefficients["a"]
+                weak = stage.weak[output][p][name] if stage.weak else None
+                rows.append(
+                    [f"p = {p}", value, "yes" if alike else "no", weak, Exact(stated),
+                     x * p / (p + c)]
+                )  # fmt: skip
     return Table(
         "Coefficient a by innovation length",
-        ("", "K0 = 1", "at the orders of p = 7", f"K0 = {WEAK_PRIOR:.0e}", "printed", "x·p / (p + c)"),
+        ("", Markup("<i>K</i><sub>0</sub> = 1"), "orders of p = 7", Markup("<i>K</i><sub>0</sub> = {}").format(WEAK),
+         "printed", Markup("<i>x p</i> / (<i>p</i> + <i>c</i>)")),
         rows,
         headings=headings,
-        note=f"x = {x:.5g} and c = {c:.4g} through the printed a₁ of p = 1 and 7. Column K0 = {WEAK_PRIOR:.0e}: at the "
-        "orders of p = 7.",
-    )
+        note="The last column is the curve of a prior through the printed values of p = 1 and p = 7. With the weak "
+        "prior all p are at the orders of p = 7.",
+    )  # fmt: skip
 
 
 def genetic_table(found: Reproduction) -> Table:
@@ -356,13 +363,17 @@ def bounds_table(found: Reproduction) -> Table:
     """Bounds of the genetic algorithm."""
     rows: list[list[Cell]] = []
     for stage in found.stages.values():
-        for rival in stage.rivals.values():
-            if rival.genetic.result is not None:
-                bounds = rival.genetic.result.settings["bounds"]
-                rows += [[symbol_html(n), Exact(b[0]) if abs(b[0]) < 10 else b[0], b[1]] for n, b in bounds.items()]
+        for output, rival in stage.rivals.items():
+            settings = {} if rival.genetic.result is None else rival.genetic.result.settings
+            bounds = _letters({n: tuple(b) for n, b in settings["bounds"].items()}, output)
+            cells = [
+                f"{number(Exact(low), 4)} … {number(Exact(high), 4)}" for low, high in (bounds[n] for n in LETTERS[0])
+            ]
+            cells += [f"±{number(high, 4)}" for _, high in (bounds[n] for n in LETTERS[1])]
+            rows.append([symbol_html(output), *cells])
     return Table(
         "Bounds of the genetic algorithm",
-        ("number", "from", "to"),
+        ("", *(symbol_html(n) for n in (*LETTERS[0], *LETTERS[1]))),
         rows,
         note="Orders in steps of 0.001, on the interval of the lattice. Coefficients: twice the value that the maker "
         "states, or four times what makes a term alone as large as the output.",
@@ -378,8 +389,8 @@ def intervals_table(found: Reproduction, stage: Stage) -> Table:
         for name, value in {**result.orders, **result.joint.coefficients}.items():
             low, high = result.intervals[name]
             rows.append([symbol_html(name), value, result.standard_errors[name], low, high, truth.get(name)])
-    columns = ("parameter", "value", "standard error", "from", "to", "true value")
-    groups = (("", 3), ("95 % interval", 2), ("", 1))
+    columns = ["parameter", "value", "standard error", "from", "to", "true value"]
+    groups = [("", 3), ("95 % interval", 2), ("", 1)]
     if not truth:
         rows, columns, groups = [r[:-1] for r in rows], columns[:-1], groups[:-1]
     return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
@@ -406,7 +417,7 @@ def fit_chart(
 
 def _beside_integer(stage: Stage, output: str, *, sine: bool) -> list[tuple[str, Comparison]]:
     last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
-    labels = (("integer, manual", "integer, manual, Euler"), (last, last), ("output error", "output error"))
+    labels = (("integer, manual", "integer, Euler"), (last, last), ("output error", "output error"))
     found = []
     for shown, label in labels:
         candidate = stage.candidates[label]
@@ -427,15 +438,18 @@ def stage_figures(stage: Stage) -> list[Figure]:
     lengths = [f"p = {p}" for p in printed.INNOVATION_LENGTHS]
     figures = []
     for k, output in enumerate(stage.outputs):
-        number = first + k
+        place = first + k
         errors = [(label, stage.candidates[label].estimation) for label in lengths]
         chart = error_chart(
-            errors, output, title=f"Figure {number}(a). {symbol(output)}: absolute error of the free run",
+            errors, output, title=f"Figure {place}(a). {symbol(output)}: absolute error of the free run",
             units={output: "rad"}, points=LINE_POINTS,
         )  # fmt: skip
         figures.append(chart)
-        named = [(f"p = {p}", trace) for p, trace in stage.traces[output].items()]
-        figures.append(trace_chart(named, title=f"Figure {number}(b). {symbol(output)}: error (45) after each step"))
+        named = [(f"p = {p}", trace) for p, trace in stage.traces.get(output, {}).items()]
+        if not named:
+            continue
+        title = f"Figure {place}(b). {symbol(output)}: error (45) after each step"
+        figures.append(trace_chart(named, title=title, log_x=True))
     for k, output in enumerate(stage.outputs):
         models = _beside_integer(stage, output, sine=False)
         figures.append(
@@ -490,10 +504,10 @@ BOXES = (
     ("Energies", "(7)–(11)"),
     ("Equations", "(14)–(21), (26)"),
     ("Pulse means", "(28)–(39)"),
-    ("Orders on a lattice", "Table 2, step 5"),
+    ("Orders", "on a lattice"),
     ("Coefficients", "(42)–(44)"),
     ("Free run", "(26), (45)"),
-    ("Smallest error", "orders, coefficients"),
+    ("Smallest error", "the model"),
 )
 
 
@@ -521,7 +535,7 @@ def _flow(described: str, *, narrow: bool) -> Markup:
     ]
     for x, y in places:
         out.append(Markup('<rect x="{}" y="{}" width="{}" height="{}" rx="5"/>').format(x, y, w, h))
-    for (x, y), (x2, y2) in zip(places, places[1:], strict=False):
+    for (x, y), (x2, y2) in pairwise(places):
         if narrow:
             line, head = f"M{x + w / 2} {y + h}V{y2}", f"M{x + w / 2 - 4} {y2 - 7}l4 7l4 -7"
         else:
@@ -553,16 +567,26 @@ def _flow(described: str, *, narrow: bool) -> Markup:
 # ------------------------------------------------------------------------------------------------ the page
 
 
+def grouped_warnings(stage: Stage) -> list[str]:
+    """Warnings of all models, those that differ in numbers alone together."""
+    groups: dict[str, tuple[str, list[str]]] = {}
+    for label, candidate in stage.candidates.items():
+        for warning in () if candidate.result is None else candidate.result.warnings:
+            # Digits of names stay: theta11 is not theta12.
+            key = re.sub(r"(?<![A-Za-z\d.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", warning)
+            groups.setdefault(key, (warning, []))[1].append(label)
+    found = []
+    for warning, labels in groups.values():
+        names = list(dict.fromkeys(labels))
+        alike = "" if len(labels) == 1 else " (numbers of the first)"
+        found.append(f"{', '.join(names)}: {warning}{alike}")
+    return found
+
+
 def _stage_section(found: Reproduction, stage: Stage) -> Section:
     number = stage.number
     table = 4 if number == 1 else 5
     joint = stage.candidates["output error"]
-    warnings = [
-        f"{label}: {w}"
-        for label, candidate in stage.candidates.items()
-        if candidate.result is not None
-        for w in candidate.result.warnings
-    ]
     searches = {
         f"{label}, {o}": s
         for label, c in stage.candidates.items()
@@ -575,7 +599,7 @@ def _stage_section(found: Reproduction, stage: Stage) -> Section:
             "Joint output error, order law and coefficient law imposed:",
             *(equation_html(e) for e in joint.model.equations),
         ],
-        warnings=warnings,
+        warnings=grouped_warnings(stage),
         tables=[
             model_table(stage, f"Table {table}. Identified models of stage {number}, square input"),
             intervals_table(found, stage),
@@ -589,9 +613,9 @@ def _stage_section(found: Reproduction, stage: Stage) -> Section:
 def _weak_section(found: Reproduction) -> Section:
     figures = []
     for stage in found.stages.values():
-        for output in stage.outputs:
-            named = [(f"p = {p}", trace) for p, trace in stage.weak_traces[output].items()]
-            figures.append(trace_chart(named, title=f"{symbol(output)}: error (45) after each step, weak prior"))
+        for output, traces in stage.weak_traces.items():
+            named = [(f"p = {p}", trace) for p, trace in traces.items()]
+            figures.append(trace_chart(named, title=f"{symbol(output)}: error (45), weak prior", log_x=True))
     return Section(
         "What p does",
         paragraphs=[
@@ -599,7 +623,7 @@ def _weak_section(found: Reproduction) -> Section:
             "holds the coefficients near 0 with covariance K0. So p is a weight of the data against the prior. With a "
             "weak prior every p gives the least-squares answer, step by step.",
         ],
-        tables=[saturation_table(s) for s in found.stages.values()],
+        tables=[saturation_table(found)],
         figures=figures,
         small=True,
     )
@@ -619,7 +643,7 @@ def _near_section(found: Reproduction) -> Section:
         output = stage.outputs[1]
         figures.append(
             fit_chart(
-                stage.near.estimation, [("free run, printed orders", stage.near.estimation)], output,
+                stage.near.estimation, [("printed orders", stage.near.estimation)], output,
                 f"{symbol(output)}: the orders of Table {3 + stage.number} with the best coefficients for this run",
             )
         )  # fmt: skip
@@ -631,8 +655,8 @@ def _near_section(found: Reproduction) -> Section:
         "equation error (RMSE) ranks its candidates.",
     )
     words = (
-        "With α − ν small, I^(α−ν) y is nearly y itself. A few such terms reproduce any smooth signal on the right-hand "
-        "side, whatever the machine is; only the free run shows what the equation knows."
+        "With α − ν small, I^(α−ν) y is nearly y itself. A few such terms reproduce any smooth signal on the "
+        "right-hand side, whatever the machine is; only the free run shows what the equation knows."
     )
     return Section("Orders close to one another", [words], tables=[table], figures=figures)
 
@@ -668,8 +692,8 @@ def _landscape_section(found: Reproduction) -> Section:
         if drawn is not None:
             figures.append(heat_map(drawn))
             words.append(
-                f"Stage {stage.number}: the two orders that this run tells apart least are {symbol(drawn.names[0])} and "
-                f"{symbol(drawn.names[1])} (correlation {drawn.correlation:.3f})."
+                f"Stage {stage.number}: the two orders that this run tells apart least are {symbol(drawn.names[0])} "
+                f"and {symbol(drawn.names[1])} (correlation {number(drawn.correlation, 3)})."
             )
     return Section("Order landscape", words, figures=figures, small=True)
 
@@ -698,7 +722,8 @@ def _runs_section(found: Reproduction) -> Section:
     notes = [
         f"M = {m} block pulses, order lattice in steps of {found.lattice.step:g}, α from {found.lattice.alpha[0]:g} to "
         f"{found.lattice.alpha[1]:g}, K0 = 1, rows in Haar coordinates from coarse to fine. Convergence is drawn at "
-        f"every {TRACE_EVERY}th step. Instrumental variables are searched at α = 2.",
+        f"every {TRACE_EVERY}th step. Instrumental variables are searched two steps around the "
+        "orders of least squares.",
         "Explicit Euler steps at the step of the run, 0.002 s on the virtual rig, as in the paper.",
         *found.notes,
     ]
@@ -734,7 +759,7 @@ def reproduction_page(found: Reproduction, path: str | os.PathLike[str], *, forc
         [] if found.sine is not None else ["No second run was given: nothing is validated, Figure 10 is left out."]
     )
     sections = [
-        Section("What holds and what does not", warnings=[*missing, *found.notes], tables=[claims_table(found)]),
+        Section("What holds and what does not", verdicts(found), warnings=[*missing, *found.notes]),
         Section(
             "Symbols and steps",
             ["Figures 1 and 3 are pictures of the authors' arm and are not shown."],
@@ -764,8 +789,8 @@ def reproduction_page(found: Reproduction, path: str | os.PathLike[str], *, forc
     ]  # fmt: skip
     origin = "a simulated arm whose truth is known" if found.simulated else f"the runs {_names(found)}"
     lead = (
-        f"Section 5 of the paper, recomputed on {origin}, beside what the paper prints. {PAPER}. Numbers in rows marked "
-        "“printed” are the paper's; every other number, figure and verdict on this page is computed."
+        f"Section 5 of the paper, recomputed on {origin}, beside what the paper prints. {PAPER}. Numbers in rows "
+        "marked “printed” are the paper's; every other number, figure and verdict on this page is computed."
     )
     return write_page(path, title="The paper reproduced", sections=sections, lead=lead, force=force)
 

@@ -141,6 +141,8 @@ class Table:
         Lines across the table, by the index of the row that they stand above.
     note
         Sentence below the table.
+    wrap
+        Whether text in cells breaks into lines; otherwise every row is one line.
     """
 
     title: str
@@ -149,6 +151,7 @@ class Table:
     groups: Sequence[tuple[str, int]] = ()
     headings: Mapping[int, str] = field(default_factory=dict)
     note: str = ""
+    wrap: bool = False
 
     @property
     def is_numeric(self) -> list[bool]:
@@ -179,7 +182,7 @@ class Table:
         """Return the table in a container that scrolls by itself on a narrow screen."""
         classes = [Markup(' class="{}"').format(c) if c else Markup("") for c in self._classes()]
         # The title stands outside of what scrolls, so that it wraps; the label tells it to those who listen.
-        dense = " dense" if len(self.columns) >= DENSE else ""
+        dense = " dense" if len(self.columns) >= DENSE else " wrap" if self.wrap else ""
         out = [Markup('<div class="table{}"><p class="title">{}</p>').format(dense, self.title)]
         out.append(Markup('<div class="scroll" role="group" tabindex="0" aria-label="{}">').format(self.title))
         out.append(Markup('<table aria-label="{}"><thead>').format(self.title))
@@ -255,7 +258,7 @@ def _symbol_math(name: str) -> Markup:
 
 
 def _derivative_math(order: Order, signal: str) -> Markup:
-    if not order.names and order.constant == 0:
+    if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return _symbol_math(signal)
     value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed(order.constant)
     return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN, _symbol_math(signal))
@@ -268,7 +271,7 @@ def _signed(value: float) -> Markup:
 
 
 def _derivative_html(order: Order, signal: str) -> Markup:
-    if not order.names and order.constant == 0:
+    if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return symbol_html(signal)
     text = str(order) if order.names else number(Exact(round(order.constant, ORDER_DECIMALS) + 0.0))
     return Markup("D<sup>{}</sup> {}").format(text, symbol_html(signal))

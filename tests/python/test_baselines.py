@@ -1,0 +1,157 @@
+"""The genetic baseline: finds what is there, repeats itself, leaves early without a change, refuses nonsense."""
+
+import random
+import sys
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm import baselines
+from ftlm.baselines import Genetic, genetic_search, polynomial, simulated_binary
+from ftlm.order_search import prepare
+
+EQUATION = "D^alpha y = a D^nu y + c y + b u"
+BOUNDS = {"a": (-10.0, 0.0), "c": (-20.0, 0.0), "b": (0.0, 10.0)}
+LATTICE = ftlm.lattice(step=0.1, alpha=(1.3, 1.9))
+
+
+@pytest.fixture(scope="module")
+def found(small_run):
+    return ftlm.identify(
+        small_run, ftlm.equation(EQUATION), method="genetic", lattice=LATTICE,
+        genetic=Genetic(seeds=(0, 1), evaluations=12000, population=100, bounds=BOUNDS),
+    )  # fmt: skip
+
+
+def test_the_optimum_of_a_clean_run_is_found(found):
+    assert found.method == "genetic"
+    assert found.fit_percent["y"] > 98
+    assert all(BOUNDS[n][0] <= value <= BOUNDS[n][1] for n, value in found.coefficients.items())
+    assert found.intervals == {}
+
+
+def test_the_error_is_that_of_compare_and_of_the_best_seed(found, small_run):
+    errors = found.settings["errors"]["y"]
+    assert set(errors) == {"0", "1"}
+    assert min(errors.values()) == pytest.approx(found.output_error["y"].error, rel=1e-9)
+    assert found.model.compare(small_run, m=found.settings["m"]).output_error["y"] == found.output_error["y"]
+
+
+def test_what_the_result_depends_on_is_told(found):
+    assert found.settings["seeds"] == [0, 1]
+    assert found.settings["bounds"]["a"] == [-10.0, 0.0]
+    assert found.settings["bounds"]["alpha"] == [1.3, 1.9]
+    # The last generation may go a little past what was asked for.
+    assert 2 * 12000 <= found.settings["evaluations"]["y"] <= 2 * (12000 + 100)
+    assert "seeds 0, 1" in str(found)
+    assert "genetic" in str(found.to_dict())
+
+
+def test_orders_keep_to_their_steps_and_below_alpha(found):
+    for value in found.orders.values():
+        assert value == pytest.approx(round(value / baselines.RESOLUTION) * baselines.RESOLUTION, abs=1e-12)
+    assert found.orders["nu"] < found.orders["alpha"]
+
+
+def searched(run, threads=1, **options):
+    structure = ftlm.equation(EQUATION)
+    settings = Genetic(**{"seeds": (3,), "evaluations": 600, "population": 40, "bounds": BOUNDS, **options})
+    return genetic_search(
+        prepare([run], structure, 256, power_of_two=True), structure, LATTICE, settings, threads=threads
+    )
+
+
+def test_equal_seeds_give_equal_results_for_any_number_of_threads_and_touch_no_global_generator(small_run):
+    np.random.seed(5)
+    random.seed(5)
+    before = np.random.get_state()[1].tolist(), random.getstate()
+    first = searched(small_run)
+    assert first == searched(small_run, threads=3)
+    assert (np.random.get_state()[1].tolist(), random.getstate()) == before
+    assert searched(small_run, seeds=(4,)).errors != first.errors
+
+
+def test_leaving_hopeless_candidates_early_changes_nothing(small_run, monkeypatch):
+    early = searched(small_run)
+    monkeypatch.setattr(baselines._Kept, "limit", property(lambda self: np.inf))
+    assert searched(small_run) == early
+
+
+def test_as_many_evaluations_as_the_lattice_has_candidates(small_run):
+    lattice = ftlm.lattice(step=0.25, alpha=(1.25, 2.0))
+    candidates = ftlm.search_orders(
+        small_run, ftlm.equation(EQUATION), lattice, coefficients="least-squares"
+    ).candidates
+    told = []
+    structure = ftlm.equation(EQUATION)
+    found = genetic_search(
+        prepare([small_run], structure, 256, power_of_two=True), structure, lattice,
+        Genetic(seeds=(0,), population=8, bounds=BOUNDS), progress=lambda done, total: told.append((done, total)),
+    )  # fmt: skip
+    assert candidates <= found.evaluations[0] <= candidates + 8
+    assert told[-1] == (candidates, candidates)
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+
+
+def test_all_equations_of_a_stage_under_their_order_law(clean_a):
+    structure = ftlm.flexible_link(stage=1, coupling="measured")
+    found = ftlm.identify(
+        clean_a, structure, method="genetic", m=256, lattice=ftlm.lattice(alpha=(2.0, 2.0)),
+        genetic=Genetic(seeds=(0,), evaluations=400, population=40),
+    )  # fmt: skip
+    assert set(found.orders) == set(structure.order_names)
+    law = ftlm.order_law(1)["beta1"].at(found.orders)
+    assert found.model.equations[0].terms[0].order.constant == pytest.approx(law, abs=1e-9)
+    assert np.isfinite(found.settings["errors"]["stage"]["0"])
+    with pytest.raises(
+        ftlm.ModelError, match=r"candidates, too many to evaluate one by one; give Genetic\(evaluations"
+    ):
+        ftlm.identify(clean_a, structure, method="genetic", m=256)
+
+
+def test_operators_keep_to_what_they_promise():
+    generator = np.random.RandomState(0)
+    low, high = np.array([-1.0, 0.0, 5.0]), np.array([1.0, 2.0, 5.0 + 1e-9])
+    parents = generator.uniform(low, high, (30, 3))
+    children = simulated_binary(parents, (201, 3), generator)
+    assert children.shape == (201, 3)
+    # Children spread around their parents without a drift.
+    assert np.allclose(children.mean(axis=0), parents.mean(axis=0), atol=0.2)
+    moved = polynomial(children, low, high, generator)
+    assert np.all(moved >= low)
+    assert np.all(moved <= high)
+    assert np.any(moved != children)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"population": 4}, r"population = 4 is outside \[8, 100000\]"),
+        ({"evaluations": 100}, "evaluations = 100 is less than two generations of 200"),
+        ({"seeds": ()}, r"seeds = \(\): give one or more whole numbers"),
+        ({"seeds": (-1,)}, "give one or more whole numbers"),
+        ({"seeds": "12"}, "give one or more whole numbers"),
+        ({"bounds": {"a": (1.0, 0.0)}}, "are no interval"),
+        ({"bounds": {"a": (0.0, np.nan)}}, "are no interval"),
+    ],
+)
+def test_settings_that_mean_nothing_are_refused(options, message):
+    with pytest.raises(ftlm.ModelError, match=message):
+        Genetic(**options)
+
+
+def test_what_cannot_be_done_is_said(small_run, monkeypatch):
+    structure = ftlm.equation(EQUATION)
+    with pytest.raises(ftlm.ModelError, match="bounds of 'q': there is no such number; free are alpha, nu, a, c, b"):
+        ftlm.identify(small_run, structure, method="genetic", genetic=Genetic(bounds={"q": (0, 1)}))
+    with pytest.raises(ftlm.ModelError, match="genetic settings are given, but method = 'least-squares'"):
+        ftlm.identify(small_run, structure, method="least-squares", genetic=Genetic())
+    with pytest.raises(ftlm.ModelError, match="genetic is dict, not Genetic"):
+        ftlm.identify(small_run, structure, method="genetic", genetic={"seeds": 1})
+    late = small_run.slice(2.0, None)
+    with pytest.raises(ftlm.ModelError, match="knows no initial terms and needs runs that start at rest"):
+        ftlm.identify(late, structure, method="genetic", genetic=Genetic(evaluations=400))
+    monkeypatch.setitem(sys.modules, "pygad", None)
+    with pytest.raises(ftlm.ModelError, match=r"pip install 'ftlm\[genetic\]'"):
+        ftlm.identify(small_run, structure, method="genetic", genetic=Genetic(evaluations=400))

@@ -1,0 +1,295 @@
+"""The paper's section 5: printed numbers are the paper's, computed ones can be computed again, verdicts follow them."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm import printed
+from ftlm.report.reproduction import reproduction_text
+from ftlm.reproduction import claims, settled_at, stages_of, table_3_coefficients
+from test_cli import ftlm_command
+from test_derivation import STIFFNESS_PAIRS, TABLE_3
+from test_oracles import PRINTED_CRITERIA, PRINTED_RIVALS
+
+
+@pytest.fixture(scope="module")
+def saved(reproduction, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reproduction")
+    reproduction.save(folder / "runs")
+    return folder / "runs"
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What is printed
+
+
+def test_printed_numbers_are_those_of_the_other_transcription():
+    for angle, rows in PRINTED_CRITERIA.items():
+        ours = [printed.INTEGER[angle], *printed.FRACTIONAL[angle].values()]
+        assert [(r.error, r.rmse, r.nr) for r in ours] == [tuple(map(float, row)) for row in rows]
+    for angle, rows in PRINTED_RIVALS.items():
+        assert list(printed.RIVALS[angle]) == [tuple(map(float, row)) for row in rows]
+    for stage, table in ((1, "table 4"), (2, "table 5")):
+        pairs = zip(*(printed.FRACTIONAL[f"theta{stage}{k}"].values() for k in (1, 2)), strict=True)
+        assert [(a.coefficients["a"], b.coefficients["a"]) for a, b in pairs] == STIFFNESS_PAIRS[table]
+        pair = tuple(printed.GENETIC[f"theta{stage}{k}"].coefficients["a"] for k in (1, 2))
+        assert pair == STIFFNESS_PAIRS["table 6"][stage - 1]
+        names = {"Ks": f"K_s{stage}", "Kt": f"K_τ{stage}", "J1": f"J_{stage}1", "J2": f"J_{stage}2"}
+        names |= {"B1": f"B_{stage}1", "B2": f"B_{stage}2"}
+        assert {n: printed.TABLE_3[full][0] for n, full in names.items()} == TABLE_3[stage]
+
+
+@pytest.mark.parametrize("stage", [1, 2])
+def test_printed_orders_obey_the_order_law(stage):
+    h, d = 2 * stage - 1, 2 * stage
+    law = ftlm.order_law(stage)
+    for rows in (lambda a: printed.FRACTIONAL[a][7], printed.GENETIC.__getitem__):
+        orders = {f"{n}{h}": v for n, v in rows(f"theta{stage}1").orders.items()}
+        orders |= {f"{n}{d}": v for n, v in rows(f"theta{stage}2").orders.items()}
+        for name, order in law.items():
+            if name != "input":
+                assert order.at(orders) == pytest.approx(orders[name], abs=1.1e-4)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Tables computed again from the saved runs
+
+
+@pytest.mark.parametrize(("table", "stage"), [(4, 1), (5, 2)])
+def test_tables_4_and_5_follow_from_the_saved_run(saved, table, stage):
+    written = json.loads((saved / "tables.json").read_text())["stages"][str(stage)]["models"]
+    run = ftlm.load(saved / "square.csv").select([f"I{stage}", f"theta{stage}1", f"theta{stage}2"])
+    structure = ftlm.flexible_link(stage=stage, coupling="measured", laws=())
+    for p in printed.INNOVATION_LENGTHS:
+        found = ftlm.identify(
+            run, structure, method="multi-innovation", innovation_length=p, lattice=ftlm.Lattice(step=0.25), keep=1
+        )
+        row = written[f"p = {p}"]
+        assert found.orders == row["orders"]
+        assert found.coefficients == row["coefficients"]
+        for kind in ("equation_error", "output_error"):
+            assert {n: f.to_dict() for n, f in getattr(found, kind).items()} == row["estimation"][kind]
+
+
+def test_every_model_s_errors_follow_from_its_file_and_the_saved_runs(saved):
+    written = json.loads((saved / "tables.json").read_text())
+    runs = {name: ftlm.load(saved / f"{name}.csv") for name in ("square", "sine")}
+    compared = 0
+    for number, stage in written["stages"].items():
+        for label, row in stage["models"].items():
+            name = "-".join("".join(c if c.isalnum() else " " for c in label).split())
+            model = ftlm.load_model(saved / f"stage{number}-{name}.json")
+            if label == "integer, Euler":
+                continue
+            for run, part in (("square", "estimation"), ("sine", "validation")):
+                found = model.compare(runs[run].select(list(model.structure.signals)))
+                for output, figures in found.output_error.items():
+                    wanted = row[part]["output_error"][output]
+                    assert figures.to_dict() == pytest.approx(wanted, rel=1e-12), (label, output)
+                    compared += 1
+    assert compared == 9 * 2 * 2 * 2
+
+
+def test_table_7_follows_from_the_saved_run(saved):
+    written = json.loads((saved / "tables.json").read_text())["stages"]["1"]["genetic"]["theta12"]
+    run = ftlm.load(saved / "square.csv").select(["I1", "theta11", "theta12"])
+    single = ftlm.flexible_link(stage=1, coupling="measured", laws=()).equation("theta12")
+    found = ftlm.identify(
+        run, single, method="genetic", genetic=ftlm.Genetic(seeds=(0, 1), evaluations=800),
+        lattice=ftlm.Lattice(step=0.25, alpha=(1.95, 2.0)),
+    )  # fmt: skip
+    assert found.settings["errors"]["theta12"] == written["genetic"]["settings"]["errors"]["theta12"]
+    assert found.output_error["theta12"].to_dict() == written["genetic"]["estimation"]["output_error"]["theta12"]
+    assert found.orders == written["genetic"]["orders"]
+
+
+def test_table_3_makes_other_coefficients_than_those_printed():
+    rows = table_3_coefficients()
+    assert rows["a1"] == (pytest.approx(2.69 / 0.0635), pytest.approx(628.89, abs=5e-3), 628.89)
+    assert sum(abs(t / p - 1) > 0.02 for t, _, p in rows.values()) == 10
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Verdicts
+
+
+def by_words(found, words):
+    return next(c for c in found if words in c.claim)
+
+
+def test_verdicts_follow_the_numbers(reproduction):
+    found = claims(reproduction)
+    errors = [
+        [s.candidates[f"p = {p}"].estimation.output_error[o].error for p in printed.INNOVATION_LENGTHS]
+        for s in reproduction.stages.values() for o in s.outputs
+    ]  # fmt: skip
+    assert by_words(found, "larger innovation length").holds is all(e == sorted(e, reverse=True) for e in errors)
+    assert by_words(found, "p itself improves").holds is False
+    assert by_words(found, "orders of Tables 4 and 5").holds is False
+    assert by_words(found, "Table 3 gives").holds is False
+    assert by_words(found, "Table 7 compares").holds is False
+    assert by_words(found, "better than whole ones").holds is True
+    assert by_words(found, "leaves the current").holds is False
+    assert by_words(found, "integer row of θ₂₂").holds is False
+
+
+def test_verdicts_turn_when_the_numbers_do(reproduction):
+    stage = reproduction.stages[1]
+    # p = 7 in the place of p = 1, and p = 1 in that of p = 7: errors rise with p.
+    swapped = dict(stage.candidates)
+    swapped["p = 1"], swapped["p = 7"] = swapped["p = 7"], swapped["p = 1"]
+    # Whole orders in the place of fractional ones.
+    swapped["output error"], swapped["integer, identified"] = swapped["integer, identified"], swapped["output error"]
+    weak = {o: {p: {n: v * p for n, v in c.items()} for p, c in each.items()} for o, each in stage.weak.items()}
+    other = replace(stage, candidates=swapped, weak=weak, near=stage.candidates["output error"])
+    found = claims(replace(reproduction, stages={1: other}))
+    assert by_words(found, "larger innovation length").holds is False
+    assert by_words(found, "better than whole ones").holds is False
+    assert by_words(found, "p itself improves").holds is True
+    assert by_words(found, "orders of Tables 4 and 5").holds is True
+
+
+def test_a_curve_has_settled_where_it_stays():
+    trace = ftlm.Trace(np.array([1, 2, 3, 4, 5]), {}, np.array([9.0, 1.01, 3.0, 1.04, 1.0]), 7)
+    assert settled_at(trace) == 4
+    assert settled_at(replace(trace, error=np.array([np.inf, 1.0, 1.0, 1.0, 1.0]))) == 2
+    assert settled_at(replace(trace, error=np.ones(5))) == 1
+
+
+def test_output_error_finds_the_simulated_arm_and_its_intervals_say_so(reproduction):
+    for number, stage in reproduction.stages.items():
+        result = stage.candidates["output error"].result
+        truth = reproduction.truth[number]
+        for name in (*result.orders, *result.joint.coefficients):
+            value = {**result.orders, **result.joint.coefficients}[name]
+            assert abs(value - truth[name]) < 4 * result.standard_errors[name], name
+        assert min(result.fit_percent.values()) > 99
+
+
+def test_errors_are_told_apart(reproduction):
+    near = reproduction.stages[1].near.estimation
+    assert near.equation_error["theta12"].nr < 0.1
+    assert near.output_error["theta12"].nr > 10
+    euler = reproduction.stages[1].candidates["integer, Euler"].estimation.output_error["theta11"]
+    exact = reproduction.stages[1].candidates["integer, exact"].estimation.output_error["theta11"]
+    assert euler.nr == pytest.approx(exact.nr, rel=0.01)
+    assert euler != exact
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The page, the folder, the command
+
+
+def test_the_page_holds_every_table_and_figure(reproduction, tmp_path):
+    page = reproduction.page(tmp_path / "paper.html")
+    text = page.read_text()
+    assert page.stat().st_size < 2_000_000
+    for number in range(1, 8):
+        assert f"Table {number}. " in text
+    pairs = [f"{n}({c})." for n in range(4, 10) for c in "ab"] + [f"{n}({c})." for n in (10, 11) for c in "abcd"]
+    for figure in ("2.", *pairs):
+        assert f"Figure {figure}" in text, figure
+    assert text.count("<em>printed: p = ") == 16
+    assert "http://" not in text.replace("http://www.w3.org", "")
+    again = reproduction.page(tmp_path / "again.html")
+    assert again.read_bytes() == page.read_bytes()
+    with pytest.raises(ftlm.DataError, match="exists; choose another name"):
+        reproduction.page(page)
+
+
+def test_the_text_is_for_a_terminal(reproduction):
+    text = reproduction_text(reproduction)
+    assert "DOES NOT HOLD: Table 7 compares both algorithms on one record." in text
+    assert text.count("output error  ") >= 2
+
+
+def test_nothing_is_overwritten_in_a_folder(reproduction, saved):
+    with pytest.raises(ftlm.DataError, match="such files\\); choose another folder, or --force"):
+        reproduction.save(saved)
+    assert len(reproduction.save(saved, force=True)) == len(list(saved.iterdir()))
+
+
+def test_measured_runs_of_one_stage(reproduction, tmp_path):
+    run = reproduction.square.select(["I2", "theta21", "theta22"])
+    other = reproduction.sine.select(["theta21", "theta22", "I2"])
+    run.to_csv(tmp_path / "mine.csv")
+    other.to_csv(tmp_path / "other.csv")
+    ran = ftlm_command(
+        "reproduce", "--square", "mine.csv", "--sine", "other.csv", "--step", "0.25", "--seed", "5",
+        "--evaluations", "400", "-o", "mine.html", "--save", "kept", "--json", cwd=tmp_path,
+    )  # fmt: skip
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stderr == ""
+    document = json.loads(ran.stdout)
+    assert list(document["stages"]) == ["2"]
+    assert document["simulated"] is False
+    assert (tmp_path / "kept" / "tables.json").exists()
+    page = (tmp_path / "mine.html").read_text()
+    assert "recomputed on the runs “" in page
+    assert "true value" not in page
+    same = reproduction.stages[2].candidates["p = 7"].estimation.output_error["theta21"].to_dict()
+    assert document["stages"]["2"]["models"]["p = 7"]["estimation"]["output_error"]["theta21"] == pytest.approx(same)
+
+
+def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduction, tmp_path):
+    stages = {}
+    for number, stage in reproduction.stages.items():
+        candidates = {
+            n: replace(c, validation=None, alone=dict(list(c.alone.items())[:1])) for n, c in stage.candidates.items()
+        }
+        rivals = {
+            o: replace(r, genetic=replace(r.genetic, validation=None), lattice=replace(r.lattice, validation=None))
+            for o, r in stage.rivals.items()
+        }
+        stages[number] = replace(stage, candidates=candidates, rivals=rivals)
+    alone = replace(reproduction, sine=None, stages=stages, simulated=False)
+    text = alone.page(tmp_path / "alone.html").read_text()
+    assert "nothing is validated" in text
+    assert "Figure 10(" not in text
+    assert "Figure 11(a). θ₁₁, square input" in text
+    assert math.isfinite(len(reproduction_text(alone)))
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "message"),
+    [
+        (["-o", "there.html"], 3, "there.html exists; choose another name"),
+        (["-o", "no/folder.html"], 3, "no is no folder; make it first"),
+        (["--save", "full"], 3, "full/square.csv exists (1 such files); choose another folder, or --force"),
+        (["--save", "there.html"], 3, "there.html cannot be made"),
+        (["--sine", "strange.csv"], 2, "--sine is given without --square"),
+        (["--square", "strange.csv"], 3, "a stage of the arm needs I1, theta11 and theta12"),
+        (["--square", "whole.csv", "--sine", "strange.csv"], 3, "lacks I1, theta12, which the square run"),
+        (["--step", "0"], 2, "step"),
+        (["--evaluations", "5"], 2, "evaluations = 5 is less than two generations"),
+        (["--square", "gone.csv"], 3, "gone.csv"),
+    ],
+)
+def test_what_cannot_be_done_is_said_before_any_work(tmp_path, words, code, message):
+    (tmp_path / "there.html").write_text("mine")
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "square.csv").write_text("mine")
+    n = np.arange(300)
+    signals = {"theta11": np.sin(n / 9.0), "theta12": np.cos(n / 9.0) - 1}
+    whole = ftlm.Run.from_arrays(step=0.01, inputs={"I1": np.sign(np.sin(n / 20))}, outputs=signals)
+    whole.to_csv(tmp_path / "whole.csv")
+    strange = ftlm.Run.from_arrays(step=0.01, inputs={"volts": np.sin(n / 7.0)}, outputs={"theta11": np.cos(n / 9.0)})
+    strange.to_csv(tmp_path / "strange.csv")
+    ran = ftlm_command("reproduce", *words, cwd=tmp_path)
+    assert ran.returncode == code, ran.stderr
+    assert message in ran.stderr
+    assert ran.stdout == ""
+    assert (tmp_path / "there.html").read_text() == "mine"
+    assert not (tmp_path / "paper.html").exists()
+
+
+def test_stages_are_found_by_their_signals(reproduction):
+    assert stages_of(reproduction.square, reproduction.sine) == [1, 2]
+    only = reproduction.square.select(["I1", "theta11", "theta12", "theta21"])
+    assert stages_of(only, reproduction.sine) == [1]
+    with pytest.raises(ftlm.DataError, match="both runs need the same names"):
+        stages_of(reproduction.square, only)
