@@ -14,7 +14,7 @@ import numpy as np
 from ftlm import _core, printed
 from ftlm.baselines import Genetic
 from ftlm.demo import PLANTS, demo_run
-from ftlm.errors import DataError, ModelError
+from ftlm.errors import ConvergenceError, DataError, ModelError
 from ftlm.flexible_link import INTEGER_ORDERS, PARAMETERS, flexible_link, link_model, order_law
 from ftlm.identification import Identification, identify, multi_innovation_trace
 from ftlm.models import Model, Order, write_atomically
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ftlm.identification import Trace
-    from ftlm.models import Equation
+    from ftlm.models import Equation, Structure
 
     Floats = NDArray[np.float64]
 
@@ -460,9 +460,7 @@ class _Work:
             candidates[f"p = {p}"] = self.searched(f"p = {p}", "multi-innovation", innovation_length=p)
         candidates["least squares"] = self.searched("least squares", "least-squares")
         candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
-        candidates["output error"] = self.joint(
-            "output error", self.coupled, "all orders and coefficients together, from the current alone"
-        )
+        candidates["output error"] = self.best()
         last = candidates[f"p = {printed.INNOVATION_LENGTHS[-1]}"]
         traces: dict[str, dict[int, Trace]] = {}
         weak_traces: dict[str, dict[int, Trace]] = {}
@@ -553,16 +551,31 @@ class _Work:
         )  # fmt: skip
         return self.candidate("instrumental variables", result.model, result)
 
-    def joint(self, label: str, structure: Any, words: str) -> Candidate:
+    def joint(self, label: str, structure: Structure, words: str) -> Candidate:
         self.say(f"stage {self.number}: {words}, by output error")
         result = identify(self.on, structure, threads=self.threads, progress=self.progress)
         return self.candidate(label, result.model, result)
 
-    def ordered(self, output: str, orders: Mapping[str, float]) -> Any:
+    def best(self) -> Candidate:
+        """Joint output error from the current alone, or driven by the measured other angle where that has no start."""
+        try:
+            return self.joint(
+                "output error", self.coupled, "all orders and coefficients together, from the current alone"
+            )
+        except ConvergenceError as error:
+            self.notes.append(
+                f"stage {self.number}: from the current alone, {error}; the row of output error is driven by the "
+                "measured other angle instead"
+            )
+        return self.joint(
+            "output error", replace(self.coupled, coupling="measured"), "all orders and coefficients together"
+        )
+
+    def ordered(self, output: str, orders: Mapping[str, float]) -> Structure:
         single = self.measured.equation(output)
         return single.with_orders({n: orders[n] for n in single.order_names})
 
-    def trace(self, single: Any, p: int, prior: float) -> Trace:
+    def trace(self, single: Structure, p: int, prior: float) -> Trace:
         return multi_innovation_trace(self.on, single, innovation_length=p, prior_covariance=prior, every=TRACE_EVERY)
 
     def rivals(self) -> dict[str, Rival]:

@@ -22,8 +22,8 @@ WIDTHS = (360, 800, 1280)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, small_model, small_run, with_noise):
-    """Reports of an output-error fit, of a searched model and of a saved model, every name hostile."""
+def folder(tmp_path_factory, small_model, small_run, with_noise, reproduction):
+    """Reports of an output-error fit, of a searched model and of a saved model, names hostile; the paper's page."""
     where = tmp_path_factory.mktemp("pages")
 
     def named(run, words):
@@ -45,10 +45,12 @@ def folder(tmp_path_factory, small_model, small_run, with_noise):
     warned = replace(searched, warnings=(*searched.warnings, "a warning " + HOSTILE))
     warned.report(where / "search.html")
     model_page(ftlm.load_model(fit.model.save(where / "m.json")), where / "model.html", validation=other)
+    reproduction.page(where / "paper.html")
     return where
 
 
 PAGES = ("fit", "search", "model")
+ALL = (*PAGES, "paper")
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +86,7 @@ def view_of(page, svg="svg.chart.wide[data-frame]"):
     return [float(v) for v in page.locator(svg).first.get_attribute("data-view").split()]
 
 
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("name", ALL)
 def test_a_page_asks_for_nothing_and_complains_of_nothing(browser, folder, name):
     with Opened(browser, folder / f"{name}.html") as opened:
         opened.page.wait_for_timeout(200)
@@ -171,7 +173,7 @@ def test_zoom_by_dragging_shows_what_was_dragged_over(browser, folder):
         assert opened.said == []
 
 
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("name", ALL)
 def test_without_scripts_everything_but_the_zoom_is_there(browser, folder, name):
     with Opened(browser, folder / f"{name}.html") as opened:
         opened.page.evaluate("document.querySelectorAll('.zoom').forEach((z) => z.remove())")
@@ -185,7 +187,7 @@ def test_without_scripts_everything_but_the_zoom_is_there(browser, folder, name)
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("name", ALL)
 def test_the_accessibility_check_passes(browser, folder, name, scheme):
     for width in (WIDTHS[0], WIDTHS[2]):
         with Opened(
@@ -198,7 +200,7 @@ def test_the_accessibility_check_passes(browser, folder, name, scheme):
 
 
 @pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("name", ALL)
 def test_no_width_makes_a_page_scroll_sideways(browser, folder, name, width):
     with Opened(browser, folder / f"{name}.html", viewport={"width": width, "height": 900}) as opened:
         page = opened.page
@@ -221,6 +223,18 @@ def test_paper_has_no_buttons_and_equations_are_typeset(browser, folder):
         printed = page.pdf(format="A4")
         assert printed.startswith(b"%PDF")
         assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
+
+
+def test_the_paper_s_page_names_what_holds_first(browser, folder):
+    with Opened(browser, folder / "paper.html", viewport={"width": 360, "height": 900}) as opened:
+        page = opened.page
+        heads = page.locator("h2").all_inner_texts()
+        assert heads[0] == "What holds and what does not"
+        assert page.locator(".verdict strong").count() == 11
+        assert page.locator("svg.chart.narrow").first.is_visible()
+        # Zooming works here, too.
+        page.locator(".zoom.narrow button:visible").first.click()
+        assert opened.said == []
 
 
 def test_warnings_come_first(browser, folder):

@@ -12,7 +12,7 @@ from ftlm.errors import ModelError
 from ftlm.identification import Identification
 from ftlm.models import Model
 from ftlm.report.figures import LINES, bode_curves, pulse_times, response_frequencies
-from ftlm.report.landscape import Landscape
+from ftlm.report.landscape import Landscape, output_error_landscape
 from ftlm.report.landscape import landscape as scores_of
 from ftlm.report.tables import symbol
 from ftlm.residuals import Residuals
@@ -174,13 +174,13 @@ def residuals(tests: Residuals | Identification) -> Any:
 
 
 def landscape(result: Identification | Landscape, output: str | None = None) -> Any:
-    """Score of an order search over two of its orders.
+    """Score of an order search, or cost of a joint fit, over two of its orders.
 
     Parameters
     ----------
     result
-        An identification with an order search, or a landscape (``ftlm.report.landscape``), which may be of any two
-        orders.
+        An identification by output error or with an order search, or a landscape (``ftlm.report.landscape``,
+        ``ftlm.report.output_error_landscape``), which may be of any two orders.
     output
         Which search of an identification; by default its first.
 
@@ -193,8 +193,12 @@ def landscape(result: Identification | Landscape, output: str | None = None) -> 
     ModelError
         An identification without a search, or without that one; fewer than two free orders; no matplotlib.
     """
-    found = result
-    if isinstance(result, Identification):
+    found: Landscape | Identification | None = result
+    if isinstance(result, Identification) and result.joint is not None:
+        found = output_error_landscape(result)
+        if found is None:
+            raise ModelError("this fit has no two free orders with standard errors, so it has no landscape")
+    elif isinstance(result, Identification):
         if not result.searches or result.task is None:
             raise ModelError("this identification searched no lattice, so it has no landscape")
         name = next(iter(result.searches)) if output is None else output
@@ -218,7 +222,7 @@ def landscape(result: Identification | Landscape, output: str | None = None) -> 
     )
     axis.set_xlabel(_plain(f"order {symbol(found.names[0])}"))
     axis.set_ylabel(_plain(f"order {symbol(found.names[1])}"))
-    figure.colorbar(drawn, ax=axis, label="score (grey: no candidate, or diverged)")
+    figure.colorbar(drawn, ax=axis, label=f"{found.score} (grey: no candidate, or diverged)")
     return figure
 
 
