@@ -13,6 +13,7 @@ __all__ = [
     "SIMD",
     "Guard",
     "OrderSearch",
+    "Points",
     "Streaming",
     "VirtualArm",
     "__version__",

@@ -129,7 +129,7 @@ impl Points {
                 wanted.push((Key::integral(signal, eta), signal, eta));
             }
         }
-        wanted.sort_unstable_by(|a, b| a.0.cmp(&b.0));
+        wanted.sort_unstable_by_key(|a| a.0);
         wanted.dedup_by(|a, b| a.0 == b.0);
         if (self.kept.len() + wanted.len()) * each > KEPT_BYTES {
             self.kept.clear();
