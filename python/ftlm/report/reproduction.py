@@ -269,9 +269,10 @@ def saturation_table(found: Reproduction) -> Table:
                     [f"p = {p}", value, "yes" if alike else "no", weak, Exact(stated),
                      x * p / (p + c)]
                 )  # fmt: skip
+    prior = Markup("<i>K</i><sub>0</sub> = {}")
     return Table(
         "Coefficient a by innovation length",
-        ("", Markup("<i>K</i><sub>0</sub> = 1"), "orders of p = 7", Markup("<i>K</i><sub>0</sub> = {}").format(WEAK),
+        ("innovation length", prior.format("1"), "orders of p = 7", prior.format(WEAK),
          "printed", Markup("<i>x p</i> / (<i>p</i> + <i>c</i>)")),
         rows,
         headings=headings,
@@ -297,7 +298,7 @@ def genetic_table(found: Reproduction) -> Table:
             )  # fmt: skip
     return Table(
         "Table 6. Orders and coefficients by the genetic algorithm",
-        ("", *(symbol_html(n) for n in (*LETTERS[0], *LETTERS[1]))),
+        ("angle", *(symbol_html(n) for n in (*LETTERS[0], *LETTERS[1]))),
         rows,
         groups=(("", 1), ("orders", 4), ("coefficients", 4)),
         note=PRINTED_NOTE,
@@ -332,7 +333,7 @@ def rivals_table(found: Reproduction) -> Table:
                 )
     return Table(
         "Table 7. Genetic algorithm and multi-innovation: the same record, the same number of candidates",
-        ("", "error (45)", "RMSE", "NR", "error (45)", "RMSE", "NR", "σ of the angle"),
+        ("algorithm", "error (45)", "RMSE", "NR", "error (45)", "RMSE", "NR", "σ of the angle"),
         rows,
         groups=(("", 1), ("square, identified from", 3), ("sine, never seen", 3), ("", 1)),
         headings=headings,
@@ -354,7 +355,7 @@ def seeds_table(found: Reproduction) -> Table:
         )  # fmt: skip
     return Table(
         "Error (45) by seed",
-        ("", "candidates of the lattice", "evaluations a seed", "population", *(f"seed {s}" for s in seeds), "p = 7"),
+        ("angle", "candidates", "evaluations a seed", "population", *(f"seed {s}" for s in seeds), "p = 7"),
         rows,
     )
 
@@ -373,7 +374,7 @@ def bounds_table(found: Reproduction) -> Table:
             rows.append([symbol_html(output), *cells])
     return Table(
         "Bounds of the genetic algorithm",
-        ("", *(symbol_html(n) for n in (*LETTERS[0], *LETTERS[1]))),
+        ("angle", *(symbol_html(n) for n in (*LETTERS[0], *LETTERS[1]))),
         rows,
         note="Orders in steps of 0.001, on the interval of the lattice. Coefficients: twice the value that the maker "
         "states, or four times what makes a term alone as large as the output.",
@@ -649,7 +650,7 @@ def _near_section(found: Reproduction) -> Section:
         )  # fmt: skip
     table = Table(
         "Orders close to α: equation error and free run",
-        ("", *(symbol_html(n) for n in LETTERS[0]), "NR of the equation error", "NR of the free run"),
+        ("angle, orders", *(symbol_html(n) for n in LETTERS[0]), "NR of the equation error", "NR of the free run"),
         rows,
         note="Coefficients by least squares. “Smallest equation error”: the orders that the lattice gives when the "
         "equation error (RMSE) ranks its candidates.",
