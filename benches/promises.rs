@@ -1,32 +1,51 @@
 //! Times that `promises.py` sets beside its rivals, one `name seconds` a line; with a kernel's name, runs that kernel a
-//! fixed number of times for callgrind.
+//! fixed number of times for callgrind; with `search`, pulses, step and threads, runs one search.
 #![allow(missing_docs, clippy::cast_precision_loss)]
 
 use std::hint::black_box;
 use std::time::Instant;
 
 use ftlm::equation::{Equation, Initial, Structure, Term};
+use ftlm::estimate::least_squares;
 use ftlm::fft::{self, Bin, Workspace};
 use ftlm::fractional::block_pulse_kernel;
 use ftlm::operational::{block_pulse_matrix, operational_matrix, operational_matrix_dense};
 use ftlm::regressors::Record;
 use ftlm::search::lattice::{Lattice, TermAxis};
 use ftlm::search::run::{search, Control, Criterion, Estimator, Norm, Options};
-use ftlm::series::{self, Buffers, Kernel};
+use ftlm::series::{self, Buffers, Division, Kernel};
 use ftlm::simulate;
 
-/// Shortest of at least `least` runs, and of as many as half a second holds: what other work on the machine disturbs
-/// least.
-fn shortest(least: usize, mut work: impl FnMut()) -> f64 {
+/// Processor seconds of this thread where the system tells them; right to a few milliseconds.
+fn processor() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/thread-self/schedstat").ok()?;
+    text.split(' ').next()?.parse::<f64>().ok().map(|ns| 1e-9 * ns)
+}
+
+/// Shortest of at least `least` runs, and of as many as these seconds hold: what other work on the machine disturbs
+/// least. A run longer than a turn on a busy processor is measured by processor time, as a mean over many.
+fn shortest(least: usize, seconds: f64, mut work: impl FnMut()) -> f64 {
     work();
     let mut times = Vec::new();
-    let start = Instant::now();
-    while times.len() < least || (start.elapsed().as_secs_f64() < 0.5 && times.len() < 2000) {
+    let (start, before) = (Instant::now(), processor());
+    while times.len() < least || (start.elapsed().as_secs_f64() < seconds && times.len() < 2000) {
         let begin = Instant::now();
         work();
         times.push(begin.elapsed().as_secs_f64());
     }
-    times.into_iter().fold(f64::INFINITY, f64::min)
+    let shortest = times.iter().copied().fold(f64::INFINITY, f64::min);
+    if shortest < 1e-3 {
+        return shortest;
+    }
+    let mut runs = times.len();
+    while let (Some(before), Some(now)) = (before, processor()) {
+        if now - before > 0.2 {
+            return shortest.min((now - before) / runs as f64);
+        }
+        work();
+        runs += 1;
+    }
+    shortest
 }
 
 fn say(name: &str, seconds: f64) {
@@ -49,26 +68,71 @@ fn transforms(n: usize) -> (f64, f64) {
     let (signal, mut time) = (noise(n, 1), vec![0.0; n]);
     let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
     let mut workspace = Workspace::new();
-    let copy = shortest(5, || time.copy_from_slice(black_box(&signal)));
-    let forward = shortest(5, || {
+    let copy = shortest(5, 0.3, || time.copy_from_slice(black_box(&signal)));
+    let forward = shortest(5, 0.3, || {
         time.copy_from_slice(&signal);
         plan.forward(&mut time, &mut spectrum, &mut workspace);
     });
     time.copy_from_slice(&signal);
     plan.forward(&mut time, &mut spectrum, &mut workspace);
     let kept = spectrum.clone();
-    let inverse = shortest(5, || {
+    let inverse = shortest(5, 0.3, || {
         spectrum.copy_from_slice(&kept);
         plan.inverse(&mut spectrum, &mut time, &mut workspace);
     });
     ((forward - copy).max(1e-9), (inverse - copy).max(1e-9))
 }
 
-/// The deflection of the arm's first stage: own kernels of orders 1.9 and 1.15 and their coefficients.
-const OWN: [(f64, f64); 2] = [(1.9, -863.247), (1.15, -9.1007)];
+/// Free runs that P6 is measured on, spread over the lattice of P1; their coefficients are least squares'.
+const RUNS: u64 = 9;
+
+fn free_runs() -> Vec<Equation> {
+    let Some((record, lattice)) = problem(2048, 0.05) else { return Vec::new() };
+    (0..RUNS)
+        .filter_map(|i| {
+            let structure = lattice.structure(lattice.count() * (2 * i + 1) / (2 * RUNS));
+            let fixed = vec![None; structure.terms.len()];
+            let records = std::slice::from_ref(&record);
+            let fit = least_squares::fit(records, &structure, &fixed, &Initial::Rest).ok()?;
+            Some(Equation { structure, coefficients: fit.coefficients })
+        })
+        .collect()
+}
+
+/// Seconds of one free run as a search makes it, kernels and regressors at hand, memory reused: exact division.
+fn free_run(equation: &Equation, m: usize, division: &mut Division) -> f64 {
+    let structure = &equation.structure;
+    let step = 10.0 / m as f64;
+    let parts: Vec<(bool, f64, Vec<f64>)> = (0..structure.terms.len())
+        .map(|k| {
+            let kernel = block_pulse_kernel(structure.integration(k), m, step);
+            let own = structure.terms[k].signal == structure.output;
+            let part = if own { kernel } else { series::multiply(&kernel, &noise(m, 2), m) };
+            (own, equation.coefficients[k], part)
+        })
+        .collect();
+    let (mut divisor, mut numerator) = (vec![0.0; m], vec![0.0; m]);
+    shortest(3, 0.05, || {
+        divisor.fill(0.0);
+        numerator.fill(0.0);
+        divisor[0] = 1.0;
+        for (own, c, part) in &parts {
+            let (sum, c) = if *own { (&mut divisor, -c) } else { (&mut numerator, *c) };
+            sum.iter_mut().zip(part).for_each(|(s, v)| *s += c * v);
+        }
+        division.reset();
+        division.add(0, 0, black_box(&numerator));
+        let inverse = [1.0 / divisor[0]];
+        while division.solved() < m {
+            division.advance(&inverse, |_, _, len| &divisor[..len]);
+        }
+        black_box(division.quotient(0));
+    })
+}
 
 fn operators() {
-    for log in 11..=20 {
+    let runs = free_runs();
+    for log in 9..=20 {
         let m = 1usize << log;
         let (forward, inverse) = transforms(2 * m);
         say(&format!("rfft {m}"), forward);
@@ -76,24 +140,21 @@ fn operators() {
         let signal = noise(m, 2);
         let kernel = Kernel::new(&block_pulse_kernel(0.85, m, 10.0 / m as f64));
         let (mut out, mut buffers) = (vec![0.0; m], Buffers::default());
-        say(&format!("apply {m}"), shortest(5, || kernel.apply(black_box(&signal), &mut out, &mut buffers)));
-        let own: Vec<Vec<f64>> = OWN.iter().map(|(eta, _)| block_pulse_kernel(*eta, m, 10.0 / m as f64)).collect();
-        let mut divisor = vec![0.0; m];
-        let simulate = shortest(3, || {
-            divisor.fill(0.0);
-            divisor[0] = 1.0;
-            for (kernel, (_, c)) in own.iter().zip(OWN) {
-                divisor.iter_mut().zip(kernel).for_each(|(d, k)| *d -= c * k);
-            }
-            let _ = black_box(series::divide(black_box(&signal), &divisor));
-        });
+        say(&format!("apply {m}"), shortest(5, 0.3, || kernel.apply(black_box(&signal), &mut out, &mut buffers)));
+        let mut division = Division::new(1, m);
+        let mut times: Vec<f64> = runs.iter().map(|equation| free_run(equation, m, &mut division)).collect();
+        times.sort_by(f64::total_cmp);
+        let Some(&simulate) = times.get(times.len() / 2) else { continue };
         say(&format!("simulate {m}"), simulate);
     }
     let m = 2048;
-    say("write 2048", shortest(5, || drop(black_box(written(m)))));
-    say("block pulse matrix 2048", shortest(5, || drop(black_box(block_pulse_matrix(0.85, m, 1e-3)))));
-    say("operational matrix 2048", shortest(5, || drop(black_box(operational_matrix(0.85, m, 1e-3)))));
-    say("operational matrix by faer 2048", shortest(1, || drop(black_box(operational_matrix_dense(0.85, m, 1e-3)))));
+    say("write 2048", shortest(5, 0.3, || drop(black_box(written(m)))));
+    say("block pulse matrix 2048", shortest(5, 0.3, || drop(black_box(block_pulse_matrix(0.85, m, 1e-3)))));
+    say("operational matrix 2048", shortest(5, 0.3, || drop(black_box(operational_matrix(0.85, m, 1e-3)))));
+    say(
+        "operational matrix by faer 2048",
+        shortest(1, 0.3, || drop(black_box(operational_matrix_dense(0.85, m, 1e-3)))),
+    );
 }
 
 /// A matrix written once, element by element, into memory never touched before.
@@ -101,9 +162,8 @@ fn written(m: usize) -> Vec<f64> {
     (0..m * m).map(|i| i as f64).collect()
 }
 
-/// The arm's first stage at 2048 pulses with a little noise, and the lattice of its deflection at this step.
-fn problem(step: f64) -> Option<(Record, Lattice)> {
-    let m = 2048;
+/// The arm's first stage over this many pulses with a little noise, and the lattice of its deflection at this step.
+fn problem(m: usize, step: f64) -> Option<(Record, Lattice)> {
     let h = 10.0 / m as f64;
     let equation = |output: usize, terms: &[(usize, f64, f64)]| Equation {
         structure: Structure {
@@ -133,23 +193,46 @@ fn problem(step: f64) -> Option<(Record, Lattice)> {
     Some((record, Lattice::new(1, &alphas, &axes, |s| s == 2).ok()?))
 }
 
+fn options(threads: usize) -> Options {
+    Options {
+        criterion: Criterion::OutputError,
+        norm: Norm::L1,
+        estimator: Estimator::LeastSquares,
+        initial: Initial::Rest,
+        keep: 20,
+        threads,
+        early_stopping: true,
+    }
+}
+
+/// Processor seconds of all threads, in the hundredths that the system counts.
+fn processor_of_all() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // The program's name, in brackets, may hold blanks.
+    let fields: Vec<&str> = text.rsplit(')').next()?.split_whitespace().collect();
+    let ticks = |i: usize| fields.get(i)?.parse::<f64>().ok();
+    Some((ticks(11)? + ticks(12)?) / 100.0)
+}
+
+/// One search: prints its candidates, wall and processor seconds.
+fn growth(m: usize, step: f64, threads: usize) {
+    let Some((record, lattice)) = problem(m, step) else { return };
+    let (start, before) = (Instant::now(), processor_of_all().unwrap_or(f64::NAN));
+    let found = black_box(search(&[record], &lattice, &[None; 4], &options(threads), &Control::default()));
+    let (wall, cpu) = (start.elapsed().as_secs_f64(), processor_of_all().unwrap_or(f64::NAN) - before);
+    if let Ok(found) = found {
+        println!("{} {wall:e} {cpu:e}", found.counts.candidates);
+    }
+}
+
 /// One of the hottest kernels a fixed number of times, for callgrind; prints how many units of work it did.
 fn kernel(name: &str) {
     let m = 2048;
     match name {
         "screen" | "nothing" => {
-            let Some((record, lattice)) = problem(0.1) else { return };
-            let options = Options {
-                criterion: Criterion::OutputError,
-                norm: Norm::L1,
-                estimator: Estimator::LeastSquares,
-                initial: Initial::Rest,
-                keep: 20,
-                threads: 1,
-                early_stopping: true,
-            };
+            let Some((record, lattice)) = problem(m, 0.1) else { return };
             if name == "screen" {
-                let _ = black_box(search(&[record], &lattice, &[None; 4], &options, &Control::default()));
+                let _ = black_box(search(&[record], &lattice, &[None; 4], &options(1), &Control::default()));
             }
             println!("units {}", lattice.count());
         }
@@ -172,8 +255,14 @@ fn kernel(name: &str) {
 
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).filter(|a| !a.starts_with("--")).collect();
-    match arguments.first() {
-        Some(name) => kernel(name),
-        None => operators(),
+    let words: Vec<&str> = arguments.iter().map(String::as_str).collect();
+    match words[..] {
+        ["search", m, step, threads] => {
+            if let (Ok(m), Ok(step), Ok(threads)) = (m.parse(), step.parse(), threads.parse()) {
+                growth(m, step, threads);
+            }
+        }
+        [name] => kernel(name),
+        _ => operators(),
     }
 }

@@ -1,11 +1,19 @@
 """Draws the pictures of the pages from seeded runs, so that they are always what this version does."""
 
+from __future__ import annotations
+
+import json
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 import ftlm
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
 def example(name: str, kind: str, seed: int) -> ftlm.Run:
@@ -33,8 +41,49 @@ def draw(folder: Path) -> None:
         "bode": ftlm.plot.bode(best),
         "landscape": ftlm.plot.landscape(searched),
     }
-    for name, figure in drawn.items():
+    for name, figure in (drawn | performance()).items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
+
+
+def performance() -> dict[str, Figure]:
+    """Cost against size, from what the bench wrote."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
+
+    measured = json.loads((Path(__file__).parent / "performance.json").read_text(encoding="utf-8"))
+    searches = measured["searches"]
+
+    def axes(x: str, y: str) -> tuple[Figure, Axes]:
+        figure = Figure(figsize=(7, 3.6), layout="constrained")
+        plot = figure.add_subplot(xscale="log", yscale="log", xlabel=x, ylabel=y)
+        plot.grid(visible=True, which="major", linewidth=0.4)
+        return figure, plot
+
+    drawn = {}
+    pulses = max({s["m"] for s in searches}, key=lambda m: sum(s["m"] == m for s in searches))
+    smallest = min(s["candidates"] for s in searches if s["m"] != pulses)
+    for name, x, label, chosen in (
+        ("cost-by-candidates", "candidates", "candidates", [s for s in searches if s["m"] == pulses]),
+        ("cost-by-pulses", "m", f"pulses (searches over {smallest} candidates)",
+         [s for s in searches if s["m"] != pulses]),
+    ):  # fmt: skip
+        figure, plot = axes(label, "seconds a candidate")
+        for threads in sorted({s["threads"] for s in chosen}):
+            rows = sorted((s[x], s["wall"] / s["candidates"]) for s in chosen if s["threads"] == threads)
+            plot.plot(*zip(*rows, strict=True), marker="o", label=f"wall time, {threads} thread{'s'[: threads - 1]}")
+        # The system counts processor time in hundredths of a second.
+        rows = [s for s in chosen if s["threads"] == 1 and s["processor"] >= 0.1]
+        rows = sorted((s[x], s["processor"] / s["candidates"]) for s in rows)
+        plot.plot(*zip(*rows, strict=True), marker=".", linestyle=":", label="processor time, 1 thread")
+        plot.legend()
+        drawn[name] = figure
+    figure, plot = axes("pulses", "seconds")
+    operators = {"simulate": "free run", "apply": "fractional integral", "rfft": "real FFT of twice the length"}
+    for key, label in operators.items():
+        rows = sorted((int(k.split()[1]), v) for k, v in measured["operators"].items() if k.split()[0] == key)
+        plot.plot(*zip(*rows, strict=True), marker="o", label=label)
+    plot.legend()
+    drawn["cost-of-operators"] = figure
+    return drawn
 
 
 if __name__ == "__main__":

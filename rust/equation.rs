@@ -63,7 +63,7 @@ impl Structure {
             range,
             remedy: remedy.to_owned(),
         };
-        if !(self.order > 0.0 && self.order <= MAX_ORDER) {
+        if !alpha_fits(self.order) {
             return Err(range("order alpha".into(), self.order, format!("(0, {MAX_ORDER}]"), "choose another order"));
         }
         if self.output >= signals {
@@ -75,13 +75,14 @@ impl Structure {
             }
             let name = format!("order of term {k}");
             if term.signal == self.output {
-                if !(term.order >= 0.0 && term.order < self.order - ORDER_GRAIN) {
+                if !order_fits(self.order, term.order, true, false) {
                     let allowed = format!("[0, {})", self.order);
                     return Err(range(name, term.order, allowed, "an own-output order must stay below alpha"));
                 }
             } else {
-                let lowest = if is_input(term.signal) { -MAX_ORDER } else { 0.0 };
-                if !(term.order >= lowest && term.order <= self.order + ORDER_GRAIN) {
+                let input = is_input(term.signal);
+                if !order_fits(self.order, term.order, false, input) {
+                    let lowest = if input { -MAX_ORDER } else { 0.0 };
                     let allowed = format!("[{lowest}, {}]", self.order);
                     return Err(range(name, term.order, allowed, "an order must not exceed alpha"));
                 }
@@ -113,6 +114,23 @@ impl Structure {
         exponents.sort_by(f64::total_cmp);
         exponents.dedup_by(|a, b| (*a - *b).abs() < ORDER_GRAIN);
         exponents
+    }
+}
+
+/// Whether a highest order is in (0, 3].
+#[must_use]
+pub fn alpha_fits(alpha: f64) -> bool {
+    alpha > 0.0 && alpha <= MAX_ORDER
+}
+
+/// Whether a term of this order may stand under α: of the output itself in [0, α), of another signal in [0, α], of an
+/// input in [−3, α].
+#[must_use]
+pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
+    if own {
+        order >= 0.0 && order < alpha - ORDER_GRAIN
+    } else {
+        order >= if input { -MAX_ORDER } else { 0.0 } && order <= alpha + ORDER_GRAIN
     }
 }
 

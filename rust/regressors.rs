@@ -65,6 +65,14 @@ impl Record {
         Self { step: self.step, signals, filter: self.filter.clone(), clean: None }
     }
 
+    /// The record of the substitutes for all signals but one.
+    #[must_use]
+    pub fn cleaned_but(&self, signal: usize) -> Self {
+        let mut cleaned = self.cleaned();
+        cleaned.signals[signal].clone_from(&self.signals[signal]);
+        cleaned
+    }
+
     /// All signals, and with them the initial terms, behind a causal filter given as a series of m terms.
     ///
     /// # Errors

@@ -301,6 +301,13 @@ impl lanes::Kernel for Join<'_> {
     }
 }
 
+/// Transforms of one length in a division: their plan, and the spectra of the n² series once they are ready.
+struct Level {
+    plan: Plan,
+    ready: bool,
+    spectra: Vec<Vec<Bin>>,
+}
+
 /// An n × n division under way: blocks of the quotients come out in order.
 ///
 /// Right-hand sides are added block by block ([`Division::add`]), then [`Division::advance`] solves the next block and
@@ -312,8 +319,8 @@ pub struct Division {
     solved: usize,
     /// Right-hand side less what solved blocks contribute, then the quotient, per unknown.
     rest: Vec<Vec<f64>>,
-    /// Spectra of the n² series, per power of two of blocks; made when first needed.
-    levels: Vec<Option<Vec<Vec<Bin>>>>,
+    /// One per power of two of blocks.
+    levels: Vec<Level>,
     spectra: Vec<Vec<Bin>>,
     product: Vec<Bin>,
     time: Vec<f64>,
@@ -339,7 +346,7 @@ impl Division {
 
     /// Forgets everything but the memory.
     pub fn reset(&mut self) {
-        self.levels.iter_mut().for_each(|level| *level = None);
+        self.levels.iter_mut().for_each(|level| level.ready = false);
         self.restart();
     }
 
@@ -440,9 +447,9 @@ impl Division {
             }
             return;
         }
-        let plan = fft::plan(2 * half);
-        self.prepare(level, &plan, &series);
+        self.prepare(level, &series);
         let zero = Bin::new(0.0, 0.0);
+        let Level { plan, spectra: kernels, .. } = &self.levels[level];
         self.time.resize(self.time.len().max(plan.len()), 0.0);
         self.product.resize(self.product.len().max(plan.bins()), zero);
         for j in 0..n {
@@ -453,7 +460,6 @@ impl Division {
             self.spectra[j].resize(bins, zero);
             plan.forward(time, &mut self.spectra[j][..plan.bins()], &mut self.workspace);
         }
-        let Some(kernels) = self.levels.get(level).and_then(Option::as_ref) else { return };
         for i in 0..n {
             let product = &mut self.product[..plan.bins()];
             product.fill(zero);
@@ -502,25 +508,25 @@ impl Division {
         }
     }
 
-    fn prepare<'a>(&mut self, level: usize, plan: &Plan, series: &impl Fn(usize, usize, usize) -> &'a [f64]) {
-        if self.levels.len() <= level {
-            self.levels.resize_with(level + 1, || None);
+    fn prepare<'a>(&mut self, level: usize, series: &impl Fn(usize, usize, usize) -> &'a [f64]) {
+        while self.levels.len() <= level {
+            let plan = fft::plan(2 * (BLOCK << self.levels.len()));
+            self.levels.push(Level { plan, ready: false, spectra: Vec::new() });
         }
-        if self.levels[level].is_some() {
+        let Level { plan, ready, spectra } = &mut self.levels[level];
+        if *ready {
             return;
         }
-        let mut spectra = Vec::with_capacity(self.n * self.n);
-        let mut time = vec![0.0; plan.len()];
-        for i in 0..self.n {
-            for j in 0..self.n {
-                let a = series(i, j, plan.len().min(self.m));
-                time[..a.len()].copy_from_slice(a);
-                time[a.len()..].fill(0.0);
-                let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-                plan.forward(&mut time, &mut spectrum, &mut self.workspace);
-                spectra.push(spectrum);
-            }
+        spectra.resize_with(self.n * self.n, Vec::new);
+        self.time.resize(self.time.len().max(plan.len()), 0.0);
+        let time = &mut self.time[..plan.len()];
+        for (place, spectrum) in spectra.iter_mut().enumerate() {
+            let a = series(place / self.n, place % self.n, plan.len().min(self.m));
+            time[..a.len()].copy_from_slice(a);
+            time[a.len()..].fill(0.0);
+            spectrum.resize(plan.bins(), Bin::new(0.0, 0.0));
+            plan.forward(time, spectrum, &mut self.workspace);
         }
-        self.levels[level] = Some(spectra);
+        *ready = true;
     }
 }

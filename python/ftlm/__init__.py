@@ -2,42 +2,61 @@
 
 Public names in the order in which a measurement passes them: runs, operators, equations and models, identification and
 order search, simulation and validation.
+
+What models are made of is imported at once, every other module when one of its names is first asked for: to import all
+of them takes longer than numpy does.
 """
 
-from ftlm import rig
-from ftlm._core import __version__
-from ftlm.baselines import Genetic
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
-from ftlm.files import load
+
+# A function with the name of its module: imported late, the module would take its place.
 from ftlm.flexible_link import PARAMETERS, LinkParameters, flexible_link, link_model, order_law
-from ftlm.identification import Identification, Trace, identify, multi_innovation_trace
-from ftlm.many import Identified, identify_many
-from ftlm.models import Equation, Estimate, Model, Order, SensorFilter, Structure, Term, equation, load_model
-from ftlm.operators import (
-    block_pulse_matrix,
-    fractional_derivative,
-    fractional_integral,
-    haar_inverse,
-    haar_matrix,
-    haar_transform,
-    operational_matrix,
-)
-from ftlm.order_search import (
-    Lattice,
-    SearchResult,
-    SearchRow,
-    StoreStatus,
-    lattice,
-    resume_search,
-    search_orders,
-    search_status,
-)
-from ftlm.physical import PhysicalParameter, physical_parameters
-from ftlm.reproduction import Reproduction, reproduce
-from ftlm.residuals import CorrelationTest, InformationCriteria, OutputResiduals, Residuals, information_criteria, resid
-from ftlm.runs import Run
-from ftlm.simulation import explicit_euler, simulate
-from ftlm.validation import Comparison, Metrics, compare, metrics
+
+if TYPE_CHECKING:
+    from ftlm import rig
+    from ftlm._core import __version__
+    from ftlm.baselines import Genetic
+    from ftlm.files import load
+    from ftlm.identification import Identification, Trace, identify, multi_innovation_trace
+    from ftlm.many import Identified, identify_many
+    from ftlm.models import Equation, Estimate, Model, Order, SensorFilter, Structure, Term, equation, load_model
+    from ftlm.operators import (
+        block_pulse_matrix,
+        fractional_derivative,
+        fractional_integral,
+        haar_inverse,
+        haar_matrix,
+        haar_transform,
+        operational_matrix,
+    )
+    from ftlm.order_search import (
+        Lattice,
+        SearchResult,
+        SearchRow,
+        StoreStatus,
+        lattice,
+        resume_search,
+        search_orders,
+        search_status,
+    )
+    from ftlm.physical import PhysicalParameter, physical_parameters
+    from ftlm.reproduction import Reproduction, reproduce
+    from ftlm.residuals import (
+        CorrelationTest,
+        InformationCriteria,
+        OutputResiduals,
+        Residuals,
+        information_criteria,
+        resid,
+    )
+    from ftlm.runs import Run
+    from ftlm.simulation import explicit_euler, simulate
+    from ftlm.validation import Comparison, Metrics, compare, metrics
 
 __all__ = [
     "PARAMETERS",
@@ -104,11 +123,93 @@ __all__ = [
     "simulate",
 ]
 
+#: Where each name lives.
+_HOMES = {
+    name: home
+    for home, names in {
+        "_core": ("__version__",),
+        "baselines": ("Genetic",),
+        "files": ("load",),
+        "reproduction": ("Reproduction", "reproduce"),
+        "identification": (
+            "Identification",
+            "Trace",
+            "identify",
+            "multi_innovation_trace",
+        ),
+        "models": (
+            "Equation",
+            "Estimate",
+            "Model",
+            "Order",
+            "SensorFilter",
+            "Structure",
+            "Term",
+            "equation",
+            "load_model",
+        ),
+        "operators": (
+            "block_pulse_matrix",
+            "fractional_derivative",
+            "fractional_integral",
+            "haar_inverse",
+            "haar_matrix",
+            "haar_transform",
+            "operational_matrix",
+        ),
+        "many": ("Identified", "identify_many"),
+        "order_search": (
+            "Lattice",
+            "SearchResult",
+            "SearchRow",
+            "StoreStatus",
+            "lattice",
+            "resume_search",
+            "search_orders",
+            "search_status",
+        ),
+        "physical": (
+            "PhysicalParameter",
+            "physical_parameters",
+        ),
+        "residuals": (
+            "CorrelationTest",
+            "InformationCriteria",
+            "OutputResiduals",
+            "Residuals",
+            "information_criteria",
+            "resid",
+        ),
+        "runs": ("Run",),
+        "simulation": (
+            "explicit_euler",
+            "simulate",
+        ),
+        "validation": (
+            "Comparison",
+            "Metrics",
+            "compare",
+            "metrics",
+        ),
+    }.items()
+    for name in names
+}
+#: Modules that are asked for as attributes.
+_MODULES = frozenset({*_HOMES.values(), "plot", "progress", "rig"})
+
 
 def __getattr__(name: str) -> object:
-    """`ftlm.plot`, imported when it is first asked for: drawing needs more than everything else."""
-    if name == "plot":
-        from importlib import import_module  # noqa: PLC0415
+    """A public name, or a module such as `ftlm.rig`, imported when it is first asked for."""
+    if name in _HOMES:
+        value = getattr(import_module(f"ftlm.{_HOMES[name]}"), name)
+    elif name in _MODULES:
+        value = import_module(f"ftlm.{name}")
+    else:
+        raise AttributeError(f"module 'ftlm' has no attribute {name!r}")
+    globals()[name] = value
+    return value
 
-        return import_module("ftlm.plot")
-    raise AttributeError(f"module 'ftlm' has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    """Public names, imported or not."""
+    return sorted({*globals(), *__all__, *_MODULES})

@@ -77,11 +77,11 @@ pub struct Fit {
 
 /// What a step reads of one record for one equation: spectra good for products of two series of m terms.
 pub struct Source<'a> {
-    /// Per term: kernel of I^η where the term is the output's own.
-    pub own: Vec<Option<&'a [f64]>>,
+    /// Per term: kernel of I^η and its spectrum where the term is the output's own.
+    pub own: Vec<Option<(&'a [f64], &'a Kernel)>>,
     /// Per term: I^η s as measured.
     pub measured: Vec<&'a Kernel>,
-    /// Per term: I^η s without noise; not read for own terms.
+    /// Per term: I^η s without noise, the same object where it is no other; not read for own terms.
     pub clean: Vec<&'a Kernel>,
     /// Initial terms.
     pub initial: Vec<&'a Kernel>,
@@ -106,17 +106,31 @@ pub fn damped_inverse(divisor: &[f64]) -> Result<(Vec<f64>, bool)> {
     if !grows(&quotient) {
         return Ok((quotient, false));
     }
+    let finite = quotient.iter().all(|q| q.is_finite());
     let mut gamma = 4.0;
     loop {
-        let damped: Vec<f64> =
-            divisor.iter().enumerate().map(|(k, d)| d * libm::exp(-gamma * k as f64 / m as f64)).collect();
-        let quotient = series::divide(&one, &damped)?;
+        let rho = libm::exp(-gamma / m as f64);
+        // The quotient of a divisor read at ρz is the quotient read at ρz, as long as numbers hold it.
+        let damped = if finite { read_at(rho, &quotient) } else { series::divide(&one, &read_at(rho, divisor))? };
         // At γ = 64 m nothing is left of D but its first term.
-        if !grows(&quotient) || gamma > 64.0 * m as f64 {
-            return Ok((quotient, true));
+        if !grows(&damped) || gamma > 64.0 * m as f64 {
+            return Ok((damped, true));
         }
         gamma *= 2.0;
     }
+}
+
+/// A series read at ρz.
+fn read_at(rho: f64, series: &[f64]) -> Vec<f64> {
+    let mut power = 1.0;
+    series
+        .iter()
+        .map(|v| {
+            let value = v * power;
+            power *= rho;
+            value
+        })
+        .collect()
 }
 
 fn grows(response: &[f64]) -> bool {
@@ -131,7 +145,7 @@ fn grows(response: &[f64]) -> bool {
 fn divisor(source: &Source<'_>, coefficients: &[f64]) -> Vec<f64> {
     let mut out = vec![0.0; source.output.len()];
     for (kernel, c) in source.own.iter().zip(coefficients) {
-        if let Some(kernel) = kernel {
+        if let Some((kernel, _)) = kernel {
             out.iter_mut().zip(*kernel).for_each(|(d, v)| *d -= c * v);
         }
     }
@@ -155,7 +169,7 @@ pub struct Scratch {
 #[allow(clippy::cast_precision_loss)]
 pub fn step(
     sources: &[Source<'_>],
-    filters: &[Vec<f64>],
+    filters: &[Kernel],
     responses: &[Vec<f64>],
     fixed: &[Option<f64>],
     dropped: &[(usize, usize)],
@@ -173,31 +187,28 @@ pub fn step(
     let mut filtered = Vec::with_capacity(sources.len());
     for (r, source) in sources.iter().enumerate() {
         let m = source.output.len();
-        let filter = Kernel::new(&filters[r]);
-        let mut target = product(&filter, source.target, m, scratch);
+        let filter = &filters[r];
+        let mut target = product(filter, source.target, m, scratch);
         let mut phi: Vec<Vec<f64>> = Vec::with_capacity(k);
         for (j, value) in fixed.iter().enumerate() {
-            let column = product(&filter, source.measured[j], m, scratch);
+            let column = product(filter, source.measured[j], m, scratch);
             match value {
                 Some(c) => target.iter_mut().zip(&column).for_each(|(t, v)| *t -= c * v),
                 None => phi.push(column),
             }
         }
-        let simulated = Kernel::new(&product(&filter, &Kernel::new(&responses[r]), m, scratch));
+        let simulated = Kernel::new(&product(filter, &Kernel::new(&responses[r]), m, scratch));
         let mut psi: Vec<Vec<f64>> = Vec::with_capacity(k);
-        for &j in &free {
+        for (place, &j) in free.iter().enumerate() {
             psi.push(match source.own[j] {
-                None => product(&filter, source.clean[j], m, scratch),
-                Some(kernel) => {
-                    let mut out = vec![0.0; m];
-                    simulated.apply(kernel, &mut out, &mut scratch.buffers);
-                    out
-                }
+                None if std::ptr::eq(source.clean[j], source.measured[j]) => phi[place].clone(),
+                None => product(filter, source.clean[j], m, scratch),
+                Some((_, spectrum)) => product(&simulated, spectrum, m, scratch),
             });
         }
         let mut places: Vec<usize> = (0..free.len()).collect();
         for (place, &(_, i)) in kept.iter().enumerate().filter(|(_, &(record, _))| record == r) {
-            let column = product(&filter, source.initial[i], m, scratch);
+            let column = product(filter, source.initial[i], m, scratch);
             psi.push(column.clone());
             phi.push(column);
             places.push(free.len() + place);
@@ -332,7 +343,7 @@ pub fn refine(
             }
             let mut response = vec![0.0; m];
             sum.take(&mut response, &mut scratch.buffers);
-            filters.push(filter);
+            filters.push(spectrum);
             responses.push(response);
         }
         let (next, _) = step(sources, &filters, &responses, fixed, dropped, false, scratch)?;
@@ -442,7 +453,8 @@ impl Problem<'_> {
                 .iter()
                 .map(|r| {
                     let band = power_frequency(r.signal(structure.output), r.step());
-                    multiple.map_or_else(|| Ok(unit(r.m())), |multiple| low_pass(multiple * band, r))
+                    let filter = multiple.map_or_else(|| Ok(unit(r.m())), |multiple| low_pass(multiple * band, r));
+                    Ok(Kernel::new(&filter?))
                 })
                 .collect::<Result<Vec<_>>>()?;
             let own: Vec<Vec<f64>> = self.clean.iter().map(|r| r.signal(structure.output).to_vec()).collect();
@@ -528,7 +540,7 @@ impl Problem<'_> {
             let sources: Vec<Source<'_>> = shelves.iter().map(Shelf::source).collect();
             let filters = sources
                 .iter()
-                .map(|s| Ok(damped_inverse(&divisor(s, &solutions[i]))?.0))
+                .map(|s| Ok(Kernel::new(&damped_inverse(&divisor(s, &solutions[i]))?.0)))
                 .collect::<Result<Vec<_>>>()?;
             let own: Vec<Vec<f64>> = responses.iter().map(|outputs| outputs[i].clone()).collect();
             let (solution, covariance) = step(&sources, &filters, &own, fixed, &dropped[i], with_covariance, scratch)?;
@@ -640,7 +652,7 @@ fn coupled(
 
 /// Spectra that the sources of one record own.
 struct Shelf<'a> {
-    kernels: Vec<Option<Vec<f64>>>,
+    kernels: Vec<Option<(Vec<f64>, Kernel)>>,
     measured: Vec<Kernel>,
     clean: Vec<Kernel>,
     initial: Vec<Kernel>,
@@ -655,7 +667,13 @@ impl<'a> Shelf<'a> {
         Self {
             kernels: orders
                 .clone()
-                .map(|(s, eta)| own(s).then(|| block_pulse_kernel(eta, record.m(), record.step())))
+                .map(|(s, eta)| {
+                    own(s).then(|| {
+                        let kernel = block_pulse_kernel(eta, record.m(), record.step());
+                        let spectrum = Kernel::new(&kernel);
+                        (kernel, spectrum)
+                    })
+                })
                 .collect(),
             measured: orders.clone().map(|(s, eta)| Kernel::new(&record.integral(s, eta))).collect(),
             clean: orders.map(|(s, eta)| Kernel::new(&clean.integral(s, eta))).collect(),
@@ -667,7 +685,7 @@ impl<'a> Shelf<'a> {
 
     fn source(&self) -> Source<'_> {
         Source {
-            own: self.kernels.iter().map(Option::as_deref).collect(),
+            own: self.kernels.iter().map(|k| k.as_ref().map(|(kernel, spectrum)| (&kernel[..], spectrum))).collect(),
             measured: self.measured.iter().collect(),
             clean: self.clean.iter().collect(),
             initial: self.initial.iter().collect(),

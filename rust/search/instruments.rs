@@ -1,5 +1,5 @@
-//! The coefficient step of an order search by refined instrumental variables: spectra of every regressor, measured and
-//! clean, made once for all candidates.
+//! The coefficient step of an order search by refined instrumental variables: spectra of every regressor, made once for
+//! all candidates.
 
 use crate::error::{Error, Result};
 use crate::estimate::instrumental_variables::{low_pass, power_frequency, refine, Scratch, Settings, Source};
@@ -12,9 +12,10 @@ const START_BAND: f64 = 2.0;
 
 /// What the refinement of any candidate reads of one record.
 struct Shelf {
-    /// Spectrum of each column of the bank as measured, and without noise.
-    measured: Vec<Kernel>,
-    clean: Vec<Kernel>,
+    /// Spectrum of each column of the bank.
+    columns: Vec<Kernel>,
+    /// Spectrum of the kernel of each column of the output itself.
+    kernels: Vec<Option<Kernel>>,
     target: Kernel,
 }
 
@@ -25,31 +26,20 @@ pub(crate) struct Refiner {
 }
 
 impl Refiner {
-    /// Spectra of the columns of `banks`, which are those of the records' clean signals, and of the same as measured.
-    ///
-    /// # Errors
-    /// As [`Bank::new`].
-    pub(crate) fn new(
-        records: &[Record],
-        output: usize,
-        index: &Index,
-        banks: &[Bank],
-        settings: Settings,
-    ) -> Result<Self> {
+    /// Spectra of the columns of `banks`, which are those of the records' clean signals.
+    pub(crate) fn new(records: &[Record], output: usize, banks: &[Bank], settings: Settings) -> Self {
         let shelves = records
             .iter()
             .zip(banks)
-            .map(|(record, bank)| {
-                let clean = Bank::new(index, &record.cleaned(), output)?;
-                let spectra = |bank: &Bank| (0..bank.len()).map(|p| Kernel::new(bank.column(p))).collect();
-                Ok(Shelf {
-                    measured: spectra(bank),
-                    clean: spectra(&clean),
-                    target: Kernel::new(record.signal(output)),
-                })
+            .map(|(record, bank)| Shelf {
+                columns: (0..bank.len()).map(|p| Kernel::new(bank.column(p))).collect(),
+                kernels: (0..bank.len())
+                    .map(|p| Some(bank.kernel(p)).filter(|k| !k.is_empty()).map(Kernel::new))
+                    .collect(),
+                target: Kernel::new(record.signal(output)),
             })
-            .collect::<Result<Vec<_>>>()?;
-        Ok(Self { shelves, settings })
+            .collect();
+        Self { shelves, settings }
     }
 
     /// Refines coefficients in place: of the terms, then of the initial terms record by record.
@@ -67,10 +57,10 @@ impl Refiner {
             .zip(banks)
             .zip(targets)
             .map(|((shelf, bank), target)| Source {
-                own: positions.iter().map(|&p| Some(bank.kernel(p)).filter(|k| !k.is_empty())).collect(),
-                measured: positions.iter().map(|&p| &shelf.measured[p]).collect(),
-                clean: positions.iter().map(|&p| &shelf.clean[p]).collect(),
-                initial: initial.iter().map(|&p| &shelf.measured[p]).collect(),
+                own: positions.iter().map(|&p| shelf.kernels[p].as_ref().map(|k| (bank.kernel(p), k))).collect(),
+                measured: positions.iter().map(|&p| &shelf.columns[p]).collect(),
+                clean: positions.iter().map(|&p| &shelf.columns[p]).collect(),
+                initial: initial.iter().map(|&p| &shelf.columns[p]).collect(),
                 target: &shelf.target,
                 output: target,
             })

@@ -23,7 +23,7 @@ use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::haar;
 use crate::lanes::{self, Lanes, WIDTH};
 use crate::regressors::{Bank, Index, Key, Record, BANK_LIMIT};
-use crate::search::bound::{self, Bound};
+use crate::search::bound::{self, Bound, Reach};
 use crate::search::instruments::{start_bank, Refiner};
 use crate::search::lattice::{Cursor, Lattice};
 use crate::series::{Division, BLOCK};
@@ -46,6 +46,14 @@ const SCOUTS: u64 = 2048;
 const VECTORS: usize = 16;
 /// Transforms that following one candidate is worth; making test vectors must stay below a fraction of all that.
 const TRANSFORMS: u64 = 6;
+/// The same where coefficients are refined: a few steps of a division and a dozen transforms each.
+const REFINING: u64 = 100;
+/// First and largest number of refined candidates followed between two looks at the kept scores: each takes about a
+/// millisecond, and a lower score excludes many.
+const REFINED: (u64, u64) = (32, 1024);
+/// Candidates among which the most likely ones are refined beforehand: guesses are cheap, and what is kept of a good
+/// part of the lattice excludes most of it.
+const GUESSED: u64 = 1 << 18;
 /// Failures listed one by one; the rest are only counted.
 pub(crate) const LISTED: usize = 100;
 /// Most threads a search starts.
@@ -303,6 +311,8 @@ pub(crate) struct Problem {
     plain: Option<Plain>,
     bound: Option<Bound>,
     refiner: Option<Refiner>,
+    /// Where coefficients are refined: the banks that the bound speaks of, until it is made.
+    bound_banks: Vec<Bank>,
     fixed: Vec<Option<f64>>,
     /// Terms whose coefficients are estimated.
     free: Vec<usize>,
@@ -414,8 +424,30 @@ where
     }
 }
 
+/// [`Bound::excludes`] as a kernel.
+struct Excluding<'a> {
+    bound: &'a Bound,
+    limit: f64,
+    terms: &'a [usize],
+    fixed: &'a [Option<f64>],
+    initial: &'a [usize],
+    start: &'a [f64],
+    reach: &'a mut Reach,
+}
+
+impl lanes::Kernel for Excluding<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run(self) -> bool {
+        self.bound.excludes(self.limit, self.terms, self.fixed, self.initial, self.start, self.reach)
+    }
+}
+
 /// Memory of one thread.
 pub(crate) struct Scratch {
+    reach: Reach,
+    start: Vec<f64>,
     one: Solve<1>,
     divisor: Vec<f64>,
     block: Vec<f64>,
@@ -430,6 +462,8 @@ pub(crate) struct Scratch {
 impl Scratch {
     pub(crate) fn new() -> Self {
         Self {
+            reach: Reach::default(),
+            start: Vec::new(),
             one: Solve::new(),
             divisor: Vec::new(),
             block: vec![0.0; BLOCK],
@@ -520,10 +554,14 @@ impl Problem {
             unit: 4.0 * f64::EPSILON * samples as f64,
         });
         let refiner = match options.estimator {
-            Estimator::InstrumentalVariables(settings) => {
-                Some(Refiner::new(records, output, &index, &banks, settings)?)
-            }
+            Estimator::InstrumentalVariables(settings) => Some(Refiner::new(records, output, &banks, settings)),
             _ => None,
+        };
+        // D e = w holds for integrals of the output as it was measured.
+        let bound_banks = if refined && options.early_stopping && options.criterion == Criterion::OutputError {
+            records.iter().map(|r| Bank::new(&index, &r.cleaned_but(output), output)).collect::<Result<_>>()?
+        } else {
+            Vec::new()
         };
         Ok(Self {
             index,
@@ -534,6 +572,7 @@ impl Problem {
             parts,
             plain,
             bound: None,
+            bound_banks,
             fixed: fixed.to_vec(),
             free: (0..fixed.len()).filter(|&k| fixed[k].is_none()).collect(),
             options: options.clone(),
@@ -543,18 +582,19 @@ impl Problem {
 
     /// Makes test vectors for about this many candidates, as far as they pay; on the current thread pool.
     pub(crate) fn with_bound(mut self, candidates: u64) -> Self {
-        // The bound speaks of coefficients, which a refinement changes.
-        if self.options.early_stopping && self.plain.is_none() && self.refiner.is_none() {
+        let banks = std::mem::take(&mut self.bound_banks);
+        let (banks, transforms) =
+            if self.refiner.is_some() { (&banks, 4 * REFINING) } else { (&self.banks, TRANSFORMS) };
+        if self.options.early_stopping && self.plain.is_none() && !banks.is_empty() {
             let output_error = self.options.criterion == Criterion::OutputError;
-            let own = (0..self.index.keys().len()).filter(|&p| !self.banks[0].kernel(p).is_empty()).count() as u64;
+            let own = (0..self.index.keys().len()).filter(|&p| !banks[0].kernel(p).is_empty()).count() as u64;
             // Two transforms for each own column and test vector; the products cost as much as a transform or so.
             let each = 2 * own + 4;
             #[allow(clippy::cast_possible_truncation)]
             let groups =
-                (candidates * TRANSFORMS / 4 / (each * WIDTH as u64)).min((bound::POOL / WIDTH) as u64) as usize;
+                (candidates * transforms / 4 / (each * WIDTH as u64)).min((bound::POOL / WIDTH) as u64) as usize;
             if groups > 0 {
-                self.bound =
-                    Some(Bound::new(&self.banks, &self.targets, self.options.norm, output_error, groups * WIDTH));
+                self.bound = Some(Bound::new(banks, &self.targets, self.options.norm, output_error, groups * WIDTH));
             }
         }
         self
@@ -599,6 +639,16 @@ impl Problem {
         scratch.coefficients.extend(scratch.one.coefficients.iter().map(|c| c[0]));
         scratch.weights.clear();
         scratch.weights.extend(scratch.one.initial.iter().map(|c| c[0]));
+        if let (Some(_), Some(bound), true) = (&self.refiner, &self.bound, limit < f64::INFINITY) {
+            // The refinement may change the coefficients in any way: only what holds of all of them excludes.
+            let Scratch { reach, start, coefficients, weights, .. } = scratch;
+            start.clear();
+            start.extend(coefficients.iter().chain(weights.iter()));
+            let (terms, fixed) = (positions, &self.fixed[..]);
+            if lanes::widest(Excluding { bound, limit, terms, fixed, initial, start, reach }) {
+                return Verdict::Bounded(limit);
+            }
+        }
         if let Some(refiner) = &self.refiner {
             let (coefficients, weights) = (&mut scratch.coefficients, &mut scratch.weights);
             let (data, places) = ((&self.banks[..], &self.targets[..]), (positions, initial));
@@ -1245,14 +1295,18 @@ impl Hunt<'_> {
             let (bound, guess) = match (&squares, &self.problem.bound) {
                 (Some((least, guess)), _) => (least[n], guess[n]),
                 (None, Some(bound)) => {
+                    // Coefficients that are yet to be refined give an order of visiting and prove nothing.
+                    let refined = self.problem.refiner.is_some();
+                    let limit = if refined { f64::INFINITY } else { limit };
                     columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.at[n]);
                     coefficients.iter_mut().zip(&solve.coefficients).for_each(|(c, x)| *c = x[n]);
                     weights.clear();
                     weights.extend(solve.initial.iter().map(|x| x[n]));
                     let e = initial.len();
-                    bound.evaluate(limit, |r| {
+                    let (least, guess) = bound.evaluate(limit, |r| {
                         (&columns[..], &coefficients[..], &initial[..], &weights[r * e..(r + 1) * e])
-                    })
+                    });
+                    (if refined { 0.0 } else { least }, guess)
                 }
                 (None, None) => (0.0, spread(index)),
             };
@@ -1281,9 +1335,10 @@ impl Hunt<'_> {
         let saving = counted && self.control.saving.load(Ordering::Relaxed);
         let piece =
             if saving { (PIECE / self.problem.samples.max(1)).max(4 * self.scratches.0.len()) } else { usize::MAX };
+        let (first, largest) = if self.problem.refiner.is_some() { REFINED } else { FOLLOWED };
         let batch = |at: u64| usize::try_from(at).unwrap_or(usize::MAX).min(open.len());
         if place.end == 0 {
-            place.size = FOLLOWED.0;
+            place.size = first;
             place.end = batch(place.size) as u64;
             place.limit = kept.limit;
         }
@@ -1310,7 +1365,7 @@ impl Hunt<'_> {
             if batch(place.end) == open.len() {
                 return Ok(());
             }
-            place.size = place.size.saturating_mul(2).min(FOLLOWED.1);
+            place.size = place.size.saturating_mul(2).min(largest);
             place.end = batch(place.end.saturating_add(place.size)) as u64;
             place.limit = kept.limit;
         }
@@ -1343,13 +1398,16 @@ impl Hunt<'_> {
                 };
                 scratch.positions = positions;
                 scratch.initial = initial;
-                if counted {
+                // One that is bounded is counted as done with the other bounded ones.
+                if counted && !matches!(verdict, Verdict::Bounded(_)) {
                     this.done(1, u64::from(matches!(verdict, Verdict::Stopped(_))));
                 }
                 Some((candidate.index, verdict, row))
             })
         };
-        let results: Vec<_> = self.pool.install(|| open.par_iter().with_min_len(4).map(visit).collect());
+        let results: Vec<_> = self.pool.install(|| {
+            open.par_iter().with_min_len(if this.problem.refiner.is_some() { 1 } else { 4 }).map(visit).collect()
+        });
         self.check_stop()?;
         let mut rows = Vec::new();
         for (index, verdict, row) in results.into_iter().flatten() {
@@ -1383,7 +1441,8 @@ impl Hunt<'_> {
     fn scout(&mut self) -> Result<(f64, Option<Vec<usize>>)> {
         let count = self.lattice.count();
         let order = visit(count);
-        let indices: Vec<u64> = (0..count.min(SCOUTS)).map(order).collect();
+        let refined = self.problem.refiner.is_some();
+        let indices: Vec<u64> = (0..count.min(if refined { GUESSED } else { SCOUTS })).map(order).collect();
         let this = &*self;
         let found: Vec<Option<(Open, Vec<f64>)>> = self.pool.install(|| {
             indices
@@ -1408,8 +1467,10 @@ impl Hunt<'_> {
                     };
                     let (mut each, mut guess) = (Vec::new(), 0.0);
                     if let Some(bound) = &this.problem.bound {
-                        each = vec![0.0; bound.len()];
-                        bound.each(columns, &mut each);
+                        if !refined {
+                            each = vec![0.0; bound.len()];
+                            bound.each(columns, &mut each);
+                        }
                         guess = bound.evaluate(f64::INFINITY, columns).1;
                     } else if let Some(plain) = &this.problem.plain {
                         guess = plain.error(&sources, &solve.coefficients).1[0];
@@ -1426,7 +1487,8 @@ impl Hunt<'_> {
         let mut kept = Kept::new(self.options.keep, f64::INFINITY);
         self.follow(&likely, &mut kept, Place::start(0), false)?;
         let limit = kept.limit;
-        let which = self.problem.bound.as_ref().map(|bound| {
+        // Where no coefficients are known yet all test vectors count.
+        let which = self.problem.bound.as_ref().filter(|_| !refined).map(|bound| {
             let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
             choose(&each, bound.len(), limit)
         });
@@ -1626,14 +1688,16 @@ impl<'a> Search<'a> {
         let tables = tables(&lattice, &problem)?;
         control.total.store(lattice.count(), Ordering::Relaxed);
         let mut ready = Self { problem, lattice, tables, options: options.clone(), limit: f64::INFINITY };
-        let screened = ready.problem.bound.is_some() || ready.problem.plain.is_some();
+        // Scouts of a few candidates, each refined, would cost as much as the search.
+        let few = ready.problem.refiner.is_some() && ready.lattice.count() <= ROUND_FOLLOWED;
+        let screened = !few && (ready.problem.bound.is_some() || ready.problem.plain.is_some());
         let mut hunt = ready.hunt(pool, control);
         hunt.check_stop()?;
         if screened {
             let (limit, which) = hunt.scout()?;
             ready.limit = limit;
-            if let (Some(bound), Some(which)) = (ready.problem.bound.take(), which) {
-                ready.problem.bound = Some(bound.chosen(&which));
+            if let Some(which) = which {
+                ready.problem.bound = ready.problem.bound.take().map(|bound| bound.chosen(&which));
             }
         }
         Ok(ready)

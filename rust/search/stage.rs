@@ -1,20 +1,30 @@
-//! Order search over all equations of a stage under its order law, by joining score tables.
+//! Order search over all equations of a stage under its order law, by joining the equations' score tables on the law.
 //!
 //! The law ties the equations' orders to a few free ones, so many tuples of free orders share an equation's orders.
-//! Each equation's distinct orders are evaluated once; tuples only add table entries. Entries start as lower bounds
-//! (left early) and are sharpened until every tuple that could be kept is exact, so the table is that of enumeration.
+//! Each equation's distinct orders are evaluated once. The free orders are split between the first equation and the
+//! others: x = (a, b). An equation's orders are then what its own half of x gives plus what the other half adds, and
+//! that addend takes few distinct values: (a, addend from b) and (b, addend from a) fit together exactly where each
+//! names the other's addend. Rows of both halves meet in the bucket of the two addends; within a bucket every pair is a
+//! tuple, and every tuple is one pair of one bucket. So the best tuples come from the best rows of the best buckets,
+//! and what became of all is counted bucket by bucket; the product of the axes is never gone through.
+//!
+//! Table entries start as lower bounds (left early) and are sharpened until every tuple that could be kept is exact, so
+//! the result is that of enumeration, ties by index.
 
+use std::collections::hash_map::Entry as Slot;
 use std::collections::{HashMap, HashSet};
+use std::ops::Range;
 use std::sync::atomic::Ordering;
 
 use rayon::prelude::*;
 
-use crate::equation::{grains, Structure};
+use crate::equation::{grains, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::regressors::{Index, Record};
-use crate::search::lattice::LawLattice;
+use crate::search::lattice::{LawEquation, LawLattice, Sums};
 use crate::search::run::{
-    index_alpha, index_orders, pool, Control, Counts, Failure, Norm, Options, Problem, Row, Scratches, Verdict, LISTED,
+    index_alpha, index_orders, pool, Control, Counts, Failure, Norm, Options, Problem, Row, Scratch, Scratches,
+    Verdict, LISTED,
 };
 
 /// An equation's candidates are first followed up to this multiple of its best score.
@@ -50,19 +60,46 @@ pub struct StageOutcome {
     pub distinct: Vec<u64>,
 }
 
+/// Sums of scores are compared with this much room: their terms may have been added in another order.
+const ROUNDING: f64 = 1e-12;
+
 /// What is known of one equation's candidate: its scaled score, or a bound below it.
 #[derive(Debug, Clone, Copy)]
 struct Entry {
     value: f64,
-    exact: bool,
-    /// Whether a bound without a run is all that is known.
-    bounded: bool,
-    failure: Option<Failure>,
+    class: Class,
 }
+
+/// What became of a candidate, or of several together: the first failure, else the largest.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Class {
+    Exact,
+    /// A bound without a run is all that is known.
+    Bounded,
+    /// Left at a partial sum, or not looked at.
+    Open,
+    Failed(Failure),
+}
+
+impl Class {
+    fn failed(self) -> bool {
+        matches!(self, Self::Failed(_))
+    }
+
+    fn with(self, later: Self) -> Self {
+        if self.failed() {
+            self
+        } else {
+            self.max(later)
+        }
+    }
+}
+
+const OPEN: Entry = Entry { value: 0.0, class: Class::Open };
 
 struct Table<'a> {
     problem: Problem,
-    structures: Vec<Structure>,
+    candidates: &'a Candidates,
     entries: Vec<Entry>,
     scale: f64,
     samples: f64,
@@ -90,9 +127,9 @@ impl Table<'_> {
                     }
                     // A hair above, so that a tie in the scaled sum is followed to its end.
                     let limit = this.raw(score) * (1.0 + 1e-12);
-                    let structure = &this.structures[id];
+                    let structure = this.candidates.structure(id);
                     let (verdict, _) = scratches
-                        .with(|scratch| this.problem.evaluate_structure(structure, limit, scratch, control))?;
+                        .with(|scratch| this.problem.evaluate_structure(&structure, limit, scratch, control))?;
                     Ok((id, verdict))
                 })
                 .collect::<Result<_>>()
@@ -102,22 +139,490 @@ impl Table<'_> {
         }
         for (id, verdict) in verdicts {
             let score = |raw: f64| self.problem.score(raw) / self.scale;
-            let open = Entry { value: 0.0, exact: false, bounded: false, failure: None };
             self.entries[id] = match verdict {
-                Verdict::Score(raw) => Entry { value: score(raw), exact: true, ..open },
-                Verdict::Bounded(raw) => Entry { value: score(raw), bounded: true, ..open },
-                Verdict::Stopped(raw) => Entry { value: score(raw), ..open },
-                Verdict::Failed(failure) => Entry { value: f64::INFINITY, exact: true, failure: Some(failure), ..open },
+                Verdict::Score(raw) => Entry { value: score(raw), class: Class::Exact },
+                Verdict::Bounded(raw) => Entry { value: score(raw), class: Class::Bounded },
+                Verdict::Stopped(raw) => Entry { value: score(raw), class: Class::Open },
+                Verdict::Failed(failure) => Entry { value: f64::INFINITY, class: Class::Failed(failure) },
             };
         }
         Ok(())
     }
 }
 
-type Key = Vec<i64>;
+/// Distinct orders of one equation.
+struct Candidates {
+    output: usize,
+    signals: Vec<usize>,
+    /// α and the terms' orders, one candidate after the other.
+    orders: Vec<f64>,
+    ids: HashMap<Box<[i64]>, u32>,
+}
 
-fn key(structure: &Structure) -> Key {
-    std::iter::once(grains(structure.order)).chain(structure.terms.iter().map(|t| grains(t.order))).collect()
+impl Candidates {
+    fn new(equation: &LawEquation) -> Self {
+        let signals = equation.terms.iter().map(|t| t.0).collect();
+        Self { output: equation.output, signals, orders: Vec::new(), ids: HashMap::new() }
+    }
+
+    fn len(&self) -> usize {
+        self.ids.len()
+    }
+
+    /// Number of the candidate with these orders, added at the end if new.
+    fn id(&mut self, orders: &[f64], key: &mut Vec<i64>) -> Result<u32> {
+        key.clear();
+        key.extend(orders.iter().map(|&v| grains(v)));
+        if let Some(&id) = self.ids.get(key.as_slice()) {
+            return Ok(id);
+        }
+        let id = number(self.ids.len())?;
+        self.ids.insert(key.as_slice().into(), id);
+        self.orders.extend_from_slice(orders);
+        Ok(id)
+    }
+
+    fn structure(&self, id: usize) -> Structure {
+        let width = self.signals.len() + 1;
+        let orders = &self.orders[id * width..(id + 1) * width];
+        let terms = self.signals.iter().zip(&orders[1..]).map(|(&signal, &order)| Term { signal, order }).collect();
+        Structure { output: self.output, order: orders[0], terms }
+    }
+}
+
+fn number(count: usize) -> Result<u32> {
+    u32::try_from(count).map_err(|_| Error::Internal { what: "more than 2^32 distinct orders".into() })
+}
+
+/// A row of one half of the join: a choice of its own free orders, and the addend of the other half's.
+#[derive(Debug, Clone, Copy)]
+struct Part {
+    /// The two addends by which it meets rows of the other half.
+    bucket: u64,
+    /// What its own free orders contribute to the index of a tuple.
+    index: u64,
+    /// Which candidates of its equations it names.
+    combination: u32,
+}
+
+/// One half of the join.
+struct Half {
+    equations: Range<usize>,
+    /// Candidates of each equation, combination after combination.
+    combinations: Vec<u32>,
+    parts: Vec<Part>,
+}
+
+impl Half {
+    /// Sum and class of every combination.
+    fn states(&self, tables: &[Table<'_>]) -> Vec<Entry> {
+        let width = self.equations.len();
+        if width == 0 {
+            return vec![Entry { value: 0.0, class: Class::Exact }];
+        }
+        self.combinations
+            .chunks_exact(width)
+            .map(|ids| {
+                let entries = self.equations.clone().zip(ids).map(|(e, &id)| tables[e].entries[id as usize]);
+                entries.fold(Entry { value: 0.0, class: Class::Exact }, |sum, entry| Entry {
+                    value: sum.value + entry.value,
+                    class: sum.class.with(entry.class),
+                })
+            })
+            .collect()
+    }
+
+    fn ids(&self, combination: u32) -> &[u32] {
+        let width = self.equations.len();
+        &self.combinations[combination as usize * width..][..width]
+    }
+}
+
+/// Rows of both halves that fit together, each with each.
+struct Bucket {
+    rows: [Range<usize>; 2],
+}
+
+/// The layout of a join.
+struct Join {
+    halves: [Half; 2],
+    buckets: Vec<Bucket>,
+}
+
+/// Most rows of both halves: they take a GB.
+const MAX_PARTS: u128 = 40_000_000;
+/// Free orders whose place in either half is tried; more go to the second.
+const PLACED: usize = 10;
+
+/// The free orders that go to the first half: those that leave the fewest rows.
+fn split(lattice: &LawLattice, rows: &[Sums; 2], control: &Control) -> Result<Vec<usize>> {
+    let axes: Vec<usize> = (0..lattice.axes().len()).collect();
+    let size = |axes: &[usize]| axes.iter().map(|&a| lattice.axes()[a].len() as u128).product::<u128>();
+    let several: Vec<usize> = axes.iter().copied().filter(|&a| lattice.axes()[a].len() > 1).take(PLACED).collect();
+    let mut plans: Vec<(u128, Vec<usize>, Vec<usize>)> = (0..1usize << several.len())
+        .map(|mask| {
+            let own: Vec<usize> =
+                several.iter().enumerate().filter(|(i, _)| mask >> i & 1 == 1).map(|(_, &axis)| axis).collect();
+            let other: Vec<usize> = axes.iter().copied().filter(|axis| !own.contains(axis)).collect();
+            (size(&own) + size(&other), own, other)
+        })
+        .collect();
+    plans.sort();
+    let (mut least, mut best) = (u128::MAX, Vec::new());
+    for (floor, own, other) in plans {
+        if control.stop.load(Ordering::Relaxed) {
+            return Err(Error::Interrupted);
+        }
+        if floor >= least {
+            break;
+        }
+        let limit = |size: u128| usize::try_from((least / size).min(MAX_PARTS)).unwrap_or(usize::MAX);
+        let Some(first) = rows[0].image(lattice, &other, limit(size(&own))) else { continue };
+        let Some(second) = rows[1].image(lattice, &own, limit(size(&other))) else { continue };
+        let count = size(&own) * first.len() as u128 + size(&other) * second.len() as u128;
+        if count < least {
+            (least, best) = (count, own);
+        }
+    }
+    if least > MAX_PARTS {
+        return Err(Error::LatticeTooLarge { count: least.min(u128::from(lattice.product())), limit: MAX_PARTS });
+    }
+    Ok(best)
+}
+
+impl Join {
+    /// Lays out the join and the distinct candidates of every equation; marks those that some tuple needs.
+    fn new(
+        lattice: &LawLattice,
+        candidates: &mut [Candidates],
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<(Self, Vec<Vec<usize>>)> {
+        let count = candidates.len();
+        let ranges = [0..count.min(1), count.min(1)..count];
+        let rows = ranges.clone().map(|range| Sums::new(lattice, range));
+        let own = split(lattice, &rows, control)?;
+        let other: Vec<usize> = (0..lattice.axes().len()).filter(|axis| !own.contains(axis)).collect();
+        let full = |axes: &[usize], rows: &Sums| {
+            rows.image(lattice, axes, usize::MAX)
+                .ok_or_else(|| Error::Internal { what: "an image without a limit".into() })
+        };
+        let addends = [full(&other, &rows[0])?, full(&own, &rows[1])?];
+        let stride = addends[1].len() as u64;
+        let mut halves = Vec::with_capacity(2);
+        for (h, axes) in [&own, &other].into_iter().enumerate() {
+            let equations = ranges[h].clone();
+            let mut half = Half { equations: equations.clone(), combinations: Vec::new(), parts: Vec::new() };
+            let mut known: HashMap<Box<[u32]>, u32> = HashMap::new();
+            let (mut orders, mut key, mut ids) = (Vec::new(), Vec::new(), Vec::new());
+            let mut failed = None;
+            rows[h].each(lattice, axes, &rows[1 - h], |index, sums, theirs| {
+                if control.stop.load(Ordering::Relaxed) {
+                    failed = Some(Error::Interrupted);
+                }
+                let Some(named) = addends[1 - h].find(theirs) else { return };
+                for (number_of_addend, addend) in addends[h].each().enumerate() {
+                    if failed.is_some() {
+                        return;
+                    }
+                    if !rows[h].orders(lattice, sums, addend, &mut orders) {
+                        continue;
+                    }
+                    match combination(lattice, candidates, &mut half, &mut known, &orders, &mut key, &mut ids) {
+                        Ok(combination) => {
+                            let mine = number_of_addend as u64;
+                            let named = u64::from(named);
+                            let bucket = if h == 0 { mine * stride + named } else { named * stride + mine };
+                            half.parts.push(Part { bucket, index, combination });
+                        }
+                        Err(error) => failed = Some(error),
+                    }
+                }
+            });
+            if let Some(error) = failed {
+                return Err(error);
+            }
+            pool.install(|| half.parts.par_sort_unstable_by_key(|part| (part.bucket, part.index)));
+            halves.push(half);
+        }
+        let [first, second] =
+            <[Half; 2]>::try_from(halves).map_err(|_| Error::Internal { what: "a join without two halves".into() })?;
+        let mut join = Self { halves: [first, second], buckets: Vec::new() };
+        join.meet();
+        let mut used: Vec<Vec<bool>> = candidates.iter().map(|c| vec![false; c.len()]).collect();
+        for bucket in &join.buckets {
+            for (half, rows) in join.halves.iter().zip(&bucket.rows) {
+                for part in &half.parts[rows.clone()] {
+                    for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
+                        used[e][id as usize] = true;
+                    }
+                }
+            }
+        }
+        let used = used.iter().map(|u| (0..u.len()).filter(|&id| u[id]).collect()).collect();
+        Ok((join, used))
+    }
+
+    /// Finds the buckets that hold rows of both halves.
+    fn meet(&mut self) {
+        let [a, b] = [&self.halves[0].parts, &self.halves[1].parts];
+        let end = |parts: &[Part], start: usize| {
+            start + parts[start..].iter().take_while(|part| part.bucket == parts[start].bucket).count()
+        };
+        let (mut i, mut j) = (0, 0);
+        while i < a.len() && j < b.len() {
+            match a[i].bucket.cmp(&b[j].bucket) {
+                std::cmp::Ordering::Less => i += 1,
+                std::cmp::Ordering::Greater => j += 1,
+                std::cmp::Ordering::Equal => {
+                    let rows = [i..end(a, i), j..end(b, j)];
+                    (i, j) = (rows[0].end, rows[1].end);
+                    self.buckets.push(Bucket { rows });
+                }
+            }
+        }
+    }
+
+    /// Number of tuples.
+    fn tuples(&self) -> u64 {
+        self.buckets.iter().map(|b| b.rows[0].len() as u64 * b.rows[1].len() as u64).sum()
+    }
+
+    /// Least value in each half of a bucket among rows that pass; none where a half has no such row.
+    fn least(&self, bucket: &Bucket, states: &[Vec<Entry>; 2], passes: impl Fn(Class) -> bool) -> Option<[f64; 2]> {
+        let mut least = [f64::INFINITY; 2];
+        for h in 0..2 {
+            for part in &self.halves[h].parts[bucket.rows[h].clone()] {
+                let state = states[h][part.combination as usize];
+                if passes(state.class) && state.value < least[h] {
+                    least[h] = state.value;
+                }
+            }
+        }
+        least.iter().all(|v| v.is_finite()).then_some(least)
+    }
+
+    /// Score of a tuple: its equations' in their order, as enumeration adds them.
+    fn score(&self, tables: &[Table<'_>], pair: [u32; 2]) -> f64 {
+        let halves = self.halves.iter().zip(pair);
+        halves
+            .flat_map(|(half, combination)| half.equations.clone().zip(half.ids(combination)))
+            .map(|(e, &id)| tables[e].entries[id as usize].value)
+            .sum()
+    }
+
+    /// The best exact tuples, best first, ties by index.
+    fn best(
+        &self,
+        states: &[Vec<Entry>; 2],
+        tables: &[Table<'_>],
+        keep: usize,
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<Vec<(f64, u64)>> {
+        let exact = |class: Class| class == Class::Exact;
+        let mut order: Vec<(f64, usize, [f64; 2])> = pool.install(|| {
+            let found = self.buckets.par_iter().enumerate().filter_map(|(i, bucket)| {
+                self.least(bucket, states, exact).map(|least| (least[0] + least[1], i, least))
+            });
+            let mut order: Vec<_> = found.collect();
+            order.par_sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            order
+        });
+        order.dedup_by_key(|o| o.1);
+        let mut kept: Vec<(f64, u64)> = Vec::new();
+        let trim = |kept: &mut Vec<(f64, u64)>| {
+            kept.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            kept.truncate(keep);
+            if kept.len() == keep {
+                kept[keep - 1].0 * (1.0 + ROUNDING)
+            } else {
+                f64::INFINITY
+            }
+        };
+        let mut worst = f64::INFINITY;
+        let room = 2 * keep.max(512);
+        for (bound, i, least) in order {
+            if control.stop.load(Ordering::Relaxed) {
+                return Err(Error::Interrupted);
+            }
+            if bound > worst {
+                break;
+            }
+            let rows: [Vec<(f64, Part)>; 2] = std::array::from_fn(|h| {
+                let parts = self.halves[h].parts[self.buckets[i].rows[h].clone()].iter();
+                let mut rows: Vec<(f64, Part)> = parts
+                    .map(|&part| (states[h][part.combination as usize], part))
+                    .filter(|(state, _)| exact(state.class) && state.value + least[1 - h] <= worst)
+                    .map(|(state, part)| (state.value, part))
+                    .collect();
+                rows.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.index.cmp(&b.1.index)));
+                rows
+            });
+            for (a, first) in &rows[0] {
+                if a + least[1] > worst {
+                    break;
+                }
+                for (b, second) in &rows[1] {
+                    if a + b > worst {
+                        break;
+                    }
+                    let pair = [first.combination, second.combination];
+                    kept.push((self.score(tables, pair), first.index + second.index));
+                    if kept.len() >= room {
+                        worst = trim(&mut kept);
+                    }
+                }
+            }
+            if worst == f64::INFINITY && kept.len() >= keep {
+                worst = trim(&mut kept);
+            }
+        }
+        trim(&mut kept);
+        Ok(kept)
+    }
+
+    /// Inexact entries that could still be part of a kept tuple, with the score up to which to follow each.
+    fn unresolved(
+        &self,
+        states: &[Vec<Entry>; 2],
+        tables: &[Table<'_>],
+        worst: f64,
+        raise: f64,
+        control: &Control,
+    ) -> Result<Vec<Vec<(usize, f64)>>> {
+        let mut limits: Vec<Vec<f64>> = tables.iter().map(|t| vec![f64::NEG_INFINITY; t.entries.len()]).collect();
+        for bucket in &self.buckets {
+            if control.stop.load(Ordering::Relaxed) {
+                return Err(Error::Interrupted);
+            }
+            // Not finite where all of one half have failed.
+            let Some(least) = self.least(bucket, states, |class| !class.failed()) else { continue };
+            if least[0] + least[1] > worst * (1.0 + ROUNDING) {
+                continue;
+            }
+            for (h, half) in self.halves.iter().enumerate() {
+                for part in &half.parts[bucket.rows[h].clone()] {
+                    let state = states[h][part.combination as usize];
+                    let open = matches!(state.class, Class::Bounded | Class::Open);
+                    if !open || state.value + least[1 - h] > worst * (1.0 + ROUNDING) {
+                        continue;
+                    }
+                    for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
+                        let entry = tables[e].entries[id as usize];
+                        if entry.class == Class::Exact {
+                            continue;
+                        }
+                        // Without a full table any tuple may enter: follow this one a few times further than before.
+                        let limit = if worst.is_finite() {
+                            worst - least[1 - h] - (state.value - entry.value)
+                        } else {
+                            raise * entry.value
+                        };
+                        // Where rounding leaves no room between bound and worst, only its end tells more.
+                        let limit = if limit > entry.value { limit } else { f64::INFINITY };
+                        let old = &mut limits[e][id as usize];
+                        *old = old.max(limit);
+                    }
+                }
+            }
+        }
+        Ok(limits
+            .into_iter()
+            .map(|all| all.into_iter().enumerate().filter(|(_, limit)| *limit > f64::NEG_INFINITY).collect())
+            .collect())
+    }
+
+    /// What became of all tuples, and the first failures by index.
+    fn count(&self, states: &[Vec<Entry>; 2]) -> (Counts, Vec<(u64, Failure)>) {
+        let mut counts = Counts::default();
+        let mut failures: Vec<(u64, Failure)> = Vec::new();
+        for bucket in &self.buckets {
+            let parts: [&[Part]; 2] = std::array::from_fn(|h| &self.halves[h].parts[bucket.rows[h].clone()]);
+            let tally: [Vec<(Class, u64)>; 2] = std::array::from_fn(|h| {
+                let mut tally: Vec<(Class, u64)> = Vec::new();
+                for part in parts[h] {
+                    let class = states[h][part.combination as usize].class;
+                    match tally.iter_mut().find(|t| t.0 == class) {
+                        Some(t) => t.1 += 1,
+                        None => tally.push((class, 1)),
+                    }
+                }
+                tally
+            });
+            let mut failed = false;
+            for &(a, x) in &tally[0] {
+                for &(b, y) in &tally[1] {
+                    let count = x * y;
+                    counts.candidates += count;
+                    *match a.with(b) {
+                        Class::Exact => &mut counts.beaten,
+                        Class::Bounded => &mut counts.bounded,
+                        Class::Open => &mut counts.stopped,
+                        Class::Failed(Failure::Singular) => &mut counts.singular,
+                        Class::Failed(Failure::Diverged) => &mut counts.diverged,
+                    } += count;
+                    failed |= a.with(b).failed();
+                }
+            }
+            if failed {
+                self.list(parts, states, &mut failures);
+            }
+        }
+        failures.sort_unstable();
+        failures.truncate(LISTED);
+        (counts, failures)
+    }
+
+    /// Adds the failures of a bucket that may be among the first; parts come in the order of their index.
+    fn list(&self, parts: [&[Part]; 2], states: &[Vec<Entry>; 2], failures: &mut Vec<(u64, Failure)>) {
+        for first in parts[0] {
+            for second in parts[1] {
+                let index = first.index + second.index;
+                if failures.len() >= LISTED && index > failures[LISTED - 1].0 {
+                    break;
+                }
+                let [a, b] = [(0, first), (1, second)].map(|(h, p)| states[h][p.combination as usize].class);
+                if let Class::Failed(failure) = a.with(b) {
+                    failures.push((index, failure));
+                    if failures.len() >= 8 * LISTED {
+                        failures.sort_unstable();
+                        failures.truncate(LISTED);
+                    }
+                }
+            }
+        }
+        failures.sort_unstable();
+        failures.truncate(LISTED);
+    }
+}
+
+/// The combination of candidates with these orders, equation after equation, added at the end if new.
+fn combination(
+    lattice: &LawLattice,
+    candidates: &mut [Candidates],
+    half: &mut Half,
+    known: &mut HashMap<Box<[u32]>, u32>,
+    orders: &[f64],
+    key: &mut Vec<i64>,
+    ids: &mut Vec<u32>,
+) -> Result<u32> {
+    ids.clear();
+    let mut rest = orders;
+    for e in half.equations.clone() {
+        let (mine, others) = rest.split_at(lattice.equations()[e].terms.len() + 1);
+        ids.push(candidates[e].id(mine, key)?);
+        rest = others;
+    }
+    match known.entry(ids.as_slice().into()) {
+        Slot::Occupied(slot) => Ok(*slot.get()),
+        Slot::Vacant(slot) => {
+            // Every equation adds its candidates in the order of combinations where it is alone.
+            let next = number(if ids.is_empty() { 0 } else { half.combinations.len() / ids.len() })?;
+            half.combinations.extend_from_slice(ids);
+            Ok(*slot.insert(next))
+        }
+    }
 }
 
 /// Searches the free orders of a stage: the sum over equations of score / scale is smallest.
@@ -140,37 +645,22 @@ pub fn search(
     check_length("scales", equations.len(), scales.len())?;
     let pool = pool(options.threads)?;
 
-    // Distinct candidates of each equation.
-    let mut ids: Vec<HashMap<Key, u32>> = vec![HashMap::new(); equations.len()];
-    let mut structures: Vec<Vec<Structure>> = vec![Vec::new(); equations.len()];
-    let mut tuples = 0u64;
-    for index in 0..lattice.product() {
-        if index % 65_536 == 0 && control.stop.load(Ordering::Relaxed) {
-            return Err(Error::Interrupted);
-        }
-        let Some(found) = lattice.structures(index) else { continue };
-        tuples += 1;
-        for (e, structure) in found.into_iter().enumerate() {
-            let next = u32::try_from(structures[e].len())
-                .map_err(|_| Error::Internal { what: "more than 2^32 distinct orders".into() })?;
-            let all = &mut structures[e];
-            ids[e].entry(key(&structure)).or_insert_with(|| {
-                all.push(structure);
-                next
-            });
-        }
-    }
-    if tuples == 0 {
+    let mut candidates: Vec<Candidates> = equations.iter().map(Candidates::new).collect();
+    let (join, used) = Join::new(lattice, &mut candidates, &pool, control)?;
+    if join.tuples() == 0 {
         return Err(Error::EmptyLattice { why: "no tuple of free orders gives orders in range".into() });
     }
-    let distinct: Vec<u64> = structures.iter().map(|s| s.len() as u64).collect();
+    let distinct: Vec<u64> = used.iter().map(|u| u.len() as u64).collect();
     control.total.store(distinct.iter().sum(), Ordering::Relaxed);
 
+    #[allow(clippy::cast_precision_loss)]
+    let samples = records.iter().map(Record::m).sum::<usize>() as f64;
     let mut tables = Vec::with_capacity(equations.len());
-    for (e, structures) in structures.into_iter().enumerate() {
+    for (e, candidates) in candidates.iter().enumerate() {
         check_length("fixed coefficients", equations[e].terms.len(), fixed[e].len())?;
         let (mut index, mut seen, mut alphas) = (Index::default(), HashSet::new(), HashSet::new());
-        for structure in &structures {
+        for &id in &used[e] {
+            let structure = candidates.structure(id);
             if alphas.insert(grains(structure.order)) {
                 index_alpha(&mut index, structure.order, &options.initial);
             }
@@ -178,47 +668,50 @@ pub fn search(
                 index_orders(&mut index, &mut seen, structure.order, term.signal, term.order, &options.initial);
             }
         }
-        #[allow(clippy::cast_precision_loss)]
-        let samples = records.iter().map(Record::m).sum::<usize>() as f64;
-        let entries = vec![Entry { value: 0.0, exact: false, bounded: false, failure: None }; structures.len()];
+        index.sort();
         let problem = Problem::new(records, equations[e].output, index, &fixed[e], options)?;
-        let problem = pool.install(|| problem.with_bound(structures.len() as u64));
-        tables.push(Table { problem, structures, entries, scale: scales[e], samples, options });
+        let problem = pool.install(|| problem.with_bound(distinct[e]));
+        let entries = vec![OPEN; candidates.len()];
+        tables.push(Table { problem, candidates, entries, scale: scales[e], samples, options });
     }
 
     // First pass: each equation's own best, the others left at a few times it.
-    for table in &mut tables {
+    for (table, used) in tables.iter_mut().zip(&used) {
         let mut best = f64::INFINITY;
         let mut start = 0;
-        while start < table.structures.len() {
-            let end = table.structures.len().min(start + if start == 0 { 256 } else { ROUND });
+        while start < used.len() {
+            let end = used.len().min(start + if start == 0 { 256 } else { ROUND });
             let limit = if options.early_stopping { FIRST_LIMIT * best } else { f64::INFINITY };
-            let wanted: Vec<(usize, f64)> = (start..end).map(|id| (id, limit)).collect();
+            let wanted: Vec<(usize, f64)> = used[start..end].iter().map(|&id| (id, limit)).collect();
             table.evaluate(&wanted, &pool, control)?;
+            let found = || used[start..end].iter().map(|&id| table.entries[id]);
+            let left = found().filter(|entry| matches!(entry.class, Class::Bounded | Class::Open)).count();
             control.done.fetch_add((end - start) as u64, Ordering::Relaxed);
-            best = table.entries[start..end]
-                .iter()
-                .filter(|entry| entry.exact)
-                .fold(best, |best, entry| best.min(entry.value));
+            control.pruned.fetch_add(left as u64, Ordering::Relaxed);
+            best = found().filter(|entry| entry.class == Class::Exact).fold(best, |best, e| best.min(e.value));
             start = end;
         }
     }
 
     let mut raise = FIRST_LIMIT;
-    let (kept, counts, failures) = loop {
-        let (kept, counts, failures) = join(lattice, &ids, &tables, options.keep, &pool, control)?;
+    let (kept, states) = loop {
+        let states: [Vec<Entry>; 2] = std::array::from_fn(|h| join.halves[h].states(&tables));
+        let kept = join.best(&states, &tables, options.keep, &pool, control)?;
         let worst = if kept.len() == options.keep { kept[kept.len() - 1].0 } else { f64::INFINITY };
-        let wanted = unresolved(lattice, &ids, &tables, worst, raise, &pool, control)?;
+        let wanted = join.unresolved(&states, &tables, worst, raise, control)?;
         if wanted.iter().all(Vec::is_empty) {
-            break (kept, counts, failures);
+            break (kept, states);
         }
         for (table, wanted) in tables.iter_mut().zip(&wanted) {
             table.evaluate(wanted, &pool, control)?;
         }
         raise *= FIRST_LIMIT;
     };
+    let (mut counts, failures) = join.count(&states);
+    counts.kept = kept.len() as u64;
+    counts.beaten -= counts.kept;
 
-    let mut scratch = crate::search::run::Scratch::new();
+    let mut scratch = Scratch::new();
     let mut rows = Vec::with_capacity(kept.len());
     for (score, index) in kept {
         let structures = lattice
@@ -233,158 +726,4 @@ pub fn search(
         rows.push(StageRow { index, free: lattice.free(index), score, structures, rows: parts });
     }
     Ok(StageOutcome { rows, counts, failures, distinct })
-}
-
-/// Length of the index ranges that threads take.
-const CHUNK: u64 = 65_536;
-
-fn chunks(product: u64) -> Vec<(u64, u64)> {
-    (0..product.div_ceil(CHUNK)).map(|c| (c * CHUNK, product.min((c + 1) * CHUNK))).collect()
-}
-
-/// Table entries of a tuple, or none where it obeys no law.
-fn entries(
-    lattice: &LawLattice,
-    ids: &[HashMap<Key, u32>],
-    tables: &[Table<'_>],
-    index: u64,
-) -> Option<Vec<(usize, Entry)>> {
-    let structures = lattice.structures(index)?;
-    structures
-        .iter()
-        .zip(ids)
-        .zip(tables)
-        .map(|((structure, ids), table)| {
-            let id = *ids.get(&key(structure))? as usize;
-            Some((id, table.entries[id]))
-        })
-        .collect()
-}
-
-/// Best exact tuples, what became of all, and the first failures.
-type Joined = (Vec<(f64, u64)>, Counts, Vec<(u64, Failure)>);
-
-/// Best exact tuples and what became of all.
-fn join(
-    lattice: &LawLattice,
-    ids: &[HashMap<Key, u32>],
-    tables: &[Table<'_>],
-    keep: usize,
-    pool: &rayon::ThreadPool,
-    control: &Control,
-) -> Result<Joined> {
-    let best = |kept: &mut Vec<(f64, u64)>| {
-        kept.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-        kept.truncate(keep);
-    };
-    let parts: Vec<Joined> = pool.install(|| {
-        chunks(lattice.product())
-            .into_par_iter()
-            .map(|(lo, hi)| {
-                if control.stop.load(Ordering::Relaxed) {
-                    return Err(Error::Interrupted);
-                }
-                let mut kept = Vec::new();
-                let mut counts = Counts::default();
-                let mut failures = Vec::new();
-                for index in lo..hi {
-                    let Some(found) = entries(lattice, ids, tables, index) else { continue };
-                    counts.candidates += 1;
-                    let failure = found.iter().find_map(|(_, entry)| entry.failure);
-                    if let (Some(failure), true) = (failure, failures.len() < LISTED) {
-                        failures.push((index, failure));
-                    }
-                    match failure {
-                        Some(Failure::Singular) => counts.singular += 1,
-                        Some(Failure::Diverged) => counts.diverged += 1,
-                        None if found.iter().all(|(_, entry)| entry.exact) => {
-                            counts.beaten += 1;
-                            kept.push((found.iter().map(|(_, entry)| entry.value).sum(), index));
-                            if kept.len() >= 8 * keep.max(64) {
-                                best(&mut kept);
-                            }
-                        }
-                        None if found.iter().all(|(_, entry)| entry.exact || entry.bounded) => counts.bounded += 1,
-                        None => counts.stopped += 1,
-                    }
-                }
-                best(&mut kept);
-                Ok((kept, counts, failures))
-            })
-            .collect::<Result<_>>()
-    })?;
-    let mut kept = Vec::new();
-    let mut counts = Counts::default();
-    let mut failures = Vec::new();
-    for (rows, part, failed) in parts {
-        kept.extend(rows);
-        failures.extend(failed.into_iter().take(LISTED - failures.len()));
-        counts.candidates += part.candidates;
-        counts.beaten += part.beaten;
-        counts.bounded += part.bounded;
-        counts.stopped += part.stopped;
-        counts.singular += part.singular;
-        counts.diverged += part.diverged;
-    }
-    best(&mut kept);
-    counts.kept = kept.len() as u64;
-    counts.beaten -= counts.kept;
-    Ok((kept, counts, failures))
-}
-
-/// Inexact entries that could still be part of a kept tuple, with the score up to which to follow each.
-fn unresolved(
-    lattice: &LawLattice,
-    ids: &[HashMap<Key, u32>],
-    tables: &[Table<'_>],
-    worst: f64,
-    raise: f64,
-    pool: &rayon::ThreadPool,
-    control: &Control,
-) -> Result<Vec<Vec<(usize, f64)>>> {
-    let parts: Vec<Vec<HashMap<usize, f64>>> = pool.install(|| {
-        chunks(lattice.product())
-            .into_par_iter()
-            .map(|(lo, hi)| {
-                if control.stop.load(Ordering::Relaxed) {
-                    return Err(Error::Interrupted);
-                }
-                let mut wanted = vec![HashMap::new(); tables.len()];
-                for index in lo..hi {
-                    let Some(found) = entries(lattice, ids, tables, index) else { continue };
-                    let bound: f64 = found.iter().map(|(_, entry)| entry.value).sum();
-                    // Not finite where one part has failed.
-                    if !(bound <= worst && bound.is_finite()) {
-                        continue;
-                    }
-                    for (e, &(id, entry)) in found.iter().enumerate().filter(|(_, (_, entry))| !entry.exact) {
-                        // Without a full table any tuple may enter: follow this one a few times further than before.
-                        let limit = if worst.is_finite() { worst - (bound - entry.value) } else { raise * entry.value };
-                        // Where rounding leaves no room between bound and worst, only its end tells more.
-                        let limit = if limit > entry.value { limit } else { f64::INFINITY };
-                        let old = wanted[e].entry(id).or_insert(limit);
-                        *old = old.max(limit);
-                    }
-                }
-                Ok(wanted)
-            })
-            .collect::<Result<_>>()
-    })?;
-    let mut wanted: Vec<HashMap<usize, f64>> = vec![HashMap::new(); tables.len()];
-    for part in parts {
-        for (all, some) in wanted.iter_mut().zip(part) {
-            for (id, limit) in some {
-                let old = all.entry(id).or_insert(limit);
-                *old = old.max(limit);
-            }
-        }
-    }
-    Ok(wanted
-        .into_iter()
-        .map(|all| {
-            let mut list: Vec<(usize, f64)> = all.into_iter().collect();
-            list.sort_by_key(|(id, _)| *id);
-            list
-        })
-        .collect())
 }

@@ -639,6 +639,7 @@ def test_control_c_ends_a_search(large):
         ({"keep": 2.5}, "keep = 2.5 is outside"),
         ({"keep": "all"}, "keep = 'all' is outside"),
         ({"threads": 0}, "threads = 0 is outside [1, 1024]"),
+        ({"threads": 10_000}, "threads = 10000 is outside [1, 1024]; leave it out to use all cores"),
         ({"threads": 1025}, "threads = 1025 is outside [1, 1024]"),
         ({"threads": True}, "threads = True is outside"),
         ({"threads": float("inf")}, "threads = inf is outside"),

@@ -77,8 +77,9 @@ fn one_step_is_that_of_dense_algebra() {
     let columns: Vec<Kernel> =
         (0..4).map(|k| Kernel::new(&noisy.integral(signals[k], model.structure.integration(k)))).collect();
     let goal = Kernel::new(noisy.signal(0));
+    let spectra: Vec<Kernel> = kernels.iter().map(|k| Kernel::new(k)).collect();
     let source = Source {
-        own: (0..4).map(|k| (signals[k] == 0).then(|| kernels[k].as_slice())).collect(),
+        own: (0..4).map(|k| (signals[k] == 0).then(|| (kernels[k].as_slice(), &spectra[k]))).collect(),
         measured: columns.iter().collect(),
         clean: columns.iter().collect(),
         initial: Vec::new(),
@@ -87,7 +88,7 @@ fn one_step_is_that_of_dense_algebra() {
     };
     let fixed = [None, None, Some(4.0), None];
     let (found, covariance) =
-        step(&[source], &[filter], &[response], &fixed, &[], true, &mut Scratch::default()).unwrap();
+        step(&[source], &[Kernel::new(&filter)], &[response], &fixed, &[], true, &mut Scratch::default()).unwrap();
     let expected = [oracle[0], oracle[1], 4.0, oracle[2]];
     check("a step of instrumental variables", relative_distance(&found, &expected), 1e-10);
     assert_eq!(covariance.len(), 9);
@@ -216,8 +217,9 @@ fn refining_one_equation_alone_ends_where_the_whole_does() {
         .map(|k| Kernel::new(&noisy.integral(model.structure.terms[k].signal, model.structure.integration(k))))
         .collect();
     let goal = Kernel::new(noisy.signal(0));
+    let spectra: Vec<Kernel> = kernels.iter().map(|k| Kernel::new(k)).collect();
     let source = Source {
-        own: vec![Some(&kernels[0]), Some(&kernels[1]), None, None],
+        own: vec![Some((&kernels[0][..], &spectra[0])), Some((&kernels[1][..], &spectra[1])), None, None],
         measured: columns.iter().collect(),
         clean: columns.iter().collect(),
         initial: Vec::new(),
@@ -368,8 +370,9 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
         let kernels: Vec<Vec<f64>> =
             (0..2).map(|k| block_pulse_kernel(structure.integration(k), m, noisy.step())).collect();
         let (measured, clean, goal) = (spectra(&noisy), spectra(&tidy), Kernel::new(noisy.signal(0)));
+        let own: Vec<Kernel> = kernels.iter().map(|k| Kernel::new(k)).collect();
         let source = Source {
-            own: vec![Some(&kernels[0]), Some(&kernels[1]), None],
+            own: vec![Some((&kernels[0][..], &own[0])), Some((&kernels[1][..], &own[1])), None],
             measured: measured.iter().collect(),
             clean: clean.iter().collect(),
             initial: Vec::new(),
@@ -396,4 +399,47 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
     let squares = Options { estimator: Estimator::LeastSquares, ..options(1, true) };
     let biased = search(std::slice::from_ref(&noisy), &lattice, &[None; 3], &squares, &Control::default()).unwrap();
     assert!(biased.rows[0].score > found.rows[0].score);
+}
+
+#[test]
+fn what_no_coefficients_can_bring_below_the_kept_ones_is_left_out_and_nothing_else() {
+    let model = equation(0, 1.8, &[(0, 0.9, -3.0), (0, 0.0, -40.0), (1, 0.0, 4.0)]);
+    let values = |low: f64, count: i32| -> Vec<f64> { (0..count).map(|i| low + 0.2 * f64::from(i)).collect() };
+    let axis = |signal, values: Vec<f64>| TermAxis { signal, values, interchangeable: signal == 0 };
+    let terms = [axis(0, values(0.0, 8)), axis(0, values(0.0, 8)), axis(1, values(0.0, 4))];
+    let lattice = Lattice::new(0, &[1.2, 1.4, 1.6, 1.8], &terms, |s| s == 1).unwrap();
+    let mut bounded = 0;
+    for (seed, keep, norm, initial) in [
+        (30, 1, Norm::L1, Initial::Rest),
+        (31, 7, Norm::L2, Initial::Rest),
+        (32, 3, Norm::L1, Initial::Powers(vec![0.0])),
+    ] {
+        let mut random = Random::new(seed);
+        let records: Vec<Record> = [200, 260]
+            .into_iter()
+            .map(|m| {
+                let rest = record(0.02, vec![vec![0.0; m], random.steps(m, 37)]);
+                let clean = simulate::respond(std::slice::from_ref(&model), &rest, &[vec![]]).unwrap().remove(0);
+                let sigma = 0.01 * deviation(&clean);
+                let noisy = with_signal(&rest, 0, clean.iter().map(|v| v + sigma * random.normal()).collect());
+                with_clean(&noisy, 0, &[1])
+            })
+            .collect();
+        let run = |threads, early_stopping| {
+            let settings = Settings { iterations: 3, tolerance: 1e-4 };
+            let estimator = Estimator::InstrumentalVariables(settings);
+            let (criterion, initial) = (Criterion::OutputError, initial.clone());
+            let options = Options { criterion, norm, estimator, initial, keep, threads, early_stopping };
+            search(&records, &lattice, &[None; 3], &options, &Control::default()).unwrap()
+        };
+        let (brute, found) = (run(2, false), run(1, true));
+        assert_eq!(found.rows, brute.rows, "seed {seed}");
+        for (a, b) in found.rows.iter().zip(&brute.rows) {
+            assert_eq!(a.score.to_bits(), b.score.to_bits());
+        }
+        assert_eq!(run(3, true), found, "seed {seed}");
+        println!("seed {seed}: {} of {} excluded", found.counts.bounded, lattice.count());
+        bounded += found.counts.bounded;
+    }
+    assert!(bounded > 200, "{bounded}");
 }

@@ -5,10 +5,11 @@ use std::sync::atomic::Ordering;
 
 use ftlm::equation::{Equation, Initial, Structure};
 use ftlm::error::{Error, Kind};
+use ftlm::estimate::instrumental_variables::Settings;
 use ftlm::estimate::least_squares::{self, Estimate};
 use ftlm::estimate::multi_innovation::{closed_form, Innovation, Rows};
 use ftlm::regressors::Record;
-use ftlm::search::bound::lower_bounds;
+use ftlm::search::bound::{lower_bounds, out_of_reach};
 use ftlm::search::lattice::{Lattice, TermAxis, MAX_CANDIDATES};
 use ftlm::search::run::{search, Control, Counts, Criterion, Estimator, Failure, Norm, Options, Outcome, MAX_THREADS};
 use ftlm::simulate::{equation_error, respond};
@@ -474,7 +475,7 @@ fn settings_out_of_range_are_refused() {
     assert!(matches!(run(&records, &[], &options()), Error::Length { .. }));
     assert!(matches!(run(&[], &[None], &options()), Error::Length { .. }));
     assert!(matches!(run(&records, &[None], &Options { keep: 0, ..options() }), Error::OutOfRange { .. }));
-    for threads in [0, MAX_THREADS + 1] {
+    for threads in [0, MAX_THREADS + 1, 10_000] {
         assert!(matches!(run(&records, &[None], &Options { threads, ..options() }), Error::OutOfRange { .. }));
     }
     let innovation = Innovation { length: 3, prior_covariance: 1.0, rows: Rows::Haar };
@@ -490,6 +491,46 @@ fn settings_out_of_range_are_refused() {
     let missing = Lattice::new(0, &[1.0], &[axis(5, &[0.0], false)], |_| false).unwrap();
     let found = search(&records, &missing, &[None], &options(), &Control::default());
     assert!(matches!(found, Err(Error::Structure { .. })));
+}
+
+#[test]
+fn kernels_that_overflow_are_a_reason_on_every_row() {
+    let mut random = Random::new(62);
+    // h^2 is beyond floating point.
+    let record = record(1e200, vec![random.signal(64), random.signal(64)]);
+    let terms = [axis(0, &[0.0, 0.5], false), axis(1, &[0.0], false)];
+    let lattice = Lattice::new(0, &[1.8, 2.0], &terms, |s| s == 1).unwrap();
+    let settings = Settings { iterations: 3, tolerance: 1e-4 };
+    for estimator in [Estimator::LeastSquares, Estimator::InstrumentalVariables(settings)] {
+        for early_stopping in [false, true] {
+            let options = Options { estimator, early_stopping, ..options() };
+            let records = std::slice::from_ref(&record);
+            match search(records, &lattice, &[None; 2], &options, &Control::default()) {
+                Ok(found) => {
+                    assert_eq!(found.rows, []);
+                    assert_eq!(found.counts.singular + found.counts.diverged, lattice.count());
+                    assert_eq!(found.failures.len() as u64, lattice.count());
+                }
+                Err(error) => assert!(matches!(error, Error::NotFinite { .. }), "{error:?}"),
+            }
+        }
+    }
+}
+
+#[test]
+fn candidates_that_explode_in_their_first_block_are_a_reason_on_their_rows() {
+    let mut random = Random::new(63);
+    let record = record(0.1, vec![random.signal(64), random.signal(64)]);
+    let terms = [axis(0, &[0.0, 0.5], false), axis(1, &[0.0], false)];
+    let lattice = Lattice::new(0, &[1.8, 2.0], &terms, |s| s == 1).unwrap();
+    for early_stopping in [false, true] {
+        let options = Options { early_stopping, ..options() };
+        // One block of 64 pulses is all there is, and growth by 1e12 a pulse leaves floating point within it.
+        let records = std::slice::from_ref(&record);
+        let found = search(records, &lattice, &[Some(1e14), None], &options, &Control::default()).unwrap();
+        assert_eq!((found.counts.diverged, found.rows.len()), (lattice.count(), 0));
+        assert!(found.failures.iter().all(|f| f.1 == Failure::Diverged));
+    }
 }
 
 /// A search that takes far longer than a test may.
@@ -599,6 +640,34 @@ fn the_bound_never_exceeds_the_error() {
     }
     println!("{unstable} unstable, closest {closest:?}, {seen} bounds within a factor of 10");
     assert!(unstable > 500 && seen > 1000);
+}
+
+#[test]
+fn no_score_within_reach_is_excluded() {
+    let mut random = Random::new(249);
+    let (mut excluded, mut finite) = (0, 0);
+    for _ in 0..1500 {
+        let (record, equation) = random_candidate(&mut random);
+        let (structure, coefficients) = (&equation.structure, &equation.coefficients);
+        let fixed: Vec<Option<f64>> = coefficients.iter().map(|&c| random.chance(0.2).then_some(c)).collect();
+        // From the very coefficients, and from others.
+        let elsewhere: Vec<f64> = coefficients.iter().map(|c| c * random.uniform(-1.0, 2.0)).collect();
+        for norm in [Norm::L1, Norm::L2] {
+            let error = raw_error(&record, &equation, norm);
+            if !error.is_finite() {
+                continue;
+            }
+            finite += 1;
+            for start in [coefficients, &elsewhere] {
+                let asked = |limit: f64| out_of_reach(&record, structure, &fixed, start, norm, limit).unwrap();
+                assert!(!asked(error), "{error:e} is reached by {equation:?}");
+                assert!(!asked(2.0 * error));
+                excluded += usize::from(asked(1e-3 * error));
+            }
+        }
+    }
+    println!("{excluded} exclusions of a thousandth of {finite} errors, from two starts each");
+    assert!(excluded > 500);
 }
 
 /// The equation with nothing on its right-hand side: its error is the measurement.
