@@ -54,6 +54,10 @@ def performance() -> dict[str, Figure]:
 
     def axes(x: str, y: str) -> tuple[Figure, Axes]:
         figure = Figure(figsize=(7, 3.6), layout="constrained")
+        figure.suptitle(
+            "commit {commit}, {machine}, {cores} cores, load {load:.1f}".format(**measured["measured"]),
+            fontsize="small",
+        )
         plot = figure.add_subplot(xscale="log", yscale="log", xlabel=x, ylabel=y)
         plot.grid(visible=True, which="major", linewidth=0.4)
         return figure, plot

@@ -7,17 +7,15 @@ What models are made of is imported at once, every other module when one of its 
 of them takes longer than numpy does.
 """
 
-from __future__ import annotations
-
-from importlib import import_module
-from typing import TYPE_CHECKING
+import importlib as _importlib
+import typing as _typing
 
 from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
 
 # A function with the name of its module: imported late, the module would take its place.
 from ftlm.flexible_link import PARAMETERS, LinkParameters, flexible_link, link_model, order_law
 
-if TYPE_CHECKING:
+if _typing.TYPE_CHECKING:
     from ftlm import rig
     from ftlm._core import __version__
     from ftlm.baselines import Genetic
@@ -201,9 +199,9 @@ _MODULES = frozenset({*_HOMES.values(), "plot", "progress", "rig"})
 def __getattr__(name: str) -> object:
     """A public name, or a module such as `ftlm.rig`, imported when it is first asked for."""
     if name in _HOMES:
-        value = getattr(import_module(f"ftlm.{_HOMES[name]}"), name)
+        value = getattr(_importlib.import_module(f"ftlm.{_HOMES[name]}"), name)
     elif name in _MODULES:
-        value = import_module(f"ftlm.{name}")
+        value = _importlib.import_module(f"ftlm.{name}")
     else:
         raise AttributeError(f"module 'ftlm' has no attribute {name!r}")
     globals()[name] = value
