@@ -39,6 +39,7 @@ __all__ = [
     "nyquist_margin",
     "operational_matrix",
     "output_error",
+    "panic_on_purpose",
     "point_samples",
     "pulse_means",
     "respond",
@@ -230,6 +231,7 @@ def search(
     settings: _Options,
     progress: _Progress | None,
 ) -> _Found: ...
+def panic_on_purpose(place: str) -> None: ...
 def search_plan(
     orders: _Lattice, inputs: Sequence[bool], terms: _Initial, settings: _Options
 ) -> tuple[int, list[int]]: ...

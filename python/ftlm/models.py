@@ -94,6 +94,10 @@ class Order:
             raise ModelError(
                 f"order {shown} is neither a number nor a sum of named orders; write 0.5, alpha or alpha1-mu2+0.1"
             ) from error
+        if not all(map(math.isfinite, (constant, *weights.values()))):
+            raise ModelError(
+                f"order {text!r:.60} holds a number that is not finite; write 0.5, alpha or alpha1-mu2+0.1"
+            )
         return cls(constant, tuple(sorted((n, w) for n, w in weights.items() if w)))
 
     @property

@@ -28,7 +28,7 @@ import time
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import numpy as np
@@ -54,13 +54,14 @@ INTERVAL = 0.3
 #: Largest payload: a table of 100 000 rows of many coefficients is far below.
 MAX_PAYLOAD = 1 << 30
 
-Row = tuple[int, float, tuple[float, ...], tuple[tuple[float, ...], ...]]
-Counts = tuple[int, int, int, int, int, int, int]
-Failures = tuple[tuple[int, bool], ...]
+Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
+Row = tuple[Natural, float, tuple[float, ...], tuple[tuple[float, ...], ...]]
+Counts = tuple[Natural, Natural, Natural, Natural, Natural, Natural, Natural]
+Failures = tuple[tuple[Natural, bool], ...]
 #: Rows (index, raw score, coefficients, initial terms by record), counts, failures (index, whether diverged).
 Part = tuple[tuple[Row, ...], Counts, Failures]
 #: Round, candidates followed, end and length of the batch, its limit.
-Place = tuple[int, int, int, int, float]
+Place = tuple[Natural, Natural, Natural, Natural, float]
 
 
 class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -138,9 +139,9 @@ class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="req
 class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
     """A stretch of rounds, half done; rows are those found since the frame before, failures None where unchanged."""
 
-    search: int
-    first: int
-    last: int
+    search: Natural
+    first: Natural
+    last: Natural
     place: Place
     rows: tuple[Row, ...]
     counts: Counts
@@ -150,9 +151,9 @@ class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="pro
 class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="rounds"):
     """A stretch of rounds, done."""
 
-    search: int
-    first: int
-    last: int
+    search: Natural
+    first: Natural
+    last: Natural
     part: Part
 
 
@@ -192,7 +193,7 @@ class Section:
         ModelError
             Rounds that are there already, or a stretch that is none.
         """
-        if not 0 <= frame.first < frame.last:
+        if frame.first >= frame.last:
             raise ModelError(f"rounds {frame.first} to {frame.last} are no stretch")
         place = bisect.bisect_left(self._firsts, frame.last)
         if place and self.done[self._firsts[place - 1]][0] > frame.first:
@@ -206,7 +207,7 @@ class Section:
         if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
             raise ModelError(f"rounds {frame.first} to {frame.last} are continued as something else")
         _, followed, end, size, limit = frame.place
-        if not (0 <= followed <= end and size >= (end > 0) and not math.isnan(limit)):
+        if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
             raise ModelError(f"rounds {frame.first} to {frame.last} stand nowhere")
         if half is None:
             half = self.open[frame.first] = Half(frame.last, frame.place, [], frame.counts, ())
@@ -336,7 +337,7 @@ def _parse(path: str | os.PathLike[str], data: memoryview) -> Contents:
             elif isinstance(frame, Requests):
                 raise ModelError("requests stand twice")
             else:
-                if not 0 <= frame.search < len(found.sections):
+                if frame.search >= len(found.sections):
                     raise ModelError(f"there is no search {frame.search}")
                 found.sections[frame.search].take(frame)
         except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:

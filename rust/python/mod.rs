@@ -33,7 +33,9 @@ mod _core {
     };
 
     #[pymodule_export]
-    use super::search::{lattice_size, search, search_join, search_plan, search_stage, OrderSearch, Points};
+    use super::search::{
+        lattice_size, panic_on_purpose, search, search_join, search_plan, search_stage, OrderSearch, Points,
+    };
 
     #[pymodule_export]
     use super::virtual_arm::{fractional_memory, Guard, VirtualArm};

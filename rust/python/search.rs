@@ -369,6 +369,19 @@ impl OrderSearch {
     }
 }
 
+/// Panics where it is told to, so that a test can see what becomes of a panic: in a call, in the thread that a search
+/// runs on, or in one of its workers.
+#[pyfunction]
+#[allow(clippy::panic)]
+pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
+    let fault = || std::panic::panic_any("on purpose");
+    match place {
+        "call" => super::errors::detached(py, fault),
+        "search" => watched(py, None, |_| fault()),
+        _ => watched(py, None, |_| run::pool(2)?.install(|| rayon::join(fault, || ()).0)),
+    }
+}
+
 /// (constant, weight of each free order).
 type AffineArg = (f64, Vec<f64>);
 /// (output, alpha, [(signal, order), …]).

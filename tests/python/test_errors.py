@@ -421,20 +421,20 @@ def test_what_is_no_real_number_is_refused(value, shown):
 ODD = st.one_of(st.floats(allow_nan=True, allow_infinity=True), st.integers(-3, 40).map(float))
 
 
-@settings(max_examples=150, deadline=None)
-@given(
-    order=ODD,
-    alpha=ODD,
-    step=ODD,
-    signal=st.integers(0, 4),
-    output=st.integers(0, 4),
-    values=st.lists(ODD, min_size=0, max_size=9),
-    coefficient=ODD,
-    exponents=st.lists(ODD, max_size=2),
-)
-def test_the_core_answers_hostile_calls_with_typed_errors(
-    order, alpha, step, signal, output, values, coefficient, exponents
-):
+HOSTILE = {
+    "order": ODD,
+    "alpha": ODD,
+    "step": ODD,
+    "signal": st.integers(0, 4),
+    "output": st.integers(0, 4),
+    "values": st.lists(ODD, min_size=0, max_size=9),
+    "coefficient": ODD,
+    "exponents": st.lists(ODD, max_size=2),
+}
+CALLS = 18
+
+
+def hostile_calls(order, alpha, step, signal, output, values, coefficient, exponents):
     means = np.array([values, values[::-1]], float).reshape(2, len(values))
     rec, inputs = (step, means, None), [False, True]
     structure = (output, alpha, [(signal, order), (1, 0.0)])
@@ -450,6 +450,10 @@ def test_the_core_answers_hostile_calls_with_typed_errors(
             [rec], (output, [alpha, order], [(signal, [order, alpha], True)]), inputs, [None], (False, exponents),
             ("output-error", "l1", 0, 1.0, False, 5, 1, True, 2), None,
         ),
+        lambda: _core.OrderSearch(
+            [rec], (output, [alpha, order], [(signal, [order, alpha], True)]), inputs, [None], (False, exponents),
+            ("equation-error", "l2", 2, coefficient, True, 5, 1, True, 0),
+        ).rounds(0, signal, [(output, coefficient)], None, 1, None, None),
         lambda: _core.filter_series([(coefficient, order)], [(1.0, alpha)], 8, step),
         lambda: _core.fractional_integral(means, order, step, "trapezoidal"),
         lambda: _core.fractional_derivative(means, order, step, "caputo", means),
@@ -467,6 +471,33 @@ def test_the_core_answers_hostile_calls_with_typed_errors(
             pytest.fail(f"call {k}: {error}")
         except ftlm.FtlmError:
             pass
+
+
+@settings(max_examples=150, deadline=None)
+@given(**HOSTILE)
+def test_the_core_answers_hostile_calls_with_typed_errors(**arguments):
+    hostile_calls(**arguments)
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_hostile_calls():
+    made = []
+
+    @settings(max_examples=6_000, deadline=None, database=None)
+    @given(**HOSTILE)
+    def call(**arguments):
+        hostile_calls(**arguments)
+        made.append(CALLS)
+
+    call()
+    print(f"\n{sum(made)} calls")
+    assert sum(made) >= 100_000
+
+
+@pytest.mark.parametrize("where", ["call", "search", "worker"])
+def test_a_panic_is_an_internal_error(where, capfd):
+    with pytest.raises(ftlm.InternalError, match="internal fault: on purpose; please report it"):
+        _core.panic_on_purpose(where)
 
 
 def test_arrays_of_another_kind_are_a_type_error():
