@@ -94,7 +94,8 @@ class Order:
             raise ModelError(
                 f"order {shown} is neither a number nor a sum of named orders; write 0.5, alpha or alpha1-mu2+0.1"
             ) from error
-        if not all(map(math.isfinite, (constant, *weights.values()))):
+        # A plain number is judged where its range is known.
+        if weights and not all(map(math.isfinite, (constant, *weights.values()))):
             raise ModelError(
                 f"order {text!r:.60} holds a number that is not finite; write 0.5, alpha or alpha1-mu2+0.1"
             )
