@@ -1333,8 +1333,10 @@ impl Hunt<'_> {
             return Ok(());
         }
         let saving = counted && self.control.saving.load(Ordering::Relaxed);
+        // A refinement costs about ten times a free run.
+        let pulses = if self.problem.refiner.is_some() { PIECE / 8 } else { PIECE };
         let piece =
-            if saving { (PIECE / self.problem.samples.max(1)).max(4 * self.scratches.0.len()) } else { usize::MAX };
+            if saving { (pulses / self.problem.samples.max(1)).max(4 * self.scratches.0.len()) } else { usize::MAX };
         let (first, largest) = if self.problem.refiner.is_some() { REFINED } else { FOLLOWED };
         let batch = |at: u64| usize::try_from(at).unwrap_or(usize::MAX).min(open.len());
         if place.end == 0 {
