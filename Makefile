@@ -66,7 +66,6 @@ wheel-test: wheel
 	$(VENV)-wheel/bin/python -m pip install --quiet --disable-pip-version-check wheels/*.whl
 	cd wheels && ../$(VENV)-wheel/bin/ftlm demo --step 0.1 -o demo
 	$(BIN)/python -m abi3audit --strict wheels/*.whl
-	$(BIN)/python -m auditwheel show wheels/*.whl
 	rm -rf $(VENV)-wheel wheels/demo
 
 # The source distribution alone builds and works, in an environment that has only pip; Rust is needed.
