@@ -879,7 +879,15 @@ def fit_output_error(
     while every < FINEST and grid_matters(problem, experiments, weights, initial, finalists[0], every):
         every *= 2
     near = experiments(alike, every)
-    best = min((descend(problem, near, signals, initial, a, evaluations=60) for a in finalists), key=lambda a: a.level)
+    ends = []
+    for attempt in finalists:
+        try:
+            ends.append(descend(problem, near, signals, initial, attempt, evaluations=60))
+        except FtlmError:
+            # No finite free run on this grid; the others have one.
+            if attempt is finalists[-1] and not ends:
+                raise
+    best = min(ends, key=lambda a: a.level)
     best = lowest(problem, near, signals, initial, best, evaluations=120)
     best = descend(problem, experiments(weights, every), signals, initial, best, evaluations=120)
 
