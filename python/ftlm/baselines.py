@@ -210,10 +210,10 @@ class _Problem:
         if not self.law:
             part = self.rows[0]
             row = part.candidates(tidied, repaired=True)[0]
-            for column in range(1 + part.own.size):
+            for column, value in enumerate(row[: 1 + part.own.size].tolist()):
                 gene = np.flatnonzero(part.weights[:n, column])
                 if gene.size:
-                    found[self.names[int(gene[0])]] = float(row[column])
+                    found[self.names[int(gene[0])]] = value
         orders = {name: round(found[name], 9) for name in self.order_names}
         return orders, {name: found[name] for name in self.coefficient_names}
 
