@@ -177,7 +177,7 @@ def output_error_landscape(
     errors = joint.standard_errors
     if not all(0 < errors[n] < math.inf for n in (first, second)):
         return None
-    decided = prepare(task.runs, task.structure, None, power_of_two=False)[0].initial
+    decided = prepare(task.runs, replace(task.structure, free_delays={}), None, power_of_two=False)[0].initial
     structure = replace(task.structure, initial=decided)
     problem = FreeProblem.of(structure)
     weights = [1.0 / joint.noise[o] for o in structure.outputs]
