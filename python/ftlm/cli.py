@@ -461,14 +461,17 @@ def version(
 @guarded
 def demo(
     out: Annotated[str, typer.Option("-o", "--out", metavar="FOLDER", help="Where to write.")] = "ftlm-demo",
-    step: LatticeStep = 0.05,
+    step: LatticeStep = 0.1,
     noise: Annotated[float, typer.Option("--noise", help="Noise on every angle [rad].")] = 1e-4,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the noise.")] = 1,
     threads: Threads = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate both stages, identify every equation with p = 1, 3, 5, 7, compare, save, draw."""
+    """Simulate both stages, identify every equation with p = 1, 3, 5, 7, compare, save, draw.
+
+    The paper's lattice is that of --step 0.05, which takes minutes.
+    """
     from ftlm.demo import run_demo  # noqa: PLC0415 — a command imports what it needs when it runs
     from ftlm.progress import Progress  # noqa: PLC0415
     from ftlm.report.demo import demo_page, demo_text  # noqa: PLC0415

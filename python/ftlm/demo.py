@@ -225,7 +225,7 @@ def replace_coupling(model: Model) -> Model:
 def run_demo(
     folder: Path,
     *,
-    step: float = 0.05,
+    step: float = 0.1,
     noise: float = 1e-4,
     seed: int = 1,
     threads: int | None = None,
@@ -240,7 +240,7 @@ def run_demo(
     folder
         Where runs and models go; made if it is not there.
     step
-        Step of the order lattice; the paper's is 0.05.
+        Step of the order lattice; the paper's is 0.05, which takes minutes.
     noise, seed
         See :func:`demo_run`.
     threads, progress
