@@ -194,8 +194,8 @@ def orders_by_lattice(task: tuple[str, int]) -> tuple[dict[str, float], float]:
     true = structure.with_orders({n: v for n, v in plants.truth(name).items() if n in structure.order_names})
     best = ftlm.identify(run, true, method="instrumental-variables", threads=1)
     try:
-        found = ftlm.search_orders(
-            run, structure, ftlm.lattice(**LATTICES[name]), coefficients="instrumental-variables", threads=1, keep=1
+        found = ftlm.identify(
+            run, structure, method="instrumental-variables", lattice=ftlm.lattice(**LATTICES[name]), threads=1
         )
         return found.orders, shortfall(found.model, best.model, clean)
     except ftlm.ConvergenceError:

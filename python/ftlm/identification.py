@@ -12,7 +12,7 @@ from ftlm import _core
 from ftlm.advice import excitation_for
 from ftlm.baselines import Genetic, genetic_search
 from ftlm.checks import whole_number
-from ftlm.errors import DataError, InternalError, ModelError
+from ftlm.errors import DataError, FtlmError, InternalError, ModelError
 from ftlm.models import Estimate, Model, Structure, delay_name, numeric
 from ftlm.order_search import (
     Lattice,
@@ -448,6 +448,10 @@ def identify(
                 threads=threads, progress=progress,
             )  # fmt: skip
             orders |= searches[name].orders
+    rank = 1
+    if "stage" in searches and method == "instrumental-variables" and structure.coupling == "simulated":
+        rank = _coupled_rank(found, structure, settings, m, searches["stage"])
+        orders = searches["stage"].table[rank - 1].orders
     structure_at = structure.with_orders(orders)
     coefficients, pulled, pulses, initial, spread = _estimate(found, structure_at, settings, m)
     about: dict[str, str | float | int | bool | None] = {
@@ -468,12 +472,35 @@ def identify(
     warnings += discretisation(model, comparison)
     tests, criteria = _judged(model, found, len(orders) + len(coefficients))
     warnings += [] if tests is None else residual_warnings(tests)
-    used = {**settings.to_dict(), "m": pulses, "initial": initial}
+    used = {**settings.to_dict(), "m": pulses, "initial": initial, **({"rank": rank} if rank > 1 else {})}
     model = _kept_with(model, method, found, comparison, criteria, warnings)
     return Identification(
         model, method, comparison, searches, used, tuple(dict.fromkeys(warnings)), coefficient_errors=spread,
         residuals=tests, information=criteria, task=Task(tuple(found), structure, lattice),
     )  # fmt: skip
+
+
+def _coupled_rank(
+    runs: Sequence[Run], structure: Structure, settings: Settings, m: int | None, search: SearchResult
+) -> int:
+    """Rank of the kept row whose coupled free run is the likeliest; the table ranks equations one by one.
+
+    Among orders that the equations one by one hardly tell apart, the run of the whole from the inputs alone decides:
+    by the sum of ln NR over outputs, the likelihood of white noise of unknown size.
+    """
+    best, rank = math.inf, 1
+    for row in search.table:
+        structure_at = structure.with_orders(row.orders)
+        try:
+            coefficients, _, pulses, _, _ = _estimate(runs, structure_at, settings, m)
+            found = compare(Model(structure_at.with_coefficients(coefficients), m=pulses), runs, m=pulses)
+        except FtlmError:
+            # It has a score in the table, but no model.
+            continue
+        cost = sum(math.log(max(f.nr, 1e-300)) for f in found.output_error.values())
+        if cost < best:
+            best, rank = cost, row.rank
+    return rank
 
 
 def _kept_with(
