@@ -5,7 +5,7 @@
 //!
 //!   ‖e‖ ≥ |⟨t, w⟩| / ‖Dᵀt‖ in the dual norm, and ‖Dᵀt‖ ≤ |1 − Σ c_i g_i|·‖t‖ + Σ |c_i|·‖F_iᵀt − g_i t‖
 //!
-//! for any numbers g_i. Where coefficients are yet to be refined, [`Bound::excludes`] proves the same of all coefficients
+//! for any numbers g_i. Where coefficients are yet to be refined, `Bound::excludes` proves the same of all coefficients
 //! at once: with d = 1 − Σ c g and S = Σ |c_i| ρ_i, a score of at most L needs |⟨t, w⟩|² ≤ L²(|d|‖t‖ + S)² for every t, and
 //!
 //!   (a + S)² ≤ (1+κ)a² + (1+1/κ)S², S² ≤ Σ c_i²ρ_i²/p_i for any κ, p_i > 0 with Σ p_i = 1,
