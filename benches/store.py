@@ -1,7 +1,8 @@
 """What a search loses to kill -9: a search with a store is killed at random moments and resumed until it ends.
 
-python benches/store.py [kills] prints the time lost to each kill (the age, when the kill came, of the oldest finished
-work that is not in the store) and whether the resumed tables are those of the uninterrupted search, byte by byte.
+python benches/store.py [kills] [stage] prints the time lost to each kill (the age, when the kill came, of the oldest
+finished work that is not in the store; of a stage the time since the last write) and whether the resumed tables are
+those of the uninterrupted search, byte by byte; of one equation, or of a stage under its order law.
 """
 
 import json
@@ -17,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import ftlm
+from ftlm.demo import demo_plant
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 
@@ -26,7 +28,7 @@ sys.path.insert(0, {folder!r})
 import store
 def told(done, total):
     print(time.time(), done, flush=True)
-store.search(sys.argv[1], told)
+store.{search}(sys.argv[1], told)
 """
 
 
@@ -48,11 +50,29 @@ def search(path, progress=None):
     )  # fmt: skip
 
 
-def kills(count, seed=0):
+def stage(path, progress=None):
+    """The same for both equations of a stage under their order law."""
+    rows = 1025
+    current = np.where(np.arange(rows) % 400 < 230, 0.3, -0.3)
+    outputs = {"theta11": np.zeros(rows), "theta12": np.zeros(rows)}
+    empty = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=outputs, name="stage")
+    clean = demo_plant(1).simulate(empty, tolerance=1e-6)
+    noise = np.random.default_rng(1)
+    noisy = {n: clean[n] + 1e-4 * noise.standard_normal(rows) for n in outputs}
+    given = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy, name="stage")
+    lattice = ftlm.lattice(step=0.025, alpha=(1.8, 2.0), gamma1=(0.8, 1.1), beta2=(0.0, 0.5), mu2=(0.7, 1.0))
+    return ftlm.search_orders(
+        given, ftlm.flexible_link(), lattice, early_stopping=False, m=1024, coefficients="least-squares", store=path,
+        progress=progress,
+    )  # fmt: skip
+
+
+def kills(count, seed=0, of=search):
     """Kill and resume until so many kills have been done: (seconds lost to each, searches ended, all identical)."""
     choose = random.Random(seed)
-    expected = json.dumps(search(None).to_dict())
-    script = CHILD.replace("{folder!r}", repr(str(Path(__file__).resolve().parent)))
+    expected = json.dumps(of(None).to_dict())
+    name = "y" if of is search else "stage"
+    script = CHILD.replace("{folder!r}", repr(str(Path(__file__).resolve().parent))).replace("{search}", of.__name__)
     lost, ended, same = [], 0, True
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "search.ftlm"
@@ -70,18 +90,24 @@ def kills(count, seed=0):
                 lines = [first, *child.stdout]
             told = [line.split() for line in lines if line.endswith("\n") and line.strip()]
             if not finished:
-                held = ftlm.search_status(path)["y"].done
-                ages = [killed - float(when) for when, done in told if int(done) > held]
+                held = ftlm.search_status(path)[name].done
+                # A stage tells what is in the store only: all since then is lost.
+                ages = [
+                    killed - float(when)
+                    for when, done in (told if of is search else told[-1:])
+                    if of is stage or int(done) > held
+                ]
                 lost.append(max([0.0, *ages]))
                 continue
             ended += 1
-            same &= json.dumps(search(path).to_dict()) == expected
+            same &= json.dumps(of(path).to_dict()) == expected
             path.unlink()
-        same &= json.dumps(ftlm.resume_search(path)["y"].to_dict()) == expected if path.exists() else True
+        same &= json.dumps(ftlm.resume_search(path)[name].to_dict()) == expected if path.exists() else True
     return lost, ended, same
 
 
 if __name__ == "__main__":
-    lost, ended, same = kills(int(sys.argv[1]) if len(sys.argv) > 1 else 50)
+    numbers = [int(a) for a in sys.argv[1:] if a.isdigit()]
+    lost, ended, same = kills(*(numbers or [50]), of=stage if "stage" in sys.argv else search)
     print(f"{len(lost)} kills, {ended} searches ended between them; tables identical: {same}")
     print(f"lost to a kill: median {sorted(lost)[len(lost) // 2]:.3f} s, worst {max(lost):.3f} s")

@@ -14,6 +14,7 @@ __all__ = [
     "Guard",
     "OrderSearch",
     "Points",
+    "StageSearch",
     "Streaming",
     "VirtualArm",
     "__version__",
@@ -95,6 +96,9 @@ _Part: TypeAlias = tuple[
     Sequence[tuple[int, bool]],
 ]
 _Checkpoint: TypeAlias = tuple[tuple[int, int, int, int, float], _Part]
+
+#: equation, first candidate, the one behind the last, limit
+_Span: TypeAlias = tuple[int, int, int, float]
 
 class _Found(TypedDict):
     #: (index, score, alpha, orders, coefficients, initial terms per record)
@@ -277,6 +281,26 @@ def search_stage(
     settings: _Options,
     progress: _Progress | None,
 ) -> _FoundStage: ...
+
+@final
+class StageSearch:
+    def __new__(
+        cls,
+        runs: Sequence[_Record],
+        axes: Sequence[Sequence[float]],
+        laws: Sequence[_LawEquation],
+        inputs: Sequence[bool],
+        fixed: Sequence[Sequence[float | None]],
+        scales: Sequence[float],
+        terms: _Initial,
+        settings: _Options,
+        keeps_course: bool,
+    ) -> StageSearch: ...
+    def wanted(self) -> list[_Span]: ...
+    def state(self) -> tuple[int, float | None]: ...
+    def follow(self, spans: Sequence[_Span], threads: int, progress: _Progress | None) -> tuple[bytes, bytes]: ...
+    def take(self, values: bytes, kinds: bytes, threads: int) -> None: ...
+    def outcome(self) -> _FoundStage: ...
 
 @final
 class Points:

@@ -668,8 +668,6 @@ def search(
         kept = None
         if store is not None:
             ready = {name: make() for name, make in jobs.items()}
-            for job in ready.values():
-                job.check_rounds()
             kept = stack.enter_context(Store(store, [job.request(name) for name, job in ready.items()]))
             show_notes(kept)
         for number, (name, make) in enumerate(jobs.items()):

@@ -13,7 +13,7 @@ from ftlm.errors import DataError, ModelError
 from ftlm.models import MAX_ORDER, Equation, Model, Order, Structure, Values, grid, parse_values
 from ftlm.progress import Progress
 from ftlm.records import check_m, default_m, initial_tuple, named_signals, record
-from ftlm.rounds import Work, do_rounds
+from ftlm.rounds import StageWork, Work, do_rounds, do_stage, stage_state
 from ftlm.store import RecordFile, Request, Store, read_store
 from ftlm.validation import as_runs
 
@@ -447,11 +447,11 @@ def search_orders(
         False is brute force, with the same table.
     store
         File in which finished work is kept, on disk within a second; the same call goes on with it after a power cut,
-        and so does :func:`resume_search`. One equation only, not a stage under its law.
+        and so does :func:`resume_search`.
     executor
         Any :class:`concurrent.futures.Executor` to work for this search: threads, processes, or a cluster's, such as
         ``dask.distributed.Client(…).get_executor()``. The result is the same to the last bit on processors of one kind.
-        `threads` are those of one task then, one by default. One equation only.
+        `threads` are those of one task then, one by default.
 
     Returns
     -------
@@ -485,9 +485,7 @@ def search_orders(
     )  # fmt: skip
     if store is None:
         return run_job(job, executor=executor)
-    job.check_rounds()
-    name = equation.outputs[0]
-    with Store(store, [job.request(name)]) as kept:
+    with Store(store, [job.request(job.name)]) as kept:
         return run_job(job, store=kept, executor=executor)
 
 
@@ -543,10 +541,8 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
     DataError, ModelError, ConvergenceError, KeyboardInterrupt
         As :func:`search_orders`.
     """
-    if store is not None or executor is not None:
-        job.check_rounds()
     if job.structure.has_order_law:
-        return _search_law(job)
+        return _search_law(job, store, number, executor)
     return _search_one(job, store, number, executor)
 
 
@@ -573,7 +569,8 @@ def resume_search(
     Returns
     -------
     dict of SearchResult
-        By output; those of the uninterrupted searches to the last bit. A store that is complete is only read.
+        By output, or under ``"stage"`` for a search under an order law; those of the uninterrupted searches to the last
+        bit. A store that is complete is only read.
 
     Raises
     ------
@@ -626,9 +623,10 @@ class StoreStatus:
     Parameters
     ----------
     name
-        Output that was searched.
+        Output that was searched, or ``"stage"``.
     candidates
-        Candidates in all.
+        Candidates in all. Under an order law those of the equations one by one, as far as is known: one that was left
+        early may have to be followed further.
     done
         Candidates dealt with.
     best
@@ -679,6 +677,8 @@ class StoreStatus:
 def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
     """How far the searches of a store are; it may be in use.
 
+    Of a stage under its order law the tables are laid out again, which takes seconds for a fine lattice.
+
     Parameters
     ----------
     path
@@ -687,7 +687,7 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
     Returns
     -------
     dict of StoreStatus
-        By output.
+        By output, or under ``"stage"``.
 
     Raises
     ------
@@ -699,15 +699,18 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
     for request, section in zip(contents.requests, contents.sections, strict=True):
         try:
             job = Job.of(request, 1, None)
-            work, _ = job.work()
-            candidates, _ = work.plan()
+            if job.structure.has_order_law:
+                candidates, best = stage_state(job.stage_work()[0], section, 1)
+            else:
+                work, _ = job.work()
+                candidates, _ = work.plan()
+                best = section.best
+                if best is not None and job.settings.norm == "l2":
+                    best = math.sqrt(max(best, 0.0) / work.samples)
         except ModelError as error:
             raise DataError(
                 f"{path} holds no usable search of {request.name}: {error}; start it again in another file"
             ) from error
-        best = section.best
-        if best is not None and job.settings.norm == "l2":
-            best = math.sqrt(max(best, 0.0) / work.samples)
         found[request.name] = StoreStatus(
             request.name, candidates, section.dealt, best, job.settings.to_dict(), request.runs, contents.version,
             contents.torn, contents.damage,
@@ -746,19 +749,10 @@ class Job:
     settings: Settings
     progress: Callable[[int, int, int], None] | None
 
-    def check_rounds(self) -> None:
-        """Refuse what has no rounds to keep or to send away.
-
-        Raises
-        ------
-        ModelError
-            A stage under its order law.
-        """
-        if self.structure.has_order_law:
-            raise ModelError(
-                "store= and executor= take the search of one equation: a stage under its order law is joined from "
-                f"tables in memory; leave them out, or pass .equation({self.structure.outputs[0]!r})"
-            )
+    @property
+    def name(self) -> str:
+        """What its result is called among others."""
+        return "stage" if self.structure.has_order_law else self.structure.outputs[0]
 
     def request(self, name: str) -> Request:
         """As a store keeps it."""
@@ -787,8 +781,8 @@ class Job:
         records = [r.record() for r in request.records]
         structure = request.structure
         signals = structure.signals
-        if not records or len(structure.equations) != 1 or structure.has_order_law:
-            raise ModelError("it is not the search of one equation on a record")
+        if not records or (len(structure.equations) != 1 and not structure.has_order_law):
+            raise ModelError("it is not the search of one equation, or of some under a law, on a record")
         if any(r.signals != signals or r.inputs != records[0].inputs for r in records):
             raise ModelError("its records do not hold the signals of its equation")
         if any(n not in request.values for n in structure.order_names):
@@ -809,6 +803,34 @@ class Job:
             initial_tuple(first.initial), self.settings.core(),
         )  # fmt: skip
         return work, signals
+
+    def stage_work(self) -> tuple[StageWork, list[str]]:
+        """As the search of a stage is computed from it, and the free orders by number."""
+        structure, records, settings = self.structure, self.records, self.settings
+        names = list(structure.order_names)
+        signals = records[0].signals
+
+        def affine(order: Order) -> tuple[float, list[float]]:
+            weights = dict(order.weights)
+            return order.constant, [weights.get(n, 0.0) for n in names]
+
+        laws = [
+            (signals.index(e.output), affine(e.order), [(signals.index(t.signal), affine(t.order)) for t in e.terms])
+            for e in structure.equations
+        ]
+        # Each output's deviation makes radians of hub and of deflection weigh alike.
+        points = sum(r.m for r in records)
+        spread = [
+            math.sqrt(sum(float(((r.of(e.output) - r.of(e.output).mean()) ** 2).sum()) for r in records) / points)
+            for e in structure.equations
+        ]
+        work = StageWork(
+            tuple(r.core() for r in records), [list(self.values[n]) for n in names], laws, list(records[0].inputs),
+            [[t.fixed for t in e.terms] for e in structure.equations],
+            [s * points if settings.norm == "l1" else s for s in spread],
+            initial_tuple(records[0].initial), settings.core(),
+        )  # fmt: skip
+        return work, names
 
 
 def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float]:
@@ -844,37 +866,15 @@ def _search_one(job: Job, store: Store | None, number: int, executor: Executor |
     return _result(job, table, dict(cast("Mapping[str, int]", found["counts"])), failures)
 
 
-def _search_law(job: Job) -> SearchResult:
-    structure, records, settings = job.structure, job.records, job.settings
-    names = list(job.values)
-    signals = records[0].signals
-
-    def affine(order: Order) -> tuple[float, list[float]]:
-        weights = dict(order.weights)
-        return order.constant, [weights.get(n, 0.0) for n in names]
-
-    laws = [
-        (signals.index(e.output), affine(e.order), [(signals.index(t.signal), affine(t.order)) for t in e.terms])
-        for e in structure.equations
-    ]
-    # Each output's deviation makes radians of hub and of deflection weigh alike.
-    points = sum(r.m for r in records)
-    spread = [
-        math.sqrt(sum(float(((r.of(e.output) - r.of(e.output).mean()) ** 2).sum()) for r in records) / points)
-        for e in structure.equations
-    ]
-    scales = [s * points if settings.norm == "l1" else s for s in spread]
-    found = _core.search_stage(
-        [r.core() for r in records],
-        [list(job.values[n]) for n in names],
-        laws,
-        list(records[0].inputs),
-        [[t.fixed for t in e.terms] for e in structure.equations],
-        scales,
-        initial_tuple(records[0].initial),
-        settings.core(),
-        job.progress,
-    )
+def _search_law(job: Job, store: Store | None, number: int, executor: Executor | None) -> SearchResult:
+    structure = job.structure
+    work, names = job.stage_work()
+    if store is None and executor is None:
+        found = work.search(job.progress)
+    else:
+        found = do_stage(
+            work, store=store, number=number, executor=executor, threads=job.settings.threads, progress=job.progress
+        )
     table = []
     for rank, (index, score, free, parts) in enumerate(found["rows"], 1):
         coefficients: dict[str, float] = {}

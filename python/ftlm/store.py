@@ -10,8 +10,9 @@ length bytes          payload: one MessagePack map whose key ``type`` says what 
 ====================  =================================================================================================
 
 The first payload holds the requests (:class:`Requests`): everything a search is computed from, so that it can be
-resumed without the files it came from. Then come :class:`Progress` (a stretch of rounds, half done) and :class:`Rounds`
-(a stretch, done). Frames are only appended; a digest covers all frames before its own, so that none can be lost, moved
+resumed without the files it came from. Then come, for a search of one equation, :class:`Progress` (a stretch of rounds,
+half done) and :class:`Rounds` (a stretch, done); for one under an order law :class:`Verdicts` (a stretch of candidates,
+done). Frames are only appended; a digest covers all frames before its own, so that none can be lost, moved
 or changed unseen. A frame that reaches to or past the end of the file and is not whole is what a power cut leaves: it
 is dropped. Any other frame that is not whole is damage, reported with its offset.
 """
@@ -42,7 +43,7 @@ if TYPE_CHECKING:
 
     from ftlm.records import Record
 
-__all__ = ["MAGIC", "Contents", "Progress", "Request", "Requests", "Rounds", "Store", "read_store"]
+__all__ = ["MAGIC", "Contents", "Progress", "Request", "Requests", "Rounds", "Store", "Verdicts", "read_store"]
 
 MAGIC = b"ftlm search store 1\n"
 HEAD = struct.Struct("<II")
@@ -157,7 +158,23 @@ class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="round
     part: Part
 
 
-_decoder = msgspec.msgpack.Decoder(Requests | Progress | Rounds)
+class Verdicts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="verdicts"):
+    """A stretch of the candidates that a search under an order law follows, in its order, done.
+
+    Values are raw sums as little-endian doubles; a byte each of kinds tells of what: 0 the whole record, 1 a bound, 2 a
+    partial sum, 3 singular, 4 diverged.
+    """
+
+    search: Natural
+    first: Natural
+    last: Natural
+    values: bytes
+    kinds: bytes
+
+
+Frame = Progress | Rounds | Verdicts
+
+_decoder = msgspec.msgpack.Decoder(Requests | Frame)
 _encoder = msgspec.msgpack.Encoder()
 
 
@@ -179,25 +196,38 @@ class Half:
 
 @dataclass
 class Section:
-    """What is known of one search: stretches done by their first round, and those half done."""
+    """What is known of one search: stretches done by their first round, and those half done.
 
+    Under an order law: stretches of candidates followed, by the first.
+    """
+
+    law: bool = False
     done: dict[int, tuple[int, Part]] = field(default_factory=dict)
     open: dict[int, Half] = field(default_factory=dict)
+    followed: dict[int, tuple[int, bytes, bytes]] = field(default_factory=dict)
     _firsts: list[int] = field(default_factory=list)
 
-    def take(self, frame: Progress | Rounds) -> None:
+    def take(self, frame: Frame) -> None:
         """Take a frame in.
 
         Raises
         ------
         ModelError
-            Rounds that are there already, or a stretch that is none.
+            Rounds that are there already, a stretch that is none, or one of another kind of search.
         """
-        if frame.first >= frame.last:
+        stretches: dict[int, Any] = self.followed if self.law else self.done
+        if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
             raise ModelError(f"rounds {frame.first} to {frame.last} are no stretch")
         place = bisect.bisect_left(self._firsts, frame.last)
-        if place and self.done[self._firsts[place - 1]][0] > frame.first:
+        if place and stretches[self._firsts[place - 1]][0] > frame.first:
             raise ModelError(f"rounds {frame.first} to {frame.last} are there twice")
+        if isinstance(frame, Verdicts):
+            count = frame.last - frame.first
+            if (len(frame.values), len(frame.kinds)) != (8 * count, count):
+                raise ModelError(f"candidates {frame.first} to {frame.last} have other verdicts")
+            self.followed[frame.first] = (frame.last, frame.values, frame.kinds)
+            self._firsts.insert(place, frame.first)
+            return
         half = self.open.get(frame.first)
         if isinstance(frame, Rounds):
             self.open.pop(frame.first, None)
@@ -218,6 +248,8 @@ class Section:
     @property
     def dealt(self) -> int:
         """Candidates dealt with."""
+        if self.law:
+            return sum(len(kinds) for _, _, kinds in self.followed.values())
         counted = [part[1] for _, part in self.done.values()] + [half.counts for half in self.open.values()]
         return sum(sum(counts[1:]) for counts in counted)
 
@@ -351,12 +383,13 @@ def _parse(path: str | os.PathLike[str], data: memoryview) -> Contents:
     return found
 
 
-def _opened(frame: Requests | Progress | Rounds, end: int, digest: bytes) -> Contents:
+def _opened(frame: Requests | Frame, end: int, digest: bytes) -> Contents:
     if not isinstance(frame, Requests) or not frame.requests:
         raise ModelError("the first frame holds no request")
     if frame.algorithm != ALGORITHM:
         raise ModelError(f"its rounds follow algorithm {frame.algorithm}, this version's is {ALGORITHM}")
-    return Contents(frame.requests, [Section() for _ in frame.requests], frame.version, end, digest)
+    sections = [Section(law=r.structure.has_order_law) for r in frame.requests]
+    return Contents(frame.requests, sections, frame.version, end, digest)
 
 
 class Store:
@@ -513,7 +546,7 @@ class Store:
         self._end += len(data)
         self._last = time.monotonic()
 
-    def _append(self, frames: Sequence[Progress | Rounds]) -> None:
+    def _append(self, frames: Sequence[Frame]) -> None:
         data, digest, offset = [], self._digest, self._end
         for frame in frames:
             payload = _encoder.encode(frame)
@@ -569,6 +602,16 @@ class Store:
         self._waiting.pop((search, first), None)
         self._failures.pop((search, first), None)
         self._append([Rounds(search, first, last, part)])
+
+    def followed(self, search: int, first: int, last: int, values: bytes, kinds: bytes) -> None:
+        """Append a stretch of candidates of a search under an order law.
+
+        Raises
+        ------
+        DataError
+            As writing.
+        """
+        self._append([Verdicts(search, first, last, values, kinds)])
 
     def close(self) -> None:
         """Write what waits and give the lock back."""

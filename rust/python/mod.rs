@@ -35,6 +35,7 @@ mod _core {
     #[pymodule_export]
     use super::search::{
         lattice_size, panic_on_purpose, search, search_join, search_plan, search_stage, OrderSearch, Points,
+        StageSearch,
     };
 
     #[pymodule_export]

@@ -3,11 +3,12 @@
 use std::borrow::Cow;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{channel, RecvTimeoutError};
+use std::sync::{Mutex, PoisonError};
 use std::time::Duration;
 
 use numpy::{PyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
-use pyo3::types::PyDict;
+use pyo3::types::{PyBytes, PyDict};
 
 use super::arrays::{initial, records, rows, InitialArg, RecordArg};
 use super::errors::caught;
@@ -19,9 +20,9 @@ use crate::regressors::Record;
 use crate::search::lattice::{Lattice, LawEquation, LawLattice, TermAxis};
 use crate::search::points::{Point, Points as PointsOf};
 use crate::search::run::{
-    self, Checkpoint, Control, Counts, Criterion, Estimator, Failure, Norm, Options, Outcome, Part, Place, Row,
+    self, Checkpoint, Control, Counts, Criterion, Estimator, Failure, Norm, Options, Outcome, Part, Place, Row, Verdict,
 };
-use crate::search::stage;
+use crate::search::stage::{self, Course, Span, Stage, StageOutcome};
 
 /// How often Python is asked for signals: well under the half second after which Ctrl-C must have ended a search.
 const LOOK: Duration = Duration::from_millis(50);
@@ -391,6 +392,18 @@ fn affine((constant, weights): AffineArg) -> AffineOrder {
     AffineOrder { constant, weights }
 }
 
+fn law_lattice(axes: &[Vec<f64>], laws: Vec<LawEquationArg>, inputs: &[bool]) -> Result<LawLattice, Error> {
+    let equations: Vec<LawEquation> = laws
+        .into_iter()
+        .map(|(output, order, terms)| LawEquation {
+            output,
+            order: affine(order),
+            terms: terms.into_iter().map(|(signal, order)| (signal, affine(order))).collect(),
+        })
+        .collect();
+    LawLattice::new(axes, &equations, inputs)
+}
+
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn search_stage<'py>(
@@ -407,20 +420,17 @@ pub fn search_stage<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let records = records(&runs)?;
     let options = options(settings, terms)?;
-    let equations: Vec<LawEquation> = laws
-        .into_iter()
-        .map(|(output, order, terms)| LawEquation {
-            output,
-            order: affine(order),
-            terms: terms.into_iter().map(|(signal, order)| (signal, affine(order))).collect(),
-        })
-        .collect();
     let (lattice, outcome) = watched(py, progress.as_ref(), |control| {
-        let lattice = LawLattice::new(&axes, &equations, &inputs)?;
+        let lattice = law_lattice(&axes, laws, &inputs)?;
         let records = prepared(records, &inputs, &options)?;
         let outcome = stage::search(&records, &lattice, &fixed, &scales, &options, control)?;
         Ok((lattice, outcome))
     })?;
+    found_stage(py, &lattice, outcome)
+}
+
+/// A table, counts and failures with the free orders of each index.
+fn found_stage<'py>(py: Python<'py>, lattice: &LawLattice, outcome: StageOutcome) -> PyResult<Bound<'py, PyDict>> {
     let rows: Vec<_> = outcome
         .rows
         .into_iter()
@@ -445,6 +455,131 @@ pub fn search_stage<'py>(
     dict.set_item("failures", failures)?;
     dict.set_item("distinct", outcome.distinct)?;
     Ok(dict)
+}
+
+/// (equation, first candidate, the one behind the last, limit).
+type SpanArg = (usize, usize, usize, f64);
+
+/// What candidates came to: raw sums as little-endian doubles, and a byte each that says of what.
+fn verdicts_of(verdicts: &[Verdict]) -> (Vec<u8>, Vec<u8>) {
+    let pairs = verdicts.iter().map(|verdict| match *verdict {
+        Verdict::Score(raw) => (raw, 0),
+        Verdict::Bounded(raw) => (raw, 1),
+        Verdict::Stopped(raw) => (raw, 2),
+        Verdict::Failed(Failure::Singular) => (0.0, 3),
+        Verdict::Failed(Failure::Diverged) => (0.0, 4),
+    });
+    let (values, kinds): (Vec<[u8; 8]>, Vec<u8>) = pairs.map(|(raw, kind)| (raw.to_le_bytes(), kind)).unzip();
+    (values.concat(), kinds)
+}
+
+fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
+    let known = kinds.iter().zip(values.chunks_exact(8)).map(|(kind, value)| {
+        let raw = f64::from_le_bytes(std::array::from_fn(|i| value[i]));
+        match kind {
+            0 => Some(Verdict::Score(raw)),
+            1 => Some(Verdict::Bounded(raw)),
+            2 => Some(Verdict::Stopped(raw)),
+            3 => Some(Verdict::Failed(Failure::Singular)),
+            4 => Some(Verdict::Failed(Failure::Diverged)),
+            _ => None,
+        }
+    });
+    known.collect::<Option<Vec<_>>>().filter(|_| values.len() == 8 * kinds.len()).ok_or_else(|| {
+        let what = format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len());
+        Error::Structure { what, remedy: "start the search again".into() }
+    })
+}
+
+/// The search of a stage made ready: its candidates are followed here or elsewhere, and taken in where its course is
+/// kept.
+#[pyclass(frozen, module = "ftlm._core")]
+pub struct StageSearch {
+    stage: Stage<'static>,
+    course: Mutex<Option<Course>>,
+}
+
+impl StageSearch {
+    /// Works on the course.
+    fn course<T>(&self, work: impl FnOnce(&mut Course) -> Result<T, Error>) -> Result<T, Error> {
+        let mut course = self.course.lock().unwrap_or_else(PoisonError::into_inner);
+        let found = course.as_mut().ok_or_else(|| Error::Structure {
+            what: "this search only follows candidates".into(),
+            remedy: "make one that keeps its course".into(),
+        })?;
+        work(found)
+    }
+}
+
+#[pymethods]
+impl StageSearch {
+    #[new]
+    #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+    fn new(
+        py: Python<'_>,
+        runs: Vec<RecordArg<'_>>,
+        axes: Vec<Vec<f64>>,
+        laws: Vec<LawEquationArg>,
+        inputs: Vec<bool>,
+        fixed: Vec<Vec<Option<f64>>>,
+        scales: Vec<f64>,
+        terms: InitialArg,
+        settings: OptionsArg,
+        keeps_course: bool,
+    ) -> PyResult<Self> {
+        let records = records(&runs)?;
+        let options = options(settings, terms)?;
+        let (stage, course) = watched(py, None, |control| {
+            let lattice = law_lattice(&axes, laws, &inputs)?;
+            let records = prepared(records, &inputs, &options)?;
+            let pool = run::pool(options.threads)?;
+            Stage::new(&records, Cow::Owned(lattice), &fixed, &scales, &options, &pool, control)
+        })?;
+        Ok(Self { stage, course: Mutex::new(keeps_course.then_some(course)) })
+    }
+
+    /// Candidates to follow next; none at the end.
+    fn wanted(&self, py: Python<'_>) -> PyResult<Vec<SpanArg>> {
+        super::errors::detached(py, || {
+            self.course(|c| Ok(c.wanted().iter().map(|s| (s.equation, s.first, s.last, s.limit)).collect()))
+        })
+    }
+
+    /// Candidates to follow in all, as far as is known, and the best score so far.
+    fn state(&self, py: Python<'_>) -> PyResult<(u64, Option<f64>)> {
+        super::errors::detached(py, || self.course(|c| Ok((c.total(), c.best()))))
+    }
+
+    /// What these candidates come to.
+    #[allow(clippy::needless_pass_by_value)]
+    fn follow<'py>(
+        &self,
+        py: Python<'py>,
+        spans: Vec<SpanArg>,
+        threads: usize,
+        progress: Option<Py<PyAny>>,
+    ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyBytes>)> {
+        let spans: Vec<Span> =
+            spans.into_iter().map(|(equation, first, last, limit)| Span { equation, first, last, limit }).collect();
+        let (values, kinds) = watched(py, progress.as_ref(), |control| {
+            Ok(verdicts_of(&self.stage.evaluate(&spans, &run::pool(threads)?, control)?))
+        })?;
+        Ok((PyBytes::new(py, &values), PyBytes::new(py, &kinds)))
+    }
+
+    /// Takes in what the wanted candidates came to, in their order.
+    fn take(&self, py: Python<'_>, values: &[u8], kinds: &[u8], threads: usize) -> PyResult<()> {
+        watched(py, None, |control| {
+            let found = verdicts(values, kinds)?;
+            self.course(|course| course.take(&self.stage, &found, &run::pool(threads)?, control))
+        })
+    }
+
+    /// The result, once nothing is wanted.
+    fn outcome<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let outcome = watched(py, None, |control| self.course(|course| self.stage.outcome(course, control)))?;
+        found_stage(py, self.stage.lattice(), outcome)
+    }
 }
 
 /// Errors of candidates at orders and coefficients of their own.

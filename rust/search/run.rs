@@ -290,12 +290,14 @@ pub struct Checkpoint {
 
 /// What one candidate came to, in raw sums (Σ|e| or Σe²).
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) enum Verdict {
+pub enum Verdict {
+    /// Run to the end.
     Score(f64),
     /// Not run: this lower bound is above the limit.
     Bounded(f64),
     /// Left at this partial sum, above the limit.
     Stopped(f64),
+    /// It has no score.
     Failed(Failure),
 }
 

@@ -11,6 +11,7 @@
 //! Table entries start as lower bounds (left early) and are sharpened until every tuple that could be kept is exact, so
 //! the result is that of enumeration, ties by index.
 
+use std::borrow::Cow;
 use std::collections::hash_map::Entry as Slot;
 use std::collections::{HashMap, HashSet};
 use std::ops::Range;
@@ -29,7 +30,7 @@ use crate::search::run::{
 
 /// An equation's candidates are first followed up to this multiple of its best score.
 const FIRST_LIMIT: f64 = 4.0;
-/// Candidates of one equation evaluated between two looks at its best score.
+/// Candidates of one equation evaluated between two looks at its best score, at first: a later look tells less.
 const ROUND: usize = 4096;
 
 /// One kept tuple of free orders.
@@ -97,57 +98,53 @@ impl Class {
 
 const OPEN: Entry = Entry { value: 0.0, class: Class::Open };
 
-struct Table<'a> {
+/// What is known of every candidate of every equation.
+type Entries = Vec<Vec<Entry>>;
+
+/// What the candidates of one equation share.
+struct Table {
     problem: Problem,
-    candidates: &'a Candidates,
-    entries: Vec<Entry>,
+    candidates: Candidates,
+    /// Those that some tuple needs.
+    used: Vec<usize>,
     scale: f64,
-    samples: f64,
-    options: &'a Options,
 }
 
-impl Table<'_> {
-    /// The raw sum that corresponds to a scaled score.
-    fn raw(&self, score: f64) -> f64 {
-        match self.options.norm {
-            Norm::L1 => score * self.scale,
-            Norm::L2 => (score * self.scale) * (score * self.scale) * self.samples,
+impl Table {
+    fn entry(&self, verdict: Verdict) -> Entry {
+        let score = |raw: f64| self.problem.score(raw) / self.scale;
+        match verdict {
+            Verdict::Score(raw) => Entry { value: score(raw), class: Class::Exact },
+            Verdict::Bounded(raw) => Entry { value: score(raw), class: Class::Bounded },
+            Verdict::Stopped(raw) => Entry { value: score(raw), class: Class::Open },
+            Verdict::Failed(failure) => Entry { value: f64::INFINITY, class: Class::Failed(failure) },
         }
     }
+}
 
-    fn evaluate(&mut self, wanted: &[(usize, f64)], pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
-        let scratches = Scratches::new(pool.current_num_threads());
-        let this = &*self;
-        let verdicts: Vec<(usize, Verdict)> = pool.install(|| {
-            wanted
-                .par_iter()
-                .map(|&(id, score)| {
-                    if control.stop.load(Ordering::Relaxed) {
-                        return Err(Error::Interrupted);
-                    }
-                    // A hair above, so that a tie in the scaled sum is followed to its end.
-                    let limit = this.raw(score) * (1.0 + 1e-12);
-                    let structure = this.candidates.structure(id);
-                    let (verdict, _) = scratches
-                        .with(|scratch| this.problem.evaluate_structure(&structure, limit, scratch, control))?;
-                    Ok((id, verdict))
-                })
-                .collect::<Result<_>>()
-        })?;
-        if control.stop.load(Ordering::Relaxed) {
-            return Err(Error::Interrupted);
+/// Candidates `first … last − 1` of one equation, to be followed up to one limit of its scaled score.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Span {
+    /// Equation.
+    pub equation: usize,
+    /// See above.
+    pub first: usize,
+    /// See above.
+    pub last: usize,
+    /// See above.
+    pub limit: f64,
+}
+
+/// Candidates of an equation with the limit of each, in stretches that share one.
+fn spans(equation: usize, wanted: impl Iterator<Item = (usize, f64)>) -> Vec<Span> {
+    let mut spans: Vec<Span> = Vec::new();
+    for (id, limit) in wanted {
+        match spans.last_mut() {
+            Some(span) if span.last == id && span.limit.to_bits() == limit.to_bits() => span.last = id + 1,
+            _ => spans.push(Span { equation, first: id, last: id + 1, limit }),
         }
-        for (id, verdict) in verdicts {
-            let score = |raw: f64| self.problem.score(raw) / self.scale;
-            self.entries[id] = match verdict {
-                Verdict::Score(raw) => Entry { value: score(raw), class: Class::Exact },
-                Verdict::Bounded(raw) => Entry { value: score(raw), class: Class::Bounded },
-                Verdict::Stopped(raw) => Entry { value: score(raw), class: Class::Open },
-                Verdict::Failed(failure) => Entry { value: f64::INFINITY, class: Class::Failed(failure) },
-            };
-        }
-        Ok(())
     }
+    spans
 }
 
 /// Distinct orders of one equation.
@@ -215,7 +212,7 @@ struct Half {
 
 impl Half {
     /// Sum and class of every combination.
-    fn states(&self, tables: &[Table<'_>]) -> Vec<Entry> {
+    fn states(&self, known: &Entries) -> Vec<Entry> {
         let width = self.equations.len();
         if width == 0 {
             return vec![Entry { value: 0.0, class: Class::Exact }];
@@ -223,7 +220,7 @@ impl Half {
         self.combinations
             .chunks_exact(width)
             .map(|ids| {
-                let entries = self.equations.clone().zip(ids).map(|(e, &id)| tables[e].entries[id as usize]);
+                let entries = self.equations.clone().zip(ids).map(|(e, &id)| known[e][id as usize]);
                 entries.fold(Entry { value: 0.0, class: Class::Exact }, |sum, entry| Entry {
                     value: sum.value + entry.value,
                     class: sum.class.with(entry.class),
@@ -403,11 +400,11 @@ impl Join {
     }
 
     /// Score of a tuple: its equations' in their order, as enumeration adds them.
-    fn score(&self, tables: &[Table<'_>], pair: [u32; 2]) -> f64 {
+    fn score(&self, known: &Entries, pair: [u32; 2]) -> f64 {
         let halves = self.halves.iter().zip(pair);
         halves
             .flat_map(|(half, combination)| half.equations.clone().zip(half.ids(combination)))
-            .map(|(e, &id)| tables[e].entries[id as usize].value)
+            .map(|(e, &id)| known[e][id as usize].value)
             .sum()
     }
 
@@ -415,7 +412,7 @@ impl Join {
     fn best(
         &self,
         states: &[Vec<Entry>; 2],
-        tables: &[Table<'_>],
+        known: &Entries,
         keep: usize,
         pool: &rayon::ThreadPool,
         control: &Control,
@@ -468,7 +465,7 @@ impl Join {
                         break;
                     }
                     let pair = [first.combination, second.combination];
-                    kept.push((self.score(tables, pair), first.index + second.index));
+                    kept.push((self.score(known, pair), first.index + second.index));
                     if kept.len() >= room {
                         worst = trim(&mut kept);
                     }
@@ -486,12 +483,12 @@ impl Join {
     fn unresolved(
         &self,
         states: &[Vec<Entry>; 2],
-        tables: &[Table<'_>],
+        known: &Entries,
         worst: f64,
         raise: f64,
         control: &Control,
-    ) -> Result<Vec<Vec<(usize, f64)>>> {
-        let mut limits: Vec<Vec<f64>> = tables.iter().map(|t| vec![f64::NEG_INFINITY; t.entries.len()]).collect();
+    ) -> Result<Vec<Span>> {
+        let mut limits: Vec<Vec<f64>> = known.iter().map(|k| vec![f64::NEG_INFINITY; k.len()]).collect();
         for bucket in &self.buckets {
             if control.stop.load(Ordering::Relaxed) {
                 return Err(Error::Interrupted);
@@ -509,7 +506,7 @@ impl Join {
                         continue;
                     }
                     for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
-                        let entry = tables[e].entries[id as usize];
+                        let entry = known[e][id as usize];
                         if entry.class == Class::Exact {
                             continue;
                         }
@@ -527,10 +524,11 @@ impl Join {
                 }
             }
         }
-        Ok(limits
+        let wanted = limits
             .into_iter()
-            .map(|all| all.into_iter().enumerate().filter(|(_, limit)| *limit > f64::NEG_INFINITY).collect())
-            .collect())
+            .enumerate()
+            .flat_map(|(e, all)| spans(e, all.into_iter().enumerate().filter(|(_, limit)| *limit > f64::NEG_INFINITY)));
+        Ok(wanted.collect())
     }
 
     /// What became of all tuples, and the first failures by index.
@@ -625,13 +623,265 @@ fn combination(
     }
 }
 
+/// A stage made ready: what the candidates of its equations share.
+pub struct Stage<'a> {
+    lattice: Cow<'a, LawLattice>,
+    options: Options,
+    tables: Vec<Table>,
+    samples: f64,
+}
+
+/// How far the search of a stage is: what is known of every candidate, and which are to be followed next.
+///
+/// What comes next depends on nothing but what the candidates before came to, so these may be followed anywhere, in any
+/// order, and a search goes on from their verdicts.
+pub struct Course {
+    join: Join,
+    known: Entries,
+    /// In the first pass: the equation, how many of its candidates are done or wanted, its best score so far.
+    pass: (usize, usize, f64),
+    raise: f64,
+    wanted: Vec<Span>,
+    total: u64,
+    /// The best exact tuples, once the first pass is over.
+    kept: Vec<(f64, u64)>,
+}
+
+impl<'a> Stage<'a> {
+    /// Lays out the join and builds what every equation's candidates share.
+    ///
+    /// `fixed[e]` gives known coefficients of equation e, `scales[e]` what its score is divided by (say σ(y)·M for norm
+    /// L1), so that radians of hub and of deflection weigh alike.
+    ///
+    /// # Errors
+    /// As [`crate::search::run::search`]; [`Error::EmptyLattice`] where no tuple obeys the law.
+    pub fn new(
+        records: &[Record],
+        lattice: Cow<'a, LawLattice>,
+        fixed: &[Vec<Option<f64>>],
+        scales: &[f64],
+        options: &Options,
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<(Self, Course)> {
+        let equations = lattice.equations();
+        check_length("fixed coefficients", equations.len(), fixed.len())?;
+        check_length("scales", equations.len(), scales.len())?;
+        let mut candidates: Vec<Candidates> = equations.iter().map(Candidates::new).collect();
+        let (join, used) = Join::new(&lattice, &mut candidates, pool, control)?;
+        if join.tuples() == 0 {
+            return Err(Error::EmptyLattice { why: "no tuple of free orders gives orders in range".into() });
+        }
+        #[allow(clippy::cast_precision_loss)]
+        let samples = records.iter().map(Record::m).sum::<usize>() as f64;
+        let mut tables = Vec::with_capacity(equations.len());
+        for (e, (candidates, used)) in candidates.into_iter().zip(used).enumerate() {
+            check_length("fixed coefficients", equations[e].terms.len(), fixed[e].len())?;
+            let (mut index, mut seen, mut alphas) = (Index::default(), HashSet::new(), HashSet::new());
+            for &id in &used {
+                let structure = candidates.structure(id);
+                if alphas.insert(grains(structure.order)) {
+                    index_alpha(&mut index, structure.order, &options.initial);
+                }
+                for term in &structure.terms {
+                    index_orders(&mut index, &mut seen, structure.order, term.signal, term.order, &options.initial);
+                }
+            }
+            index.sort();
+            let problem = Problem::new(records, equations[e].output, index, &fixed[e], options)?;
+            let problem = pool.install(|| problem.with_bound(used.len() as u64));
+            tables.push(Table { problem, candidates, used, scale: scales[e] });
+        }
+        let stage = Self { lattice, options: options.clone(), tables, samples };
+        let mut course = Course {
+            join,
+            known: stage.tables.iter().map(|t| vec![OPEN; t.candidates.len()]).collect(),
+            pass: (0, 0, f64::INFINITY),
+            raise: FIRST_LIMIT,
+            wanted: Vec::new(),
+            total: stage.tables.iter().map(|t| t.used.len() as u64).sum(),
+            kept: Vec::new(),
+        };
+        course.next(&stage, pool, control)?;
+        Ok((stage, course))
+    }
+
+    /// The raw sum up to which a candidate is followed for a scaled score.
+    fn raw(&self, equation: usize, score: f64) -> f64 {
+        let scaled = score * self.tables[equation].scale;
+        let raw = match self.options.norm {
+            Norm::L1 => scaled,
+            Norm::L2 => scaled * scaled * self.samples,
+        };
+        // A hair above, so that a tie in the scaled sum is followed to its end.
+        raw * (1.0 + 1e-12)
+    }
+
+    /// Follows these candidates: what each came to, in raw sums.
+    ///
+    /// # Errors
+    /// Candidates that this stage has not, or [`Error::Interrupted`].
+    pub fn evaluate(&self, spans: &[Span], pool: &rayon::ThreadPool, control: &Control) -> Result<Vec<Verdict>> {
+        let mut wanted = Vec::new();
+        for &Span { equation, first, last, limit } in spans {
+            let count = self.tables.get(equation).map_or(0, |t| t.candidates.len());
+            if last > count || first > last || limit.is_nan() {
+                let what = format!("candidates {first} to {last} of equation {equation} are not among {count}");
+                return Err(Error::Structure { what, remedy: "start the search again".into() });
+            }
+            let limit = self.raw(equation, limit);
+            wanted.extend((first..last).map(|id| (equation, id, limit)));
+        }
+        let scratches = Scratches::new(pool.current_num_threads());
+        let verdicts: Vec<Verdict> = pool.install(|| {
+            wanted
+                .par_iter()
+                .map(|&(e, id, limit)| {
+                    if control.stop.load(Ordering::Relaxed) {
+                        return Err(Error::Interrupted);
+                    }
+                    let Table { problem, candidates, .. } = &self.tables[e];
+                    let structure = candidates.structure(id);
+                    let (verdict, _) =
+                        scratches.with(|scratch| problem.evaluate_structure(&structure, limit, scratch, control))?;
+                    control.done.fetch_add(1, Ordering::Relaxed);
+                    let left = matches!(verdict, Verdict::Bounded(_) | Verdict::Stopped(_));
+                    control.pruned.fetch_add(u64::from(left), Ordering::Relaxed);
+                    Ok(verdict)
+                })
+                .collect::<Result<_>>()
+        })?;
+        if control.stop.load(Ordering::Relaxed) {
+            return Err(Error::Interrupted);
+        }
+        Ok(verdicts)
+    }
+
+    /// The result of a search that has nothing left to follow.
+    ///
+    /// # Errors
+    /// A search that has something left, or an internal fault.
+    pub fn outcome(&self, course: &Course, control: &Control) -> Result<StageOutcome> {
+        if !course.wanted.is_empty() {
+            let what = "a search that has candidates left to follow has no result".into();
+            return Err(Error::Structure { what, remedy: "follow them, and take in what they come to".into() });
+        }
+        let (mut counts, failures) = course.join.count(&course.states());
+        counts.kept = course.kept.len() as u64;
+        counts.beaten -= counts.kept;
+        let mut scratch = Scratch::new();
+        let mut rows = Vec::with_capacity(course.kept.len());
+        for &(score, index) in &course.kept {
+            let structures = self
+                .lattice
+                .structures(index)
+                .ok_or_else(|| Error::Internal { what: "a kept tuple without structures".into() })?;
+            let mut parts = Vec::with_capacity(structures.len());
+            for (table, structure) in self.tables.iter().zip(&structures) {
+                let (_, mut row) = table.problem.evaluate_structure(structure, f64::INFINITY, &mut scratch, control)?;
+                row.score = table.problem.score(row.score);
+                parts.push(row);
+            }
+            rows.push(StageRow { index, free: self.lattice.free(index), score, structures, rows: parts });
+        }
+        let distinct = self.tables.iter().map(|t| t.used.len() as u64).collect();
+        Ok(StageOutcome { rows, counts, failures, distinct })
+    }
+
+    /// Its lattice.
+    #[must_use]
+    pub fn lattice(&self) -> &LawLattice {
+        &self.lattice
+    }
+}
+
+impl Course {
+    /// Candidates to follow next; none at the end.
+    #[must_use]
+    pub fn wanted(&self) -> &[Span] {
+        &self.wanted
+    }
+
+    /// Candidates to follow in all, as far as is known: one that was left early may have to be followed further.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        self.total
+    }
+
+    /// Best score of a tuple, once there is one.
+    #[must_use]
+    pub fn best(&self) -> Option<f64> {
+        self.kept.first().map(|kept| kept.0)
+    }
+
+    fn states(&self) -> [Vec<Entry>; 2] {
+        std::array::from_fn(|h| self.join.halves[h].states(&self.known))
+    }
+
+    /// Takes in what the wanted candidates came to, in their order, and finds those to follow next.
+    ///
+    /// # Errors
+    /// Verdicts that are not theirs, or [`Error::Interrupted`].
+    pub fn take(
+        &mut self,
+        stage: &Stage<'_>,
+        verdicts: &[Verdict],
+        pool: &rayon::ThreadPool,
+        control: &Control,
+    ) -> Result<()> {
+        let wanted: usize = self.wanted.iter().map(|span| span.last - span.first).sum();
+        let sound = |verdict: &Verdict| match *verdict {
+            Verdict::Score(raw) | Verdict::Bounded(raw) | Verdict::Stopped(raw) => raw >= 0.0,
+            Verdict::Failed(_) => true,
+        };
+        if verdicts.len() != wanted || !verdicts.iter().all(sound) {
+            let what = format!("{} verdicts are not those of {wanted} candidates", verdicts.len());
+            return Err(Error::Structure { what, remedy: "start the search again".into() });
+        }
+        let first_pass = self.pass.0 < stage.tables.len();
+        let mut verdicts = verdicts.iter();
+        for span in &self.wanted {
+            let table = &stage.tables[span.equation];
+            for (entry, &verdict) in self.known[span.equation][span.first..span.last].iter_mut().zip(&mut verdicts) {
+                *entry = table.entry(verdict);
+                if first_pass && entry.class == Class::Exact {
+                    self.pass.2 = self.pass.2.min(entry.value);
+                }
+            }
+        }
+        self.next(stage, pool, control)
+    }
+
+    fn next(&mut self, stage: &Stage<'_>, pool: &rayon::ThreadPool, control: &Control) -> Result<()> {
+        control.total.store(self.total, Ordering::Relaxed);
+        // First pass: each equation's own best, the others left at a few times it.
+        while let Some(Table { used, .. }) = stage.tables.get(self.pass.0) {
+            let (equation, start, best) = self.pass;
+            if start < used.len() {
+                let end = used.len().min(start + if start == 0 { 256 } else { ROUND.max(start / 2) });
+                let limit = if stage.options.early_stopping { FIRST_LIMIT * best } else { f64::INFINITY };
+                self.wanted = spans(equation, used[start..end].iter().map(|&id| (id, limit)));
+                self.pass.1 = end;
+                return Ok(());
+            }
+            self.pass = (equation + 1, 0, f64::INFINITY);
+        }
+        let keep = stage.options.keep;
+        let states = self.states();
+        self.kept = self.join.best(&states, &self.known, keep, pool, control)?;
+        let worst = if self.kept.len() == keep { self.kept[keep - 1].0 } else { f64::INFINITY };
+        self.wanted = self.join.unresolved(&states, &self.known, worst, self.raise, control)?;
+        self.raise *= FIRST_LIMIT;
+        self.total += self.wanted.iter().map(|span| (span.last - span.first) as u64).sum::<u64>();
+        control.total.store(self.total, Ordering::Relaxed);
+        Ok(())
+    }
+}
+
 /// Searches the free orders of a stage: the sum over equations of score / scale is smallest.
 ///
-/// `fixed[e]` gives known coefficients of equation e, `scales[e]` what its score is divided by (say σ(y)·M for norm
-/// L1), so that radians of hub and of deflection weigh alike.
-///
 /// # Errors
-/// As [`crate::search::run::search`]; [`Error::EmptyLattice`] where no tuple obeys the law.
+/// As [`Stage::new`].
 pub fn search(
     records: &[Record],
     lattice: &LawLattice,
@@ -640,90 +890,11 @@ pub fn search(
     options: &Options,
     control: &Control,
 ) -> Result<StageOutcome> {
-    let equations = lattice.equations();
-    check_length("fixed coefficients", equations.len(), fixed.len())?;
-    check_length("scales", equations.len(), scales.len())?;
     let pool = pool(options.threads)?;
-
-    let mut candidates: Vec<Candidates> = equations.iter().map(Candidates::new).collect();
-    let (join, used) = Join::new(lattice, &mut candidates, &pool, control)?;
-    if join.tuples() == 0 {
-        return Err(Error::EmptyLattice { why: "no tuple of free orders gives orders in range".into() });
+    let (stage, mut course) = Stage::new(records, Cow::Borrowed(lattice), fixed, scales, options, &pool, control)?;
+    while !course.wanted().is_empty() {
+        let verdicts = stage.evaluate(course.wanted(), &pool, control)?;
+        course.take(&stage, &verdicts, &pool, control)?;
     }
-    let distinct: Vec<u64> = used.iter().map(|u| u.len() as u64).collect();
-    control.total.store(distinct.iter().sum(), Ordering::Relaxed);
-
-    #[allow(clippy::cast_precision_loss)]
-    let samples = records.iter().map(Record::m).sum::<usize>() as f64;
-    let mut tables = Vec::with_capacity(equations.len());
-    for (e, candidates) in candidates.iter().enumerate() {
-        check_length("fixed coefficients", equations[e].terms.len(), fixed[e].len())?;
-        let (mut index, mut seen, mut alphas) = (Index::default(), HashSet::new(), HashSet::new());
-        for &id in &used[e] {
-            let structure = candidates.structure(id);
-            if alphas.insert(grains(structure.order)) {
-                index_alpha(&mut index, structure.order, &options.initial);
-            }
-            for term in &structure.terms {
-                index_orders(&mut index, &mut seen, structure.order, term.signal, term.order, &options.initial);
-            }
-        }
-        index.sort();
-        let problem = Problem::new(records, equations[e].output, index, &fixed[e], options)?;
-        let problem = pool.install(|| problem.with_bound(distinct[e]));
-        let entries = vec![OPEN; candidates.len()];
-        tables.push(Table { problem, candidates, entries, scale: scales[e], samples, options });
-    }
-
-    // First pass: each equation's own best, the others left at a few times it.
-    for (table, used) in tables.iter_mut().zip(&used) {
-        let mut best = f64::INFINITY;
-        let mut start = 0;
-        while start < used.len() {
-            let end = used.len().min(start + if start == 0 { 256 } else { ROUND });
-            let limit = if options.early_stopping { FIRST_LIMIT * best } else { f64::INFINITY };
-            let wanted: Vec<(usize, f64)> = used[start..end].iter().map(|&id| (id, limit)).collect();
-            table.evaluate(&wanted, &pool, control)?;
-            let found = || used[start..end].iter().map(|&id| table.entries[id]);
-            let left = found().filter(|entry| matches!(entry.class, Class::Bounded | Class::Open)).count();
-            control.done.fetch_add((end - start) as u64, Ordering::Relaxed);
-            control.pruned.fetch_add(left as u64, Ordering::Relaxed);
-            best = found().filter(|entry| entry.class == Class::Exact).fold(best, |best, e| best.min(e.value));
-            start = end;
-        }
-    }
-
-    let mut raise = FIRST_LIMIT;
-    let (kept, states) = loop {
-        let states: [Vec<Entry>; 2] = std::array::from_fn(|h| join.halves[h].states(&tables));
-        let kept = join.best(&states, &tables, options.keep, &pool, control)?;
-        let worst = if kept.len() == options.keep { kept[kept.len() - 1].0 } else { f64::INFINITY };
-        let wanted = join.unresolved(&states, &tables, worst, raise, control)?;
-        if wanted.iter().all(Vec::is_empty) {
-            break (kept, states);
-        }
-        for (table, wanted) in tables.iter_mut().zip(&wanted) {
-            table.evaluate(wanted, &pool, control)?;
-        }
-        raise *= FIRST_LIMIT;
-    };
-    let (mut counts, failures) = join.count(&states);
-    counts.kept = kept.len() as u64;
-    counts.beaten -= counts.kept;
-
-    let mut scratch = Scratch::new();
-    let mut rows = Vec::with_capacity(kept.len());
-    for (score, index) in kept {
-        let structures = lattice
-            .structures(index)
-            .ok_or_else(|| Error::Internal { what: "a kept tuple without structures".into() })?;
-        let mut parts = Vec::with_capacity(structures.len());
-        for (table, structure) in tables.iter().zip(&structures) {
-            let (_, mut row) = table.problem.evaluate_structure(structure, f64::INFINITY, &mut scratch, control)?;
-            row.score = table.problem.score(row.score);
-            parts.push(row);
-        }
-        rows.push(StageRow { index, free: lattice.free(index), score, structures, rows: parts });
-    }
-    Ok(StageOutcome { rows, counts, failures, distinct })
+    stage.outcome(&course, control)
 }

@@ -4,6 +4,7 @@ import contextlib
 import json
 import multiprocessing
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -169,9 +170,6 @@ def test_an_error_of_the_search_is_the_one_of_one_machine(run):
         for here in (None, pool):
             with pytest.raises(ModelError, match="signal 'u'"):
                 search(run, here, lattice=ftlm.Lattice(orders={"alpha": [0.5], "nu": [0.7], "beta": [0.1], "mu": [0]}))
-        structure = ftlm.flexible_link(laws=("orders",))
-        with pytest.raises((ModelError, DataError)):
-            ftlm.search_orders(run, structure, executor=pool)
 
 
 def test_an_executor_that_is_closed_is_said(run):
@@ -179,6 +177,58 @@ def test_an_executor_that_is_closed_is_said(run):
     pool.shutdown()
     with pytest.raises(ConvergenceError, match="lost its work"):
         search(run, pool)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# A stage under its order law
+
+
+@pytest.fixture(scope="module")
+def stage_run(plant, drive, with_noise):
+    return with_noise(plant("A").simulate(drive("A", samples=301), tolerance=1e-5), 1e-5, 3)
+
+
+def search_stage(run, executor=None, **options):
+    lattice = ftlm.Lattice(step=0.1, orders={"alpha": (1.8, 2.0)})
+    options = {"m": 64, "keep": 8, "coefficients": "least-squares", **options}
+    return ftlm.search_orders(run, ftlm.flexible_link(), lattice, executor=executor, **options)
+
+
+@pytest.fixture(scope="module")
+def stage_expected(stage_run):
+    return bytes_of(search_stage(stage_run))
+
+
+def test_threads_give_the_same_bytes_of_a_stage(stage_run, stage_expected):
+    told = []
+    with ThreadPoolExecutor(3) as pool:
+        found = search_stage(stage_run, pool, progress=lambda *done: told.append(done))
+        assert bytes_of(search_stage(stage_run, pool, threads=2)) == stage_expected
+    assert bytes_of(found) == stage_expected
+    assert told[-1][0] == told[-1][1]
+    assert [d for d, _ in told] == sorted(d for d, _ in told)
+
+
+def test_spawned_processes_give_the_same_bytes_of_a_stage_and_resume(stage_run, stage_expected, tmp_path):
+    path = tmp_path / "s.ftlm"
+    with ProcessPoolExecutor(2, mp_context=multiprocessing.get_context("spawn")) as pool:
+        assert bytes_of(search_stage(stage_run, pool, store=path)) == stage_expected
+        os.truncate(path, path.stat().st_size * 2 // 3)
+        assert not ftlm.search_status(path)["stage"].complete
+        assert bytes_of(ftlm.resume_search(path, executor=pool)["stage"]) == stage_expected
+    assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
+
+
+def test_of_a_stage_the_record_is_sent_once_and_tasks_are_ranges(stage_run, stage_expected):
+    pool = Counting(fail={3})
+    assert bytes_of(search_stage(stage_run, pool)) == stage_expected
+    assert pool.carried == 1
+    spans = [span for _, _, some, _ in pool.tasks for span in some]
+    assert all(first < last and (equation, len(span)) in {(0, 4), (1, 4)}
+               for span in spans for equation, first, last, _ in [span])  # fmt: skip
+    assert len(pickle.dumps(pool.tasks[-1])) < 10_000
+    with pytest.raises(ConvergenceError, match="the network is down"):
+        search_stage(stage_run, Counting(fail=range(2, 50)))
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -16,7 +16,8 @@ import pytest
 import ftlm
 import store as bench
 from ftlm import _core
-from ftlm.store import MAGIC, Store, read_store
+from ftlm.errors import ModelError
+from ftlm.store import MAGIC, Rounds, Store, Verdicts, read_store
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 COARSE = ftlm.lattice(step=0.1)
@@ -140,9 +141,15 @@ def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, c
     other = CliRunner().invoke(app, [*call, "--store", path, "--keep", "5"])
     assert other.exit_code == 3
     assert "other settings: keep = 5" in other.stderr
-    law = CliRunner().invoke(app, [*call, "--laws", "orders", "--store", str(tmp_path / "l.ftlm")])
-    assert law.exit_code == 2
-    assert "joined from tables in memory" in law.stderr
+    # Under the order law both are one search.
+    law = ["search", str(data), *common, "--laws", "orders"]
+    plain = CliRunner().invoke(app, law)
+    kept = CliRunner().invoke(app, [*law, "--store", str(tmp_path / "l.ftlm")])
+    resumed = CliRunner().invoke(app, ["resume", str(tmp_path / "l.ftlm"), "--json"])
+    assert [r.exit_code for r in (plain, kept, resumed)] == [0, 0, 0], kept.output + resumed.output
+    assert plain.stdout == kept.stdout == resumed.stdout
+    assert list(json.loads(plain.stdout)) == ["stage"]
+    assert "stage: " in CliRunner().invoke(app, ["status", str(tmp_path / "l.ftlm")]).stdout
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -152,6 +159,19 @@ def test_several_equations_are_kept_in_one_store_by_the_command_line(tmp_path, c
 def test_kill_loses_no_finished_work_and_changes_no_byte():
     lost, _, same = bench.kills(3)
     assert len(lost) == 3
+    assert same
+
+
+def test_kill_loses_no_finished_work_of_a_stage_and_changes_no_byte():
+    lost, _, same = bench.kills(2, of=bench.stage)
+    assert len(lost) == 2
+    assert same
+
+
+@pytest.mark.slow
+def test_fifty_kills_of_a_stage():
+    lost, ended, same = bench.kills(50, of=bench.stage)
+    print(f"\n{len(lost)} kills, {ended} searches ended, worst loss {max(lost):.3f} s")
     assert same
 
 
@@ -269,6 +289,199 @@ def test_zeros_behind_the_last_frame_are_a_torn_tail(run, whole, expected, tmp_p
         assert kept.notes == [f"4096 bytes of an unfinished write at byte {len(whole)} were dropped"]
     assert path.read_bytes() == whole
     assert bytes_of(search(run, path)) == expected
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# A stage under its order law
+
+
+STAGE = {
+    "alpha1": [1.9, 1.95, 2.0],
+    "alpha2": [1.9, 2.0],
+    "gamma1": [0.85, 0.95, 1.05],
+    "beta2": [0.0, 0.1, 0.2],
+    "mu2": [0.75, 0.85, 0.95],
+}
+
+
+@pytest.fixture(scope="module")
+def stage_run(plant, drive, with_noise):
+    return with_noise(plant("A").simulate(drive("A", samples=301), tolerance=1e-5), 1e-5, 3)
+
+
+def search_stage(run, path=None, *, structure=None, lattice=None, **options):
+    options = {"m": 64, "keep": 8, **options}
+    lattice = lattice or ftlm.Lattice(orders=STAGE)
+    return ftlm.search_orders(run, structure or ftlm.flexible_link(), lattice, store=path, **options)
+
+
+@pytest.fixture
+def small_pieces(monkeypatch):
+    """Some candidates a frame, so that a small store has many."""
+    monkeypatch.setattr("ftlm.rounds.FEWEST", 16)
+    monkeypatch.setattr("ftlm.rounds.PIECE", 0.0)
+
+
+@pytest.fixture(scope="module")
+def stage_expected(stage_run):
+    return bytes_of(search_stage(stage_run))
+
+
+@pytest.fixture
+def stage_store(stage_run, small_pieces, tmp_path):
+    """Bytes of a complete store of a stage."""
+    search_stage(stage_run, tmp_path / "whole.ftlm")
+    return (tmp_path / "whole.ftlm").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"early_stopping": False, "threads": 3},
+        {"criterion": "equation-error", "norm": "l2", "rows": "time", "keep": 30},
+        {"coefficients": "instrumental-variables", "norm": "l2", "threads": 1},
+        {"structure": ftlm.flexible_link(laws=("orders",), coupling="measured"), "coefficients": "least-squares"},
+        # More candidates than the first pass follows at a time, so that some are left early and followed further.
+        {"lattice": ftlm.Lattice(step=0.1, orders={"alpha": (1.8, 2.0)}), "coefficients": "least-squares"},
+    ],
+)
+def test_the_search_of_a_stage_with_a_store_is_the_search_without(stage_run, small_pieces, tmp_path, options):
+    path = tmp_path / "s.ftlm"
+    told = []
+    found = search_stage(stage_run, **options)
+    with_store = search_stage(stage_run, path, progress=lambda *done: told.append(done), **options)
+    assert bytes_of(with_store) == bytes_of(found)
+    assert told[-1][0] == told[-1][1]
+    assert [d for d, _ in told] == sorted(d for d, _ in told)
+    size = path.stat().st_size
+    assert bytes_of(search_stage(stage_run, path, **options)) == bytes_of(found)
+    assert bytes_of(ftlm.resume_search(path)["stage"]) == bytes_of(found)
+    assert path.stat().st_size == size
+    status = ftlm.search_status(path)["stage"]
+    assert status.complete
+    assert status.candidates == told[-1][1]
+    assert status.best == found.score
+
+
+def test_a_store_of_a_stage_cut_at_any_byte_holds_only_right_verdicts(stage_store, tmp_path):
+    path = tmp_path / "cut.ftlm"
+    path.write_bytes(stage_store)
+    right = read_store(path).sections[0].followed
+    assert len(right) > 10
+    begun = 0
+    for size in range(len(stage_store)):
+        path.write_bytes(stage_store[:size])
+        with contextlib.suppress(ftlm.DataError):
+            found = read_store(path)
+            begun = begun or size
+            assert found.sections[0].followed.items() <= right.items()
+            assert found.damage is None
+            assert found.end + found.torn == size
+    assert 0 < begun < len(stage_store) - 9 * 128
+
+
+def test_a_store_of_a_stage_flipped_at_any_byte_never_gives_a_wrong_verdict(stage_store, tmp_path):
+    path = tmp_path / "flipped.ftlm"
+    path.write_bytes(stage_store)
+    right = read_store(path).sections[0].followed
+    for at in range(len(stage_store)):
+        flipped = bytearray(stage_store)
+        flipped[at] ^= 0x10
+        path.write_bytes(flipped)
+        with contextlib.suppress(ftlm.DataError):
+            found = read_store(path)
+            assert found.sections[0].followed.items() < right.items()
+            assert found.end <= at
+
+
+def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expected, tmp_path):
+    path = tmp_path / "cut.ftlm"
+    path.write_bytes(stage_store)
+    everything = ftlm.search_status(path)["stage"].done
+    begun = len(stage_store) - everything * 9
+    done = []
+    for size in range(len(stage_store) - 40, begun // 2, -(len(stage_store) - begun // 2) // 9):
+        path.write_bytes(stage_store[:size])
+        try:
+            status = ftlm.search_status(path)["stage"]
+        except ftlm.DataError:
+            break
+        done.append(status.done)
+        assert not status.complete
+        threads = 1 + len(done) % 3
+        assert bytes_of(ftlm.resume_search(path, threads=threads)["stage"]) == stage_expected
+        assert ftlm.search_status(path)["stage"].complete
+    assert len(done) > 3
+    assert done[0] > done[-1]
+
+
+def test_a_stage_that_is_interrupted_goes_on(stage_run, stage_expected, small_pieces, tmp_path):
+    path = tmp_path / "s.ftlm"
+    for after in (1, 3, 2):
+        told = []
+
+        def stop(done, total, told=told, after=after):
+            told.append(done)
+            if len(told) == after:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            search_stage(stage_run, path, progress=stop)
+        # What was told is in the store.
+        assert ftlm.search_status(path)["stage"].done == told[-1]
+    assert bytes_of(search_stage(stage_run, path)) == stage_expected
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda run, path: search_stage(run, path, m=32), "asked is other data"),
+        (lambda run, path: search_stage(run, path, keep=9), "asked is other settings: keep = 9"),
+        (lambda run, path: search_stage(run, path, structure=ftlm.flexible_link().with_coefficients({"g1": 40.0})),
+         "asked is another equation"),
+        (lambda run, path: search_stage(run, path, lattice=ftlm.Lattice(orders=STAGE | {"alpha2": 2.0})),
+         "asked is another lattice"),
+    ],
+)  # fmt: skip
+def test_the_search_of_another_stage_is_refused(stage_run, stage_store, tmp_path, change, message):
+    path = tmp_path / "s.ftlm"
+    path.write_bytes(stage_store)
+    with pytest.raises(ftlm.DataError, match=message):
+        change(stage_run, path)
+    assert path.read_bytes() == stage_store
+
+
+def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_pieces, tmp_path):
+    """What a forger would write: whole frames, under digests that are right."""
+    from ftlm.order_search import make_job
+
+    job = make_job(stage_run, ftlm.flexible_link(), ftlm.Lattice(orders=STAGE), m=64, keep=8)
+    work, _ = job.stage_work()
+    wave = sum(last - first for _, first, last, _ in work.ready(keeps_course=True).wanted())
+    for number, (first, last, kind, message) in enumerate(
+        [
+            (0, wave + 1, 0, "are cut up otherwise"),
+            (0, wave, 9, "are no verdicts"),
+            (10**9, 10**9 + 1, 0, "it holds"),
+        ]
+    ):
+        path = tmp_path / f"{number}.ftlm"
+        with Store(path, [job.request("stage")]) as kept:
+            kept.followed(0, first, last, bytes(8 * (last - first)), bytes([kind]) * (last - first))
+        with pytest.raises(ftlm.DataError, match=message):
+            ftlm.resume_search(path)
+    path = tmp_path / "nan.ftlm"
+    with Store(path, [job.request("stage")]) as kept:
+        kept.followed(0, 0, wave, np.full(wave, np.nan).tobytes(), bytes(wave))
+    for call in (ftlm.resume_search, ftlm.search_status):
+        with pytest.raises(ftlm.DataError, match="are not those of"):
+            call(path)
+    path = tmp_path / "kinds.ftlm"
+    with Store(path, [job.request("stage")]) as kept, pytest.raises(ModelError, match="other verdicts"):
+        kept.contents.sections[0].take(Verdicts(0, 0, 2, bytes(8), b"\0"))
+    with Store(path) as kept, pytest.raises(ModelError, match="no stretch"):
+        kept.contents.sections[0].take(Rounds(0, 0, 1, ((), (0,) * 7, ())))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
