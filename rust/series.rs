@@ -258,7 +258,35 @@ impl<'a> Solver<'a> {
     }
 }
 
-/// Forward substitution within a block of one unknown, in place.
+/// Terms whose sums stay in registers while a tile of solved ones is taken off them.
+const TILE: usize = 8;
+
+/// `open[i] −= Σ_s series[start − s + i]·solved[s]`, s from 0 on; every term by the same operations as one by one.
+#[inline(always)]
+fn take_off(open: &mut [f64], series: &[f64], start: usize, solved: &[f64]) {
+    let mut at = start;
+    let mut tiles = open.chunks_exact_mut(2 * TILE);
+    for tile in &mut tiles {
+        let mut sums = [0.0; 2 * TILE];
+        sums.copy_from_slice(tile);
+        for (s, &y) in solved.iter().enumerate() {
+            let part = &series[at - s..at - s + 2 * TILE];
+            for i in 0..2 * TILE {
+                sums[i] -= part[i] * y;
+            }
+        }
+        tile.copy_from_slice(&sums);
+        at += 2 * TILE;
+    }
+    let rest = tiles.into_remainder();
+    for (s, &y) in solved.iter().enumerate() {
+        for (term, &v) in rest.iter_mut().zip(&series[at - s..]) {
+            *term -= v * y;
+        }
+    }
+}
+
+/// Forward substitution within a block of one unknown, in place, tile by tile.
 struct Substitution<'a> {
     divisor: &'a [f64],
     inverse: f64,
@@ -270,11 +298,29 @@ impl lanes::Kernel for Substitution<'_> {
 
     #[inline(always)]
     fn run(self) {
-        for k in 0..self.block.len() {
-            self.block[k] *= self.inverse;
-            let y = self.block[k];
-            let (_, later) = self.block.split_at_mut(k + 1);
-            for (rest, &v) in later.iter_mut().zip(&self.divisor[1..]) {
+        let mut open = self.block;
+        while open.len() >= TILE {
+            let (tile, later) = open.split_at_mut(TILE);
+            // Of a length known beforehand: no loop of these is left, and nothing leaves the registers.
+            let mut head = [0.0; TILE];
+            let known = self.divisor.len().min(TILE);
+            head[..known].copy_from_slice(&self.divisor[..known]);
+            let mut solved = [0.0; TILE];
+            solved.copy_from_slice(tile);
+            for k in 0..TILE {
+                solved[k] *= self.inverse;
+                for i in k + 1..TILE {
+                    solved[i] -= head[i - k] * solved[k];
+                }
+            }
+            tile.copy_from_slice(&solved);
+            take_off(later, self.divisor, TILE, &solved);
+            open = later;
+        }
+        for k in 0..open.len() {
+            open[k] *= self.inverse;
+            let y = open[k];
+            for (rest, &v) in open[k + 1..].iter_mut().zip(&self.divisor[1..]) {
                 *rest -= v * y;
             }
         }
@@ -293,11 +339,7 @@ impl lanes::Kernel for Join<'_> {
 
     #[inline(always)]
     fn run(self) {
-        for (s, &y) in self.solved.iter().enumerate() {
-            for (rest, &v) in self.open.iter_mut().zip(&self.series[self.solved.len() - s..]) {
-                *rest -= v * y;
-            }
-        }
+        take_off(self.open, self.series, self.solved.len(), self.solved);
     }
 }
 

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import threading
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +22,7 @@ from ftlm.flexible_link import INTEGER_ORDERS, PARAMETERS, flexible_link, link_m
 from ftlm.identification import Identification, identify, multi_innovation_trace
 from ftlm.models import Model, Order, write_atomically
 from ftlm.order_search import Lattice, prepare
+from ftlm.progress import Progress, Stoppable
 from ftlm.runs import Run
 from ftlm.simulation import explicit_euler
 from ftlm.validation import Comparison, Metrics, compare, metrics
@@ -47,6 +51,8 @@ RIVAL_ALPHA = (1.95, 2.0)
 AROUND = 2
 #: A curve has converged where it stays this close to its end.
 SETTLED = 0.05
+#: Seconds between two looks for Ctrl-C.
+LOOK = 0.1
 #: Differences of two errors below this share of them are none.
 ALIKE = 0.02
 
@@ -372,10 +378,12 @@ def reproduce(
     genetic
         Settings of the genetic algorithm; by default seeds 0, 1, 2, each with as many evaluations as the lattice that
         it is compared with has candidates.
-    threads, progress
-        See :func:`ftlm.search_orders`.
+    threads
+        Threads of each stage; both stages are computed at the same time unless this is 1.
     say
-        Called with a line about what happens next.
+        Called with a line about what happens next, from the thread of a stage.
+    progress
+        See :func:`ftlm.search_orders`; called from the thread of a stage.
 
     Returns
     -------
@@ -395,11 +403,45 @@ def reproduce(
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     numbers = stages_of(square, sine)
     lattice = Lattice(step=step)
-    notes: list[str] = []
-    stages = {}
-    for number in numbers:
-        stages[number] = _Work(number, square, sine, lattice, genetic, threads, say, progress, notes).stage()
+    works = {n: _Work(n, square, sine, lattice, genetic, threads, say, progress, []) for n in numbers}
+    stages = {n: work.stage() for n, work in works.items()} if len(works) == 1 or threads == 1 else side_by_side(works)
+    notes = [note for work in works.values() for note in work.notes]
     return Reproduction(square, sine, simulated, stages, lattice, tuple(dict.fromkeys(notes)))
+
+
+def side_by_side(works: Mapping[int, _Work]) -> dict[int, Stage]:
+    """All stages at once: while one fits on one core, another uses the rest."""
+    stop = threading.Event()
+    with ExitStack() as stack:
+        for work in works.values():
+            told = work.progress
+            if isinstance(told, Progress):
+                told = stack.enter_context(told.beside())
+                work.say = _both(work.say, told.name)
+            work.progress = Stoppable(told, stop)
+        pool = stack.enter_context(ThreadPoolExecutor(len(works), thread_name_prefix="ftlm-stage"))
+        under_way = {n: pool.submit(work.stage) for n, work in works.items()}
+        try:
+            # A wait without an end would not be interrupted by Ctrl-C everywhere.
+            while wait(under_way.values(), timeout=LOOK, return_when=FIRST_EXCEPTION).not_done:
+                if any(f.done() and f.exception() is not None for f in under_way.values()):
+                    break
+        except BaseException:
+            stop.set()
+            raise
+        stop.set()
+        failed = [f.exception() for f in under_way.values() if f.done() and f.exception() is not None]
+        if failed and failed[0] is not None:
+            raise failed[0]
+        return {n: f.result() for n, f in under_way.items()}
+
+
+def _both(first: Callable[[str], None], second: Callable[[str], None]) -> Callable[[str], None]:
+    def told(line: str) -> None:
+        first(line)
+        second(line)
+
+    return told
 
 
 def stages_of(square: Run, sine: Run | None) -> list[int]:

@@ -2,13 +2,15 @@
 
 import json
 import math
+import signal
+import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import ftlm
-from ftlm import printed
+from ftlm import DataError, printed
 from ftlm.report.reproduction import reproduction_text
 from ftlm.reproduction import claims, settled_at, stages_of, table_3_coefficients
 from test_cli import ftlm_command
@@ -293,3 +295,33 @@ def test_stages_are_found_by_their_signals(reproduction):
     assert stages_of(only, reproduction.sine) == [1]
     with pytest.raises(ftlm.DataError, match="both runs need the same names"):
         stages_of(reproduction.square, only)
+
+
+def test_ctrl_c_ends_both_stages(reproduction):
+    started = []
+
+    def say(line):
+        started.append(line)
+        if len(started) == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    before = threading.active_count()
+    with pytest.raises(KeyboardInterrupt):
+        ftlm.reproduce(reproduction.square, reproduction.sine, say=say)
+    assert threading.active_count() == before
+    assert len(started) < 20
+
+
+def test_a_stage_that_fails_ends_the_other(reproduction):
+    def say(line):
+        if line.startswith("stage 2"):
+            raise DataError("enough")
+
+    with pytest.raises(DataError, match="enough"):
+        ftlm.reproduce(reproduction.square, reproduction.sine, say=say)
+
+
+@pytest.mark.slow
+def test_threads_do_not_change_a_number(reproduction):
+    one = ftlm.reproduce(step=0.25, genetic=ftlm.Genetic(seeds=(0, 1), evaluations=800), threads=1)
+    assert one.to_dict() == reproduction.to_dict()

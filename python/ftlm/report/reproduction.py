@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
@@ -694,11 +695,11 @@ def _derivative_section(found: Reproduction) -> Section:
 
 def _landscape_section(found: Reproduction) -> Section:
     figures, words = [], []
-    for stage in found.stages.values():
-        result = stage.candidates["output error"].result
-        if result is None or result.joint is None:
-            continue
-        drawn = output_error_landscape(result)
+    fits = [(stage, stage.candidates["output error"].result) for stage in found.stages.values()]
+    joint = [(stage, result) for stage, result in fits if result is not None and result.joint is not None]
+    with ThreadPoolExecutor(max(1, len(joint))) as pool:
+        landscapes = list(pool.map(output_error_landscape, [result for _, result in joint]))
+    for (stage, _), drawn in zip(joint, landscapes, strict=True):
         if drawn is not None:
             figures.append(heat_map(drawn))
             words.append(
