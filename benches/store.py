@@ -3,11 +3,17 @@
 python benches/store.py [kills] [stage] prints the time lost to each kill (the age, when the kill came, of the oldest
 finished work that is not in the store; of a stage the time since the last write) and whether the resumed tables are
 those of the uninterrupted search, byte by byte; of one equation, or of a stage under its order law.
+
+python benches/store.py [count] control-c prints how long a terminal waits for ftlm search after Ctrl-C.
 """
 
+import contextlib
 import json
+import math
 import os
+import pty
 import random
+import select
 import signal
 import subprocess
 import sys
@@ -19,6 +25,7 @@ import numpy as np
 
 import ftlm
 from ftlm.demo import demo_plant
+from ftlm.store import read_store
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 
@@ -29,6 +36,13 @@ import store
 def told(done, total):
     print(time.time(), done, flush=True)
 store.{search}(sys.argv[1], told)
+"""
+
+#: Makes its terminal the one whose Ctrl-C it gets, and becomes what it is told.
+AT_A_TERMINAL = """
+import fcntl, os, sys, termios
+fcntl.ioctl(0, termios.TIOCSCTTY, 0)
+os.execv(sys.argv[1], sys.argv[1:])
 """
 
 
@@ -106,7 +120,65 @@ def kills(count, seed=0, of=search):
     return lost, ended, same
 
 
+def control_c(arguments, path, frames):
+    """Type Ctrl-C at ftlm once its store holds so many frames: exit code, seconds until it ended, what it said."""
+    terminal, other = pty.openpty()
+    child = subprocess.Popen(
+        [sys.executable, "-c", AT_A_TERMINAL, sys.executable, "-m", "ftlm", *arguments],
+        stdin=other, stdout=other, stderr=other, start_new_session=True,
+    )  # fmt: skip
+    os.close(other)
+    said, typed = b"", None
+    while True:
+        ready, _, _ = select.select([terminal], [], [], 0.02)
+        if ready:
+            try:
+                data = os.read(terminal, 4096)
+            except OSError:  # how Linux says that the other end is closed
+                break
+            if not data:
+                break
+            said += data
+        if typed is None:
+            with contextlib.suppress(ftlm.DataError):
+                if path.exists() and rounds_in(path) >= frames:
+                    os.write(terminal, b"\x03")
+                    typed = time.monotonic()
+    code = child.wait()
+    waited = math.nan if typed is None else time.monotonic() - typed
+    os.close(terminal)
+    return code, waited, said.decode()
+
+
+def rounds_in(path):
+    """Stretches of rounds in a store, done or begun, of its first search."""
+    section = read_store(path).sections[0]
+    return len(section.done) + len(section.open)
+
+
+def interruptions(count):
+    """Seconds from Ctrl-C to the end of a search, whose store must then be whole."""
+    waits = []
+    with tempfile.TemporaryDirectory() as folder:
+        data = Path(folder) / "run.csv"
+        run().to_csv(data)
+        for number in range(count):
+            path = Path(folder) / f"{number}.ftlm"
+            call = ["search", str(data), "--structure", EQUATION, "--step", "0.02", "--m", "2048", "--initial", "rest"]
+            call += ["--coefficients", "instrumental-variables", "--store", str(path)]
+            code, waited, said = control_c(call, path, 1 + number % 3)
+            status = ftlm.search_status(path)["y"]
+            if code != 130 or status.torn or status.damage:
+                sys.exit(f"exit code {code}, {status}\n{said}")
+            waits.append(waited)
+    return waits
+
+
 if __name__ == "__main__":
+    if "control-c" in sys.argv:
+        waits = interruptions(int(sys.argv[1]) if sys.argv[1].isdigit() else 20)
+        print(f"{len(waits)} times Ctrl-C: median {sorted(waits)[len(waits) // 2]:.3f} s, worst {max(waits):.3f} s")
+        sys.exit()
     numbers = [int(a) for a in sys.argv[1:] if a.isdigit()]
     lost, ended, same = kills(*(numbers or [50]), of=stage if "stage" in sys.argv else search)
     print(f"{len(lost)} kills, {ended} searches ended between them; tables identical: {same}")

@@ -4,6 +4,8 @@
 //! the widest instructions of the machine at hand. Nothing is contracted to fused multiply-adds and no sum is
 //! reordered, so a kernel gives the same bits whether it runs inside [`widest`] or not.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use pulp::{Arch, Simd, WithSimd};
 
 /// Values that a kernel works on side by side.
@@ -33,9 +35,20 @@ impl<K: Kernel> WithSimd for Inlined<K> {
     }
 }
 
+static PORTABLE: AtomicBool = AtomicBool::new(false);
+
+/// Whether [`widest`] runs kernels as they are compiled for the oldest machine, so that tests can compare the two.
+pub fn portable(on: bool) {
+    PORTABLE.store(on, Ordering::Relaxed);
+}
+
 /// Runs a kernel with the widest vector instructions of this machine.
 pub fn widest<K: Kernel>(kernel: K) -> K::Output {
-    Arch::new().dispatch(Inlined(kernel))
+    if PORTABLE.load(Ordering::Relaxed) {
+        kernel.run()
+    } else {
+        Arch::new().dispatch(Inlined(kernel))
+    }
 }
 
 /// Σ a·b, summed in [`WIDTH`] lanes that are joined at the end.

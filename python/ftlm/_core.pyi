@@ -42,6 +42,7 @@ __all__ = [
     "output_error",
     "panic_on_purpose",
     "point_samples",
+    "portable",
     "pulse_means",
     "respond",
     "respond_with_initial",
@@ -236,6 +237,7 @@ def search(
     progress: _Progress | None,
 ) -> _Found: ...
 def panic_on_purpose(place: str) -> None: ...
+def portable(on: bool) -> None: ...
 def search_plan(
     orders: _Lattice, inputs: Sequence[bool], terms: _Initial, settings: _Options
 ) -> tuple[int, list[int]]: ...

@@ -34,7 +34,7 @@ mod _core {
 
     #[pymodule_export]
     use super::search::{
-        lattice_size, panic_on_purpose, search, search_join, search_plan, search_stage, OrderSearch, Points,
+        lattice_size, panic_on_purpose, portable, search, search_join, search_plan, search_stage, OrderSearch, Points,
         StageSearch,
     };
 

@@ -383,6 +383,12 @@ pub fn panic_on_purpose(py: Python<'_>, place: &str) -> PyResult<()> {
     }
 }
 
+/// Whether kernels run as they are compiled for the oldest machine.
+#[pyfunction]
+pub fn portable(on: bool) {
+    crate::lanes::portable(on);
+}
+
 /// (constant, weight of each free order).
 type AffineArg = (f64, Vec<f64>);
 /// (output, alpha, [(signal, order), …]).

@@ -16,6 +16,7 @@ import pytest
 import ftlm
 import ftlm.progress
 import oracles
+from ftlm import _core
 from ftlm.order_search import Settings, available_threads, check_threads
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
@@ -776,3 +777,69 @@ def test_a_share_of_candidates_that_fail_are_rows_with_a_reason(run, tmp_path, s
     assert 100 * found.pruned["singular"] == share * found.candidates
     assert found.failures == [({"nu": 0.0, "mu": 0.0}, "singular")]
     assert all(row.orders["nu"] > 0 for row in found.table)
+
+
+@pytest.mark.parametrize("share", [1, 50, 100])
+def test_a_share_of_candidates_that_diverge_are_rows_with_a_reason(tmp_path, share):
+    """R6: growth rates 5^(1/alpha) over 200 s leave the range of numbers for alpha below 1.27, and for no other."""
+    u = np.where(np.arange(2001) % 80 < 40, 1.0, -1.0)
+    growing = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": np.cumsum(u)})
+    structure = ftlm.equation("D^alpha y = 5 y + b u", initial="rest")
+    diverging = [0.6 + k / 200 for k in range(share)]
+    lattice = ftlm.Lattice(orders={"alpha": diverging + [2.0 + k / 100 for k in range(100 - share)]})
+    for early_stopping in (False, True):
+        options = {"m": 2000, "coefficients": "least-squares", "early_stopping": early_stopping}
+        for more in ({}, {"store": tmp_path / f"{early_stopping}.ftlm"}):
+            if share == 100:
+                with pytest.raises(ftlm.ModelError, match="none of 100 candidates has a finite score"):
+                    ftlm.search_orders(growing, structure, lattice, **options, **more)
+                continue
+            found = ftlm.search_orders(growing, structure, lattice, **options, **more)
+            assert len(found.table) + sum(found.pruned.values()) == found.candidates == 100
+            assert all(row.orders["alpha"] >= 2 for row in found.table)
+            assert all(reason == "diverged" and orders["alpha"] < 1.27 for orders, reason in found.failures)
+            if not early_stopping:
+                assert found.pruned["diverged"] == share
+                assert [orders["alpha"] for orders, _ in found.failures] == pytest.approx(diverging)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The same bits with and without vector instructions
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"norm": "l2"},
+        {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"},
+        {"coefficients": "instrumental-variables", "lattice": ftlm.lattice(step=0.2)},
+        {"early_stopping": False, "lattice": ftlm.lattice(step=0.2)},
+    ],
+)
+def test_the_oldest_machine_ranks_as_the_newest(run, with_noise, options):
+    """R4: the whole table and all counts, from kernels compiled for the machine at hand and for any."""
+    noisy = with_noise(run, 0.003, 1)
+    options = {"lattice": ftlm.lattice(step=0.1), "m": 256, "threads": 2, **options}
+    words = ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u", initial="rest")
+    tables = []
+    for portable in (False, True):
+        _core.portable(portable)
+        try:
+            found = ftlm.search_orders(noisy, words, **options)
+        finally:
+            _core.portable(False)
+        tables.append((found.to_dict(), found.failures))
+    assert repr(tables[0]) == repr(tables[1])
+    assert len(tables[0][0]["table"]) == 20
+
+
+def test_the_oldest_machine_ranks_a_stage_as_the_newest(drive, plant, with_noise):
+    tables = []
+    for portable in (False, True):
+        _core.portable(portable)
+        try:
+            tables.append(repr(stage_search(drive, plant, with_noise).to_dict()))
+        finally:
+            _core.portable(False)
+    assert tables[0] == tables[1]

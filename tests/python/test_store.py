@@ -8,7 +8,9 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -207,6 +209,25 @@ def test_control_c_leaves_a_store_that_goes_on(tmp_path):
     resumed = subprocess.run([sys.executable, "-m", "ftlm", "resume", path, "--json"], capture_output=True, check=True)
     plain = subprocess.run([*call, "--json"], capture_output=True, check=True)
     assert resumed.stdout == plain.stdout
+
+
+def test_control_c_at_a_terminal_ends_a_search_that_can_be_resumed(tmp_path):
+    """R3: the search gives the terminal back, exit code 130, and goes on to the same bytes."""
+    path, data = tmp_path / "s.ftlm", tmp_path / "a.csv"
+    bench.run().to_csv(data)
+    call = ["search", str(data), "--structure", EQUATION, "--step", "0.02", "--m", "2048", "--initial", "rest"]
+    call += ["--coefficients", "instrumental-variables"]
+    code, _, said = bench.control_c([*call, "--store", str(path)], path, 3)
+    assert code == 130
+    # The terminal's own echo, then what to do; nothing after it, no traceback.
+    assert said.replace("\r\n", "\n").endswith(f"ftlm: interrupted; go on with: ftlm resume {path}\n")
+    assert "Traceback" not in said
+    status = ftlm.search_status(path)["y"]
+    assert 0 < status.done < status.candidates
+    assert (status.torn, status.damage) == (0, None)
+    with Store(path) as kept:
+        assert kept.notes == []
+        assert kept.contents.sections[0].dealt == status.done
 
 
 def test_a_store_cut_at_any_byte_holds_only_right_rows_and_goes_on(run, whole, expected, tmp_path):
@@ -572,6 +593,58 @@ def test_a_limit_of_the_system_on_file_sizes_leaves_the_store_whole(run, expecte
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert path.stat().st_size == begun
     assert bytes_of(search(run, path)) == expected
+
+
+@pytest.fixture
+def folder():
+    """A folder that any user can reach."""
+    with tempfile.TemporaryDirectory() as path:
+        Path(path).chmod(0o777)
+        yield Path(path)
+
+
+@contextlib.contextmanager
+def as_nobody():
+    """Without the rights of root, to whom no folder is read-only."""
+    root = os.geteuid() == 0
+    if root:
+        os.seteuid(65534)
+    try:
+        yield
+    finally:
+        if root:
+            os.seteuid(0)
+
+
+def test_a_read_only_folder_is_an_error_and_leaves_the_store_whole(run, whole, expected, folder):
+    half = whole[: len(whole) * 2 // 3]
+    path = folder / "s.ftlm"
+    path.write_bytes(half)
+    path.chmod(0o444)
+    folder.chmod(0o555)
+    try:
+        with as_nobody():
+            with pytest.raises(ftlm.DataError, match=r"cannot be opened: Permission denied; choose another file"):
+                search(run, folder / "new.ftlm")
+            for again in (lambda: search(run, path), lambda: ftlm.resume_search(path)):
+                with pytest.raises(ftlm.DataError, match=r"cannot be opened: Permission denied; choose another file"):
+                    again()
+            assert 0 < ftlm.search_status(path)["y"].done < 19_295
+        assert [p.name for p in folder.iterdir()] == ["s.ftlm"]
+        assert path.read_bytes() == half
+        # The file may be written, but nothing beside it: damage is not salvaged without a copy of it.
+        damaged = bytearray(whole)
+        damaged[len(whole) - len(whole) // 3] ^= 4
+        path.chmod(0o666)
+        path.write_bytes(damaged)
+        with as_nobody(), pytest.raises(ftlm.DataError, match=r"s\.ftlm\.damaged.*Permission denied"):
+            ftlm.resume_search(path, salvage=True)
+        assert path.read_bytes() == damaged
+        path.write_bytes(half)
+        with as_nobody():
+            assert bytes_of(search(run, path)) == expected
+    finally:
+        folder.chmod(0o777)
 
 
 @pytest.mark.parametrize(
