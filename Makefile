@@ -66,12 +66,15 @@ wheel-test: wheel
 	$(VENV)-wheel/bin/python -m pip install --quiet --disable-pip-version-check wheels/*.whl
 	cd wheels && ../$(VENV)-wheel/bin/ftlm demo --step 0.1 -o demo
 	$(BIN)/python -m abi3audit --strict wheels/*.whl
+ifeq ($(shell uname -s),Linux)
+	$(BIN)/auditwheel show --json wheels/*.whl | $(BIN)/python tests/wheel.py
+endif
 	rm -rf $(VENV)-wheel wheels/demo
 
 # The source distribution alone builds and works, in an environment that has only pip; Rust is needed.
 sdist-test: $(VENV)/.tools
 	rm -rf sdist $(VENV)-sdist
-	. $(BIN)/activate && maturin sdist --quiet --out sdist
+	. $(BIN)/activate && maturin sdist --out sdist
 	$(PYTHON) -m venv $(VENV)-sdist
 	$(VENV)-sdist/bin/python -m pip install --quiet --disable-pip-version-check sdist/*.tar.gz
 	cd sdist && ../$(VENV)-sdist/bin/ftlm doctor

@@ -559,6 +559,10 @@ def identify(
     seeds: Seeds = None,
     evaluations: Evaluations = None,
     threads: Threads = None,
+    store: Annotated[
+        str | None,
+        typer.Option("--store", metavar="FILE", help="Keep finished order searches there; the same command goes on."),
+    ] = None,
     out: Out = None,
     report: Annotated[str | None, typer.Option("--report", metavar="HTML", help="Page to write.")] = None,
     validation: Annotated[str | None, typer.Option("--validation", metavar="FILE", help="Another run.")] = None,
@@ -576,11 +580,11 @@ def identify(
     options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
     runs = load_runs(files, sliced, **options)
     others = load_runs([validation], None, **options) if validation is not None else []
-    with Progress("searching orders", quiet=as_json) as progress:
+    with resumable(store, "the same command"), Progress("searching orders", quiet=as_json) as progress:
         found = ftlm.identify(
             runs, wanted, method=method.value, criterion=criterion.value, lattice=lattice_of(lattice, step),
             norm=norm.value, innovation_length=p, prior_covariance=k0, rows=rows.value, m=m, keep=keep,
-            genetic=genetic_of(seeds, evaluations, method.value), threads=threads, progress=progress,
+            genetic=genetic_of(seeds, evaluations, method.value), threads=threads, progress=progress, store=store,
         )  # fmt: skip
     if out is not None:
         found.model.save(out, force=force)
@@ -686,14 +690,14 @@ def show_searches(found: dict[str, SearchResult], *, as_json: bool) -> None:
 
 
 @contextlib.contextmanager
-def resumable(path: str | None) -> Iterator[None]:
+def resumable(path: str | None, how: str | None = None) -> Iterator[None]:
     """Say after Ctrl-C how to go on with a store, if there is one."""
     try:
         yield
     except KeyboardInterrupt:
         if path is None or not Path(path).exists():
             raise
-        print(f"ftlm: interrupted; go on with: ftlm resume {path}", file=sys.stderr)
+        print(f"ftlm: interrupted; go on with: {how or f'ftlm resume {path}'}", file=sys.stderr)
         raise typer.Exit(EXIT_INTERRUPTED) from None
 
 

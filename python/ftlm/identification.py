@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
@@ -20,9 +21,10 @@ from ftlm.order_search import (
     Settings,
     check_lattice,
     check_threads,
+    make_job,
     named_coefficients,
     prepare,
-    search_orders,
+    run_job,
 )
 from ftlm.output_error import NORMAL_95, FreeProblem, JointFit, fit_output_error, is_white
 from ftlm.physical import PhysicalParameter, physical_parameters
@@ -34,11 +36,13 @@ from ftlm.residuals import (
     resid,
     residual_warnings,
 )
+from ftlm.store import Store
 from ftlm.validation import Comparison, Metrics, as_runs, compare, validation_warnings
 
 if TYPE_CHECKING:
     import os
     from collections.abc import Callable, Mapping, Sequence
+    from concurrent.futures import Executor
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -377,6 +381,8 @@ def identify(
     genetic: Genetic | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
+    store: str | os.PathLike[str] | None = None,
+    executor: Executor | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
@@ -405,6 +411,12 @@ def identify(
         Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows).
     genetic
         Seeds, evaluations, population and bounds of the genetic algorithm.
+    store
+        File in which the order searches are kept: the same call goes on with them after a power cut, and
+        :func:`ftlm.resume_search` with the searches alone; see :func:`ftlm.search_orders`.
+    executor
+        Any :class:`concurrent.futures.Executor` to work for the order searches; see :func:`ftlm.search_orders`. For
+        many runs each by itself: :func:`ftlm.identify_many`.
 
     Returns
     -------
@@ -414,11 +426,13 @@ def identify(
     Raises
     ------
     DataError
-        Runs that do not fit the structure, or a constant output.
+        Runs that do not fit the structure, or a constant output; a store of other searches, in use, damaged, or that
+        cannot be written.
     ModelError
-        A method that is not known, a lattice without or with too many candidates, settings out of range.
+        A method that is not known, a lattice without or with too many candidates, settings out of range, a store or an
+        executor without an order search.
     ConvergenceError
-        Regressors that cannot be told apart at the given orders.
+        Regressors that cannot be told apart at the given orders, or an executor that has lost its workers.
     """
     found = as_runs(runs)
     if method not in METHODS:
@@ -433,6 +447,10 @@ def identify(
         raise ModelError(f"genetic settings are given, but method = {method!r}; use method='genetic'")
     estimator = "least-squares" if method in ("output-error", "genetic") else method
     settings = Settings.check(criterion, norm, estimator, innovation_length, prior_covariance, rows, keep, threads)
+    searched = bool(structure.order_names) and method not in ("output-error", "genetic")
+    if not searched and not (store is None and executor is None):
+        why = f"method {method!r} makes none" if structure.order_names else "every order here is a number"
+        raise ModelError(f"store= and executor= are for order searches, and {why}; leave them out")
     if method == "output-error":
         return _identify_output_error(found, structure, m, threads, progress)
     if method == "genetic":
@@ -441,13 +459,20 @@ def identify(
     searches: dict[str, SearchResult] = {}
     orders: dict[str, float] = {}
     if structure.order_names:
-        for name, part in structure.parts().items():
-            searches[name] = search_orders(
+        jobs = {
+            name: make_job(
                 found, part, _lattice_of(lattice, part), criterion=criterion, coefficients=method, norm=norm,
                 innovation_length=innovation_length, prior_covariance=prior_covariance, rows=rows, m=m, keep=keep,
-                threads=threads, progress=progress,
-            )  # fmt: skip
-            orders |= searches[name].orders
+                threads=1 if executor is not None and threads is None else threads, progress=progress,
+            )
+            for name, part in structure.parts().items()
+        }  # fmt: skip
+        with contextlib.ExitStack() as stack:
+            requests = [job.request(name) for name, job in jobs.items()]
+            kept = None if store is None else stack.enter_context(Store(store, requests))
+            for number, (name, job) in enumerate(jobs.items()):
+                searches[name] = run_job(job, store=kept, number=number, executor=executor)
+                orders |= searches[name].orders
     rank = 1
     if "stage" in searches and method == "instrumental-variables" and structure.coupling == "simulated":
         rank = _coupled_rank(found, structure, settings, m, searches["stage"])

@@ -76,7 +76,7 @@ def identify_many(
     progress
         Called with (runs done, runs in all).
     **options
-        Of :func:`ftlm.identify`.
+        Of :func:`ftlm.identify`, but for `store`, which keeps one identification.
 
     Returns
     -------
@@ -86,7 +86,7 @@ def identify_many(
     Raises
     ------
     ModelError
-        No runs, or something else among them.
+        No runs, or something else among them; a store.
     KeyboardInterrupt
         Ctrl-C.
     """
@@ -99,6 +99,8 @@ def identify_many(
         names.append(", ".join(r.name for r in group))
     if not items:
         raise ModelError("there are no runs; give at least one")
+    if options.get("store") is not None:
+        raise ModelError("a store keeps one identification; call identify for each run with a store of its own")
     if executor is None:
         found = []
         for item in items:

@@ -219,6 +219,17 @@ def test_spawned_processes_give_the_same_bytes_of_a_stage_and_resume(stage_run, 
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
 
 
+@pytest.mark.parametrize("laws", [(), ("orders", "coefficients")])
+def test_an_identification_by_the_lattice_shares_its_searches_out(stage_run, laws):
+    structure = ftlm.flexible_link(laws=laws, coupling="measured")
+    options = {"method": "least-squares", "lattice": ftlm.Lattice(step=0.3, alpha=(1.8, 2.0)), "m": 64, "keep": 5}
+    with ThreadPoolExecutor(2) as pool:
+        found = ftlm.identify(stage_run, structure, executor=pool, **options)
+    assert json.dumps(found.to_dict()) == json.dumps(ftlm.identify(stage_run, structure, **options).to_dict())
+    with ThreadPoolExecutor(1) as pool, pytest.raises(ModelError, match="method 'output-error' makes none"):
+        ftlm.identify(stage_run, structure, executor=pool)
+
+
 def test_of_a_stage_the_record_is_sent_once_and_tasks_are_ranges(stage_run, stage_expected):
     pool = Counting(fail={3})
     assert bytes_of(search_stage(stage_run, pool)) == stage_expected

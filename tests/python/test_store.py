@@ -506,6 +506,68 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
 
 
 # ----------------------------------------------------------------------------------------------------------------------
+# Identifications by the lattice
+
+
+@pytest.mark.parametrize(
+    ("structure", "names"),
+    [(ftlm.flexible_link(), ["stage"]), (ftlm.flexible_link(laws=(), coupling="measured"), ["theta11", "theta12"])],
+)
+def test_an_identification_keeps_its_searches(stage_run, small_pieces, tmp_path, structure, names):
+    path = tmp_path / "s.ftlm"
+    lattice = ftlm.Lattice(orders=STAGE) if names == ["stage"] else ftlm.Lattice(step=0.3, alpha=(1.8, 2.0))
+    options = {"method": "least-squares", "lattice": lattice, "m": 64, "keep": 5, "threads": 1}
+    plain = ftlm.identify(stage_run, structure, **options)
+    calls = []
+
+    def stop(done, total):
+        calls.append(done)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        ftlm.identify(stage_run, structure, store=path, progress=stop, **options)
+    assert list(ftlm.search_status(path)) == names
+    found = ftlm.identify(stage_run, structure, store=path, **options)
+    assert json.dumps(found.to_dict()) == json.dumps(plain.to_dict())
+    assert all(status.complete for status in ftlm.search_status(path).values())
+    resumed = ftlm.resume_search(path)
+    assert {n: s.to_dict() for n, s in resumed.items()} == {n: s.to_dict() for n, s in plain.searches.items()}
+
+
+def test_a_store_where_nothing_is_searched_is_refused(stage_run, tmp_path):
+    path = tmp_path / "s.ftlm"
+    known = ftlm.equation("D^1.6 theta11 = a D^0.6 theta11 + b I1")
+    for structure, method, why in (
+        (ftlm.flexible_link(), "output-error", "method 'output-error' makes none"),
+        (ftlm.flexible_link(), "genetic", "method 'genetic' makes none"),
+        (known, "least-squares", "every order here is a number"),
+    ):
+        with pytest.raises(ModelError, match=f"store= and executor= are for order searches, and {why}; leave them out"):
+            ftlm.identify(stage_run, structure, method=method, store=path)
+    with pytest.raises(ModelError, match="a store keeps one identification"):
+        ftlm.identify_many([stage_run], ftlm.flexible_link(), method="least-squares", store=path)
+    assert not path.exists()
+
+
+def test_the_command_identify_goes_on_with_its_store(tmp_path, clean_a):
+    from typer.testing import CliRunner
+
+    from ftlm.cli import app
+
+    data, path = tmp_path / "a.csv", tmp_path / "s.ftlm"
+    clean_a.to_csv(data)
+    call = ["identify", str(data), "--structure", "flexible-link:1", "--laws", "orders", "--method", "least-squares"]
+    call += ["--step", "0.25", "--m", "128", "--json"]
+    plain = CliRunner().invoke(app, call)
+    kept = CliRunner().invoke(app, [*call, "--store", str(path)])
+    os.truncate(path, path.stat().st_size * 3 // 4)
+    again = CliRunner().invoke(app, [*call, "--store", str(path)])
+    assert [r.exit_code for r in (plain, kept, again)] == [0, 0, 0], kept.output + again.output
+    assert plain.stdout == kept.stdout == again.stdout
+
+
+# ----------------------------------------------------------------------------------------------------------------------
 # What a store refuses
 
 
