@@ -119,6 +119,28 @@ pub fn respond_damped(
     system.with_initial(record, initial)
 }
 
+/// Columns of the inverse of the matrix of the equations: `[j][i]` is what a unit pulse in the error of equation i does
+/// to output j. O(n³ m log² m).
+///
+/// # Errors
+/// As [`respond`].
+pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f64>>>> {
+    let system = System::new(equations, record)?;
+    let n = equations.len();
+    let mut solver = series::Solver::new(&system.matrix)?;
+    let mut out = vec![Vec::with_capacity(n); n];
+    for i in 0..n {
+        let mut unit = vec![vec![0.0; record.m()]; n];
+        if let Some(first) = unit[i].first_mut() {
+            *first = 1.0;
+        }
+        for (row, response) in out.iter_mut().zip(solver.solve(&unit)?) {
+            row.push(response);
+        }
+    }
+    Ok(out)
+}
+
 /// Free run whose initial terms are those that bring it closest to the measured outputs.
 ///
 /// The response is linear in the initial terms, so they follow by least squares on the output error, each output

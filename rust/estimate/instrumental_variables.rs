@@ -5,12 +5,13 @@
 //! filtered by 1/D̂, which leaves about the white noise of the output, and correlated with instruments that hold no
 //! noise: the inputs and the *simulated* outputs. Both follow from the last estimate, so the step is repeated. All
 //! equations given are simulated together, from the signals that none of them has as its output; where those are
-//! measured outputs too, a clean substitute for them is asked for ([`project`] makes one).
+//! measured outputs too, a clean substitute for them is asked for ([`project`] makes one). Several equations are then
+//! refined together ([`multivariable`]).
 
 use crate::dense;
 use crate::equation::{Equation, Filter, Initial, Structure};
 use crate::error::{check_length, Error, Result};
-use crate::estimate::least_squares;
+use crate::estimate::{least_squares, multivariable};
 use crate::fft;
 use crate::fractional::block_pulse_kernel;
 use crate::regressors::Record;
@@ -92,7 +93,7 @@ pub struct Source<'a> {
 }
 
 /// Coefficients of terms, then of the initial terms record by record.
-type Solution = Vec<f64>;
+pub type Solution = Vec<f64>;
 
 /// 1/D mod z^m, or of D(ρz) with the largest ρ = e^{−γ/m}, γ = 0, 4, 8, …, that keeps it from growing.
 ///
@@ -133,7 +134,7 @@ fn read_at(rho: f64, series: &[f64]) -> Vec<f64> {
         .collect()
 }
 
-fn grows(response: &[f64]) -> bool {
+pub(crate) fn grows(response: &[f64]) -> bool {
     let (first, second) = response.split_at(response.len() / 2);
     let peak =
         |part: &[f64]| part.iter().fold(0.0_f64, |a, v| if v.is_finite() { a.max(v.abs()) } else { f64::INFINITY });
@@ -235,7 +236,10 @@ pub fn step(
     }
     let mut covariance = Vec::new();
     if with_covariance {
-        let meat = long_run(&filtered, &x, k);
+        let mut meat = vec![0.0; k * k];
+        for part in &filtered {
+            long_run(&part.scores(&x), &part.places, &mut meat, k);
+        }
         let n = free.len();
         covariance = vec![0.0; n * n];
         for a in 0..n {
@@ -261,32 +265,33 @@ struct Filtered {
     target: Vec<f64>,
 }
 
-/// Long-run covariance of Σ ψ e at a solution, with Bartlett weights (doi:10.2307/1913610): what the filter leaves
-/// behind is not white where other measured outputs enter the equation.
-#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-fn long_run(filtered: &[Filtered], x: &[f64], k: usize) -> Vec<f64> {
-    let mut meat = vec![0.0; k * k];
-    for part in filtered {
-        let m = part.target.len();
-        let mut rest = part.target.clone();
-        for (column, &place) in part.phi.iter().zip(&part.places) {
+impl Filtered {
+    /// ψ e at a solution, a row each instrument.
+    fn scores(&self, x: &[f64]) -> Vec<Vec<f64>> {
+        let mut rest = self.target.clone();
+        for (column, &place) in self.phi.iter().zip(&self.places) {
             rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
         }
-        let scores: Vec<Vec<f64>> =
-            part.psi.iter().map(|p| p.iter().zip(&rest).map(|(p, e)| p * e).collect()).collect();
-        let lags = ((4.0 * libm::cbrt(m as f64)) as usize).min(m - 1);
-        for (left, &a) in scores.iter().zip(&part.places) {
-            for (right, &b) in scores.iter().zip(&part.places) {
-                meat[a * k + b] += dot(left, right);
-                for lag in 1..=lags {
-                    let weight = 1.0 - lag as f64 / (lags + 1) as f64;
-                    let both = dot(&left[lag..], &right[..m - lag]) + dot(&left[..m - lag], &right[lag..]);
-                    meat[a * k + b] += weight * both;
-                }
+        self.psi.iter().map(|p| p.iter().zip(&rest).map(|(p, e)| p * e).collect()).collect()
+    }
+}
+
+/// Adds the long-run covariance of the sums of scores to a k × k matrix, with Bartlett weights
+/// (doi:10.2307/1913610): what the filter leaves behind is not white where other measured outputs enter the equation.
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub(crate) fn long_run(scores: &[Vec<f64>], places: &[usize], meat: &mut [f64], k: usize) {
+    let m = scores.first().map_or(0, Vec::len);
+    let lags = ((4.0 * libm::cbrt(m as f64)) as usize).min(m.saturating_sub(1));
+    for (left, &a) in scores.iter().zip(places) {
+        for (right, &b) in scores.iter().zip(places) {
+            meat[a * k + b] += dot(left, right);
+            for lag in 1..=lags {
+                let weight = 1.0 - lag as f64 / (lags + 1) as f64;
+                let both = dot(&left[lag..], &right[..m - lag]) + dot(&left[..m - lag], &right[lag..]);
+                meat[a * k + b] += weight * both;
             }
         }
     }
-    meat
 }
 
 /// First m terms of a product of two cached series.
@@ -296,7 +301,7 @@ fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Vec<f64> 
     out
 }
 
-fn dot(a: &[f64], b: &[f64]) -> f64 {
+pub(crate) fn dot(a: &[f64], b: &[f64]) -> f64 {
     // Four sums: one alone would wait for itself.
     let mut sums = [0.0; 4];
     let (left, right) = (a.chunks_exact(4), b.chunks_exact(4));
@@ -356,7 +361,7 @@ pub fn refine(
     Ok((solution, settings.iterations, false))
 }
 
-fn unmoved(before: &[f64], after: &[f64], terms: usize, tolerance: f64) -> bool {
+pub(crate) fn unmoved(before: &[f64], after: &[f64], terms: usize, tolerance: f64) -> bool {
     let largest = after[..terms].iter().fold(0.0_f64, |a, v| a.max(v.abs()));
     before[..terms].iter().zip(after).all(|(a, b)| (a - b).abs() <= tolerance * b.abs().max(1e-9 * largest))
 }
@@ -397,9 +402,12 @@ pub fn fit(
             Err(error) => failure = failure.or(Some(error)),
         }
     }
-    let Some(ended) = best else {
+    let Some(mut ended) = best else {
         return Err(failure.unwrap_or_else(|| Error::Diverged { what: "free run of every start".into(), index: 0 }));
     };
+    if structures.len() > 1 {
+        problem.refine_together(&mut ended, settings)?;
+    }
     let estimates = ended
         .solutions
         .into_iter()
@@ -417,7 +425,7 @@ pub fn fit(
 }
 
 /// (record, position) of the initial terms left out.
-type Dropped = Vec<(usize, usize)>;
+pub type Dropped = Vec<(usize, usize)>;
 
 struct Problem<'a> {
     records: &'a [Record],
@@ -431,6 +439,7 @@ struct Problem<'a> {
 struct Ended {
     error: f64,
     solutions: Vec<Solution>,
+    dropped: Vec<Dropped>,
     covariances: Vec<Vec<f64>>,
     iterations: usize,
     converged: bool,
@@ -501,7 +510,8 @@ impl Problem<'_> {
             }
             let (next, covariances) = self.step(&solutions, &responses, dropped, last, &mut scratch)?;
             if last {
-                return Ok(Ended { error, solutions, covariances, iterations, converged, damped });
+                let dropped = dropped.to_vec();
+                return Ok(Ended { error, solutions, dropped, covariances, iterations, converged, damped });
             }
             iterations += 1;
             converged = solutions
@@ -510,6 +520,30 @@ impl Problem<'_> {
                 .zip(self.structures)
                 .all(|((a, b), s)| unmoved(a, b, s.terms.len(), settings.tolerance));
             solutions = next;
+        }
+    }
+
+    /// From where the equations one by one ended, all of them together ([`multivariable`]); left alone where that
+    /// cannot be done or does not stand still.
+    fn refine_together(&self, ended: &mut Ended, settings: Settings) -> Result<()> {
+        let problem = multivariable::Problem {
+            records: self.records,
+            clean: self.clean,
+            structures: self.structures,
+            fixed: self.fixed,
+            exponents: self.exponents,
+            dropped: &ended.dropped,
+        };
+        match problem.refine(&ended.solutions, settings) {
+            Ok(Some(found)) => {
+                ended.iterations += found.iterations;
+                ended.converged = found.converged;
+                ended.solutions = found.solutions;
+                ended.covariances = found.covariances;
+                Ok(())
+            }
+            Ok(None) | Err(Error::Singular { .. }) => Ok(()),
+            Err(error) => Err(error),
         }
     }
 

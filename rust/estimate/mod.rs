@@ -3,5 +3,6 @@
 pub mod instrumental_variables;
 pub mod least_squares;
 pub mod multi_innovation;
+pub mod multivariable;
 pub mod output_error;
 pub mod streaming;

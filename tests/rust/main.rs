@@ -13,6 +13,7 @@ mod instrumental_variables;
 mod kernels;
 mod means;
 mod metrics;
+mod multivariable;
 mod output_error;
 mod plants;
 mod points;
