@@ -1,8 +1,8 @@
 """Truth under noise, measured: bias against step, Monte-Carlo of the joint fit, the three-term table, random plants.
 
 ``python benches/truth.py WHAT [--seeds 100] [--plants A,A2,3T] [--levels 20,40,60,80] [--outputs theta11,…] [--write]``
-prints tables; ``--write`` appends them to benches/RESULTS.md. WHAT is bias, intervals, orders, three-terms,
-random-plants, arm or heating. Seeds are 0 to ``--seeds`` less one, and are never changed.
+prints tables; ``--write`` appends them to benches/RESULTS.md. WHAT is bias, intervals, instruments, orders,
+three-terms, random-plants, arm or heating. Seeds are 0 to ``--seeds`` less one, and are never changed.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 import plants
+from ftlm.demo import demo_plant
 from ftlm.output_error import Attempt, FreeProblem, descend, experiment, fit_output_error
 
 if TYPE_CHECKING:
@@ -169,15 +170,40 @@ def random_plants(seeds: int) -> Iterator[str]:
 
 def shortfall(found: ftlm.Model, best: ftlm.Model, clean: ftlm.Run) -> float:
     """Points of fit to the noise-free outputs that one model has less than another; of the worst output."""
+    reached, wanted = clean_fits(found, clean), clean_fits(best, clean)
+    return max(wanted[n] - reached[n] for n in clean.outputs)
 
-    def fits(model: ftlm.Model) -> np.ndarray:
-        simulated = model.simulate(clean, tolerance=1e-6)
-        return np.array([
-            100 * (1 - np.linalg.norm(simulated[n] - clean[n]) / np.linalg.norm(clean[n] - clean[n].mean()))
-            for n in clean.outputs
-        ])  # fmt: skip
 
-    return float(np.max(fits(best) - fits(found)))
+def instruments(seeds: int) -> Iterator[str]:
+    """Coefficients of Plant A by instrumental variables at the true orders, and fit of their coupled free run."""
+    structure, clean = plants.structure("A"), plants.clean_run("A")
+    true = structure.with_orders({n: v for n, v in plants.truth("A").items() if n in structure.order_names})
+    exact = demo_plant(1).coefficients
+    for level in (60, 40, 20):
+        found = [ftlm.identify(plants.noisy_run("A", level, s), true, method="instrumental-variables")
+                 for s in range(seeds)]  # fmt: skip
+        for name, value in exact.items():
+            values = np.array([f.coefficients[name] for f in found])
+            errors = np.array([f.standard_errors[name] for f in found])
+            z = (values - value) / errors
+            yield (
+                f"A {level} dB, {seeds} seeds: {name} {values.mean():.5g} ± {values.std():.2g} (truth {value:.5g}), "
+                f"standard error {np.median(errors):.2g}, mean z {z.mean():.2f}, |z| < 1.96 in "
+                f"{100 * np.mean(np.abs(z) < NORMAL_95):.0f} %"
+            )
+        fits = np.array([list(clean_fits(f.model, clean).values()) for f in found])
+        words = ", ".join(f"{o} {m:.3f} % (least {w:.3f})" for o, m, w in zip(
+            clean.outputs, np.median(fits, axis=0), fits.min(axis=0), strict=True))  # fmt: skip
+        yield f"A {level} dB, {seeds} seeds: median fit of the coupled free run to the clean outputs {words}"
+
+
+def clean_fits(model: ftlm.Model, clean: ftlm.Run) -> dict[str, float]:
+    """Fit of a model's free run to noise-free outputs."""
+    simulated = model.simulate(clean, tolerance=1e-6)
+    return {
+        n: 100 * (1 - float(np.linalg.norm(simulated[n] - clean[n]) / np.linalg.norm(clean[n] - clean[n].mean())))
+        for n in clean.outputs
+    }  # fmt: skip
 
 
 #: Values of the orders around the truth; every true order is one of them.
@@ -341,7 +367,8 @@ def main() -> None:
     """Measure and print; append with ``--write``."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "what", choices=("bias", "intervals", "orders", "three-terms", "random-plants", "arm", "heating")
+        "what",
+        choices=("bias", "intervals", "instruments", "orders", "three-terms", "random-plants", "arm", "heating"),
     )
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--plants", default="A,A2,3T")
@@ -353,6 +380,7 @@ def main() -> None:
     rows: Iterable[object] = {
         "bias": lambda: bias(names),
         "intervals": lambda: intervals(names, [float(x) for x in arguments.levels.split(",")], arguments.seeds),
+        "instruments": lambda: instruments(arguments.seeds),
         "orders": lambda: orders([n for n in names if n in LATTICES], arguments.seeds),
         "three-terms": lambda: three_terms_table(arguments.seeds),
         "random-plants": lambda: random_plants(arguments.seeds),

@@ -53,6 +53,12 @@ if TYPE_CHECKING:
 __all__ = ["Identification", "Trace", "identify", "multi_innovation_trace"]
 
 METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
+#: Most pulses a run on which instrumental variables end where m is not given.
+MOST_PULSES = 1 << 14
+#: Fewest pulses on which the effect of the step is looked at.
+LEAST_PULSES = 32
+#: Standard errors that the step may move a coefficient by before it is said.
+STEP_BIAS = 0.5
 #: Most steps of refined instrumental variables, and the relative change of a coefficient that ends them.
 REFINEMENTS = 40
 STILL = 1e-8
@@ -408,7 +414,8 @@ def identify(
     innovation_length, prior_covariance, rows
         p, K0 and the coordinates of paper (42)-(44). p is a weight of the data against the prior, nothing else.
     m
-        Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows).
+        Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows). Instrumental variables
+        search on these and, without m, end on all samples (at most 16 384 pulses).
     genetic
         Seeds, evaluations, population and bounds of the genetic algorithm.
     store
@@ -478,7 +485,11 @@ def identify(
         rank = _coupled_rank(found, structure, settings, m, searches["stage"])
         orders = searches["stage"].table[rank - 1].orders
     structure_at = structure.with_orders(orders)
+    if m is None and method == "instrumental-variables":
+        # Coefficients without the bias of noise show that of the step: all samples, once the orders are found.
+        m = min(MOST_PULSES, *(run.length - 1 for run in found))
     coefficients, pulled, pulses, initial, spread = _estimate(found, structure_at, settings, m)
+    pulled += _step_bias(found, structure_at, settings, pulses, coefficients, spread)
     about: dict[str, str | float | int | bool | None] = {
         "method": method, "runs": ", ".join(r.name for r in found), **settings.to_dict(),
     }  # fmt: skip
@@ -819,6 +830,37 @@ def _instrumental(structure: Structure, records: list[Record]) -> tuple[dict[str
             pairs = zip(free, spread.tolist(), strict=True)
             errors |= {t.coefficient: s / abs(t.factor) for t, s in pairs if isinstance(t.coefficient, str)}
     return coefficients, errors, warnings
+
+
+def _step_bias(
+    runs: Sequence[Run],
+    structure: Structure,
+    settings: Settings,
+    m: int,
+    coefficients: Mapping[str, float],
+    errors: Mapping[str, float],
+) -> list[str]:
+    """Say so where the step of the pulses moves coefficients by more than noise does.
+
+    The scheme is of second order, so of the move from twice the step a third is left (Richardson).
+    """
+    if not errors or m < 2 * LEAST_PULSES:
+        return []
+    try:
+        coarser, *_ = _estimate(runs, structure, settings, m // 2)
+    except FtlmError:
+        # A step that leaves no estimate tells nothing about half of it.
+        return []
+    moved = {n: abs(coarser[n] - coefficients[n]) / 3 / e for n, e in errors.items() if e > 0}
+    worst = max(moved, key=lambda n: moved[n], default="")
+    if not worst or moved[worst] <= STEP_BIAS:
+        return []
+    carried = min(run.length - 1 for run in runs)
+    finer = f"raise m, up to {carried}, or " if m < carried else ""
+    return [
+        f"at {m} pulses the step alone moves coefficient {worst} by about {moved[worst]:.2g} standard errors, which do "
+        f"not count it; {finer}use method='output-error', which refines the step"
+    ]
 
 
 def _pulled(output: str, raw: list[float], weak: list[float], settings: Settings) -> list[str]:

@@ -391,22 +391,44 @@ pub fn fit(
     let problem = Problem { records, clean: &clean, structures, fixed, exponents: &exponents };
     let mut best: Option<Ended> = None;
     let mut failure = None;
+    // Ends of all equations together, by cost; from one start the equations one by one may come out unstable, from
+    // another not.
+    let mut together: Option<multivariable::Ended> = None;
     for multiple in PREFILTERS {
         // A start that cannot be made, or whose instruments fail, leaves the others.
-        match problem
-            .start(initial, multiple)
-            .and_then(|(solutions, dropped)| problem.iterate(solutions, &dropped, settings))
-        {
-            Ok(ended) if best.as_ref().is_none_or(|b| ended.error < b.error) => best = Some(ended),
-            Ok(_) => {}
+        match problem.start(initial, multiple).and_then(|(solutions, dropped)| {
+            let ended = problem.iterate(solutions.clone(), &dropped, settings)?;
+            Ok((solutions, dropped, ended))
+        }) {
+            Ok((start, dropped, ended)) => {
+                if structures.len() > 1 {
+                    for from in [&ended.solutions, &start] {
+                        let Some(found) = problem.together(from, &dropped, settings)? else { continue };
+                        if together.as_ref().is_none_or(|t| found.cost < t.cost) {
+                            together = Some(found);
+                        }
+                        break;
+                    }
+                }
+                if best.as_ref().is_none_or(|b| ended.error < b.error) {
+                    best = Some(ended);
+                }
+            }
             Err(error) => failure = failure.or(Some(error)),
         }
     }
     let Some(mut ended) = best else {
         return Err(failure.unwrap_or_else(|| Error::Diverged { what: "free run of every start".into(), index: 0 }));
     };
-    if structures.len() > 1 {
-        problem.refine_together(&mut ended, settings)?;
+    if let Some(found) = together {
+        ended = Ended {
+            error: ended.error,
+            solutions: found.solutions,
+            covariances: found.covariances,
+            iterations: ended.iterations + found.iterations,
+            converged: found.converged,
+            damped: false,
+        };
     }
     let estimates = ended
         .solutions
@@ -439,7 +461,6 @@ struct Problem<'a> {
 struct Ended {
     error: f64,
     solutions: Vec<Solution>,
-    dropped: Vec<Dropped>,
     covariances: Vec<Vec<f64>>,
     iterations: usize,
     converged: bool,
@@ -510,8 +531,7 @@ impl Problem<'_> {
             }
             let (next, covariances) = self.step(&solutions, &responses, dropped, last, &mut scratch)?;
             if last {
-                let dropped = dropped.to_vec();
-                return Ok(Ended { error, solutions, dropped, covariances, iterations, converged, damped });
+                return Ok(Ended { error, solutions, covariances, iterations, converged, damped });
             }
             iterations += 1;
             converged = solutions
@@ -523,27 +543,24 @@ impl Problem<'_> {
         }
     }
 
-    /// From where the equations one by one ended, all of them together ([`multivariable`]); left alone where that
-    /// cannot be done or does not stand still.
-    fn refine_together(&self, ended: &mut Ended, settings: Settings) -> Result<()> {
+    /// All equations together from a start ([`multivariable`]); None where that cannot be done.
+    fn together(
+        &self,
+        start: &[Solution],
+        dropped: &[Dropped],
+        settings: Settings,
+    ) -> Result<Option<multivariable::Ended>> {
         let problem = multivariable::Problem {
             records: self.records,
             clean: self.clean,
             structures: self.structures,
             fixed: self.fixed,
             exponents: self.exponents,
-            dropped: &ended.dropped,
+            dropped,
         };
-        match problem.refine(&ended.solutions, settings) {
-            Ok(Some(found)) => {
-                ended.iterations += found.iterations;
-                ended.converged = found.converged;
-                ended.solutions = found.solutions;
-                ended.covariances = found.covariances;
-                Ok(())
-            }
-            Ok(None) | Err(Error::Singular { .. }) => Ok(()),
-            Err(error) => Err(error),
+        match problem.refine(start, settings) {
+            Err(Error::Singular { .. }) => Ok(None),
+            other => other,
         }
     }
 

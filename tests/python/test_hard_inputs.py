@@ -123,7 +123,9 @@ def test_a_lattice_of_one_point_is_that_point(method):
     assert one.coefficients == known.coefficients
     assert one.standard_errors == known.standard_errors
     assert set(one.standard_errors) == {"a1", "a0", "b0"}
-    assert one.warnings == known.warnings == ()
+    assert one.warnings == known.warnings
+    # Instrumental variables do not refine the step, and say what it does.
+    assert [w for w in one.warnings if "the step alone moves" not in w] == []
 
 
 @pytest.mark.parametrize(("noise", "fit"), [(1.0, 43), (3.2, 9)])
