@@ -12,7 +12,7 @@ import pytest
 import ftlm
 from ftlm import DataError, printed
 from ftlm.report.reproduction import reproduction_text
-from ftlm.reproduction import claims, settled_at, stages_of, table_3_coefficients
+from ftlm.reproduction import claims, settled_at, stages_of, table_3_coefficients, thinned
 from test_cli import ftlm_command
 from test_derivation import STIFFNESS_PAIRS, TABLE_3
 from test_oracles import PRINTED_CRITERIA, PRINTED_RIVALS
@@ -235,6 +235,44 @@ def test_measured_runs_of_one_stage(reproduction, tmp_path):
     assert "true value" not in page
     same = reproduction.stages[2].candidates["p = 7"].estimation.output_error["theta21"].to_dict()
     assert document["stages"]["2"]["models"]["p = 7"]["estimation"]["output_error"]["theta21"] == pytest.approx(same)
+
+
+def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypatch):
+    own = ["I2", "theta21", "theta22"]
+    moving = reproduction.square.select(own).slice(1.3, 7.3)
+    other = reproduction.sine.select(own).slice(0.7, 6.7)
+    monkeypatch.setattr("ftlm.reproduction.MOST_ROWS", 2000)
+    monkeypatch.setattr("ftlm.reproduction.JOINT_ROWS", 1000)
+    found = ftlm.reproduce(moving, other, step=0.5)
+    words = " ".join(found.notes)
+    assert "does not start at rest: every model is fitted and compared with initial terms" in words
+    assert "Tables 6 and 7 and Figure 11 are left out" in words
+    assert f"has {moving.length} rows: joint fits by output error take one of 3 rows, 0.006 s apart" in words
+    stage = found.stages[2]
+    assert stage.rivals == {}
+    # Every model is compared on the same pulses, thinned or not.
+    assert {c.estimation.m for c in stage.candidates.values()} == {stage.candidates["p = 7"].estimation.m}
+    assert {c.validation.m for c in stage.candidates.values()} == {stage.candidates["p = 7"].validation.m}
+    joint = stage.candidates["output error"].result
+    assert joint.task.runs[0].length == moving.length // 3
+    assert min(f.fit for f in stage.candidates["output error"].estimation.output_error.values()) > 90
+    text = found.page(tmp_path / "moving.html").read_text()
+    assert "does not start at rest" in text
+    assert "one of 3 rows" in text
+    assert "Table 5." in text
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_thinning_keeps_the_means_of_held_currents_and_the_rows_of_the_rest():
+    n = np.arange(14.0)
+    run = ftlm.Run.from_arrays(
+        step=0.5, inputs={"u": n, "v": n * n}, outputs={"y": -n}, intersample={"v": "foh"}, units={"y": "deg"}
+    )
+    found = thinned(run, 4)
+    assert found["u"].tolist() == [1.5, 5.5, 9.5]
+    assert found["v"].tolist() == [0.0, 16.0, 64.0]
+    assert found["y"].tolist() == pytest.approx(np.deg2rad([0.0, -4.0, -8.0]))
+    assert (found.step, found.units["y"], found.intersample["v"]) == (2.0, "rad", "foh")
 
 
 def test_without_a_second_run_nothing_is_validated_and_the_page_says_so(reproduction, tmp_path):

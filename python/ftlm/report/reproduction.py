@@ -428,7 +428,7 @@ def fit_chart(
 
 def _beside_integer(stage: Stage, output: str, *, sine: bool) -> list[tuple[str, Comparison]]:
     last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
-    labels = (("integer, manual", "integer, Euler"), (last, last), ("output error", "output error"))
+    labels = (("integer, manual", stage.manual), (last, last), ("output error", "output error"))
     found = []
     for shown, label in labels:
         candidate = stage.candidates[label]
