@@ -677,7 +677,7 @@ class StoreStatus:
 def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
     """How far the searches of a store are; it may be in use.
 
-    Of a stage under its order law the tables are laid out again, which takes seconds for a fine lattice.
+    Of an unfinished stage under its order law the tables are laid out again, which takes seconds for a fine lattice.
 
     Parameters
     ----------

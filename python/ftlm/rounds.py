@@ -27,7 +27,7 @@ from ftlm.errors import ConvergenceError, FtlmError, ModelError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ftlm.store import Part, Place, Section, Store
+    from ftlm.store import Joined, Part, Place, Section, Store
 
     Checkpoint = tuple[Place, Part]
     #: Equation, first candidate, the one behind the last, limit.
@@ -332,8 +332,10 @@ def do_stage(
     ModelError
         A store that holds other candidates.
     """
-    search = work.ready(keeps_course=True)
     section = None if store is None else store.contents.sections[number]
+    if section is not None and section.joined is not None:
+        return _table(work, section.joined)
+    search = work.ready(keeps_course=True)
     pace = Pace(fewest=FEWEST)
     key, first, pruned = work.key, 0, 0
     while spans := search.wanted():
@@ -366,7 +368,10 @@ def do_stage(
         raise ModelError(f"it holds {section.dealt} candidates of {first}")
     if progress is not None:
         progress(first, first, 0)
-    return search.outcome()
+    found = search.outcome()
+    if store is not None:
+        store.joined(number, found)
+    return found
 
 
 def stage_state(work: StageWork, section: Section, threads: int) -> tuple[int, float | None]:
@@ -377,6 +382,8 @@ def stage_state(work: StageWork, section: Section, threads: int) -> tuple[int, f
     ModelError
         A store that holds other candidates.
     """
+    if section.joined is not None:
+        return section.dealt, _table(work, section.joined)["rows"][0][1]
     search = work.ready(keeps_course=True)
     first = 0
     while spans := search.wanted():
@@ -387,6 +394,30 @@ def stage_state(work: StageWork, section: Section, threads: int) -> tuple[int, f
         search.take(*_whole(held, first, end), threads)
         first = end
     return search.state()
+
+
+def _table(work: StageWork, joined: Joined) -> _core._FoundStage:
+    """The table of a finished search as the core gives it.
+
+    Raises
+    ------
+    ModelError
+        One of another search.
+    """
+    widths = [len(terms) for _, _, terms in work.laws]
+    dealt = sum(v for k, v in joined.counts.items() if k != "candidates")
+    sound = (
+        set(joined.counts) == {"candidates", "kept", "beaten", "bound", "stopped early", "singular", "diverged"}
+        and dealt == joined.counts["candidates"]
+        and 0 < len(joined.rows) == joined.counts["kept"] <= work.settings[5]
+        and all(len(free) == len(work.axes) for _, free, _ in joined.failures)
+        and all(len(free) == len(work.axes) for _, _, free, _ in joined.rows)
+        and all([len(p[3]) for p in parts] == widths for _, _, _, parts in joined.rows)
+    )
+    if not sound:
+        raise ModelError("its table is of another search")
+    found = msgspec.to_builtins({"rows": joined.rows, "counts": joined.counts, "failures": joined.failures})
+    return cast("_core._FoundStage", {**found, "distinct": []})
 
 
 def _followed(

@@ -12,9 +12,9 @@ length bytes          payload: one MessagePack map whose key ``type`` says what 
 The first payload holds the requests (:class:`Requests`): everything a search is computed from, so that it can be
 resumed without the files it came from. Then come, for a search of one equation, :class:`Progress` (a stretch of rounds,
 half done) and :class:`Rounds` (a stretch, done); for one under an order law :class:`Verdicts` (a stretch of candidates,
-done). Frames are only appended; a digest covers all frames before its own, so that none can be lost, moved
-or changed unseen. A frame that reaches to or past the end of the file and is not whole is what a power cut leaves: it
-is dropped. Any other frame that is not whole is damage, reported with its offset.
+done) and at its end :class:`Joined` (its table). Frames are only appended; a digest covers all frames before its own,
+so that none can be lost, moved or changed unseen. A frame that reaches to or past the end of the file and is not whole
+is what a power cut leaves: it is dropped. Any other frame that is not whole is damage, reported with its offset.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import time
 import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 import numpy as np
@@ -41,9 +41,21 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from types import TracebackType
 
+    from ftlm import _core
     from ftlm.records import Record
 
-__all__ = ["MAGIC", "Contents", "Progress", "Request", "Requests", "Rounds", "Store", "Verdicts", "read_store"]
+__all__ = [
+    "MAGIC",
+    "Contents",
+    "Joined",
+    "Progress",
+    "Request",
+    "Requests",
+    "Rounds",
+    "Store",
+    "Verdicts",
+    "read_store",
+]
 
 MAGIC = b"ftlm search store 1\n"
 HEAD = struct.Struct("<II")
@@ -172,7 +184,23 @@ class Verdicts(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="ver
     kinds: bytes
 
 
-Frame = Progress | Rounds | Verdicts
+#: Index, score, free orders, and of each equation score, alpha, orders, coefficients, initial terms by record.
+StagePart = tuple[float, float, tuple[float, ...], tuple[float, ...], tuple[tuple[float, ...], ...]]
+StageRow = tuple[Natural, float, tuple[float, ...], tuple[StagePart, ...]]
+#: Index, free orders, reason.
+StageFailure = tuple[Natural, tuple[float, ...], Literal["singular", "diverged"]]
+
+
+class Joined(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="joined"):
+    """What a search under an order law came to: table, counts by reason, first failures."""
+
+    search: Natural
+    rows: tuple[StageRow, ...]
+    counts: dict[str, Natural]
+    failures: tuple[StageFailure, ...]
+
+
+Frame = Progress | Rounds | Verdicts | Joined
 
 _decoder = msgspec.msgpack.Decoder(Requests | Frame)
 _encoder = msgspec.msgpack.Encoder()
@@ -205,6 +233,7 @@ class Section:
     done: dict[int, tuple[int, Part]] = field(default_factory=dict)
     open: dict[int, Half] = field(default_factory=dict)
     followed: dict[int, tuple[int, bytes, bytes]] = field(default_factory=dict)
+    joined: Joined | None = None
     _firsts: list[int] = field(default_factory=list)
 
     def take(self, frame: Frame) -> None:
@@ -215,6 +244,11 @@ class Section:
         ModelError
             Rounds that are there already, a stretch that is none, or one of another kind of search.
         """
+        if self.joined is not None or (isinstance(frame, Joined) and not self.law):
+            raise ModelError("a table stands where none belongs")
+        if isinstance(frame, Joined):
+            self.joined = frame
+            return
         stretches: dict[int, Any] = self.followed if self.law else self.done
         if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
             raise ModelError(f"rounds {frame.first} to {frame.last} are no stretch")
@@ -612,6 +646,17 @@ class Store:
             As writing.
         """
         self._append([Verdicts(search, first, last, values, kinds)])
+
+    def joined(self, search: int, found: _core._FoundStage) -> None:
+        """Append the table of a search under an order law.
+
+        Raises
+        ------
+        DataError
+            As writing.
+        """
+        frame = {"type": "joined", "search": search, **{k: found[k] for k in ("rows", "counts", "failures")}}
+        self._append([msgspec.convert(frame, Joined)])
 
     def close(self) -> None:
         """Write what waits and give the lock back."""

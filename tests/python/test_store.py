@@ -12,6 +12,7 @@ import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -19,7 +20,7 @@ import ftlm
 import store as bench
 from ftlm import _core
 from ftlm.errors import ModelError
-from ftlm.store import MAGIC, Rounds, Store, Verdicts, read_store
+from ftlm.store import MAGIC, Joined, Rounds, Store, Verdicts, read_store
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 COARSE = ftlm.lattice(step=0.1)
@@ -385,34 +386,36 @@ def test_the_search_of_a_stage_with_a_store_is_the_search_without(stage_run, sma
     assert status.best == found.score
 
 
-def test_a_store_of_a_stage_cut_at_any_byte_holds_only_right_verdicts(stage_store, tmp_path):
+def test_a_store_of_a_stage_cut_anywhere_holds_only_right_verdicts(stage_store, tmp_path):
     path = tmp_path / "cut.ftlm"
     path.write_bytes(stage_store)
     right = read_store(path).sections[0].followed
     assert len(right) > 10
     begun = 0
-    for size in range(len(stage_store)):
+    for size in range(0, len(stage_store), 7):
         path.write_bytes(stage_store[:size])
         with contextlib.suppress(ftlm.DataError):
             found = read_store(path)
             begun = begun or size
             assert found.sections[0].followed.items() <= right.items()
+            assert found.sections[0].joined is None
             assert found.damage is None
             assert found.end + found.torn == size
     assert 0 < begun < len(stage_store) - 9 * 128
 
 
-def test_a_store_of_a_stage_flipped_at_any_byte_never_gives_a_wrong_verdict(stage_store, tmp_path):
+def test_a_store_of_a_stage_flipped_anywhere_never_gives_a_wrong_verdict(stage_store, tmp_path):
     path = tmp_path / "flipped.ftlm"
     path.write_bytes(stage_store)
     right = read_store(path).sections[0].followed
-    for at in range(len(stage_store)):
+    for at in range(0, len(stage_store), 7):
         flipped = bytearray(stage_store)
         flipped[at] ^= 0x10
         path.write_bytes(flipped)
         with contextlib.suppress(ftlm.DataError):
             found = read_store(path)
-            assert found.sections[0].followed.items() < right.items()
+            assert found.sections[0].followed.items() <= right.items()
+            assert found.sections[0].joined is None
             assert found.end <= at
 
 
@@ -420,9 +423,16 @@ def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expec
     path = tmp_path / "cut.ftlm"
     path.write_bytes(stage_store)
     everything = ftlm.search_status(path)["stage"].done
-    begun = len(stage_store) - everything * 9
+    joined = len(msgspec.msgpack.encode(read_store(path).sections[0].joined)) + 24
+    begun = len(stage_store) - joined - everything * 9
+    # Without its table alone it is joined anew, to the same bytes.
+    path.write_bytes(stage_store[: len(stage_store) - joined])
+    assert ftlm.search_status(path)["stage"].complete
+    assert read_store(path).sections[0].joined is None
+    assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
+    assert path.read_bytes() == stage_store
     done = []
-    for size in range(len(stage_store) - 40, begun // 2, -(len(stage_store) - begun // 2) // 9):
+    for size in range(len(stage_store) - joined - 40, begun // 2, -(len(stage_store) - begun // 2) // 9):
         path.write_bytes(stage_store[:size])
         try:
             status = ftlm.search_status(path)["stage"]
@@ -435,6 +445,34 @@ def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expec
         assert ftlm.search_status(path)["stage"].complete
     assert len(done) > 3
     assert done[0] > done[-1]
+
+
+def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage_expected, tmp_path, monkeypatch):
+    path = tmp_path / "s.ftlm"
+    path.write_bytes(stage_store)
+    monkeypatch.setattr("ftlm.rounds.StageWork.ready", None)
+    assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
+    assert ftlm.search_status(path)["stage"].complete
+    held = msgspec.structs.asdict(read_store(path).sections[0].joined)
+    whole = read_store(path)
+    for number, change in enumerate(
+        (
+            {"rows": ()},
+            {"rows": ((*held["rows"][0][:2], (1.0,), held["rows"][0][3]), *held["rows"][1:])},
+            {"rows": ((*held["rows"][0][:3], held["rows"][0][3][:1]), *held["rows"][1:])},
+            {"counts": {**held["counts"], "beaten": 0}},
+            {"counts": {"candidates": 0}},
+            {"failures": ((0, (1.0,), "singular"),)},
+        )
+    ):
+        forged = tmp_path / f"{number}.ftlm"
+        with Store(forged, whole.requests) as kept:
+            kept._append([Joined(**{**held, **change})])
+        for call in (ftlm.resume_search, ftlm.search_status):
+            with pytest.raises(ftlm.DataError, match="its table is of another search"):
+                call(forged)
+    with Store(path) as kept, pytest.raises(ModelError, match="a table stands where none belongs"):
+        kept.contents.sections[0].take(Joined(**held))
 
 
 def test_a_stage_that_is_interrupted_goes_on(stage_run, stage_expected, small_pieces, tmp_path):
