@@ -7,6 +7,8 @@ import os
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+import numpy as np
+
 from ftlm import _core
 from ftlm.checks import real_number, whole_number
 from ftlm.errors import DataError, ModelError
@@ -820,10 +822,16 @@ class Job:
         ]
         # Each output's deviation makes radians of hub and of deflection weigh alike.
         points = sum(r.m for r in records)
-        spread = [
-            math.sqrt(sum(float(((r.of(e.output) - r.of(e.output).mean()) ** 2).sum()) for r in records) / points)
-            for e in structure.equations
-        ]
+        with np.errstate(over="ignore", invalid="ignore"):
+            spread = [
+                math.sqrt(sum(float(((r.of(e.output) - r.of(e.output).mean()) ** 2).sum()) for r in records) / points)
+                for e in structure.equations
+            ]
+        for item, size in zip(structure.equations, spread, strict=True):
+            if not 0 < size < math.inf:
+                raise ModelError(
+                    f"the deviation of {item.output} is {size:g}; scale it so that its squares are numbers"
+                )
         work = StageWork(
             tuple(r.core() for r in records), [list(self.values[n]) for n in names], laws, list(records[0].inputs),
             [[t.fixed for t in e.terms] for e in structure.equations],

@@ -185,4 +185,7 @@ def _seeds(target, folder):
     )
     payloads = [msgspec.msgpack.encode(frame) for frame in (request, half)]
     half_done = b"".join(struct.pack("<I", len(p)) + p for p in payloads)
-    return (halves, half_done) if target == "sealed" else (whole,)
+    law = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u")
+    ftlm.search_orders(run, law, ftlm.lattice(step=0.25), m=16, store=folder / "b.ftlm", keep=3, threads=1)
+    of_law = (folder / "b.ftlm").read_bytes()
+    return (halves, half_done, unsealed(of_law)) if target == "sealed" else (whole, of_law)
