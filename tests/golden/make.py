@@ -28,7 +28,7 @@ def run():
 
 
 def main():
-    """Write model, run, finished store and half-finished store."""
+    """Write model, run, finished stores and a half-finished one."""
     folder = HERE / ftlm.__version__
     if folder.exists():
         sys.exit(f"{folder} is there already, and stays as it is")
@@ -56,6 +56,15 @@ def main():
         "pruned": whole.pruned,
     }
     (folder / "expected.json").write_text(json.dumps(expected, indent=1) + "\n", encoding="utf-8")
+    under_a_law(folder, given)
+
+
+def under_a_law(folder, given):
+    """A finished store of a search under an order law, and its table."""
+    structure = ftlm.equation("D^alpha y = a D^beta y + b D^(alpha-beta) u", initial="rest")
+    options = {"m": 32, "threads": 1, "keep": 5, "store": folder / "law.ftlm"}
+    found = ftlm.search_orders(given, structure, ftlm.lattice(step=0.05), **options)
+    (folder / "law.json").write_text(json.dumps(found.to_dict(), indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

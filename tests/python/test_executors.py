@@ -272,6 +272,11 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_bytes(run, expected, tmp_p
     assert bytes_of(found) == expected
 
 
+def test_a_cluster_gives_the_same_bytes_of_a_stage(stage_run, stage_expected, tmp_path):
+    with cluster(tmp_path) as (client, _):
+        assert bytes_of(search_stage(stage_run, client.get_executor())) == stage_expected
+
+
 @pytest.mark.slow
 def test_ten_million_candidates_on_a_cluster_that_loses_a_worker(run, tmp_path):
     options = {"lattice": ftlm.lattice(step=0.0205), "m": 256, "early_stopping": True}

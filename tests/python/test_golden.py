@@ -55,3 +55,26 @@ def test_a_half_finished_store_goes_on(folder, expected, tmp_path):
     assert [row.index for row in found.table] == [row["index"] for row in expected["table"]]
     assert [row.score for row in found.table] == pytest.approx([row["score"] for row in expected["table"]], rel=1e-9)
     assert found.pruned == expected["pruned"]
+
+
+def test_a_finished_store_under_an_order_law_is_read_to_the_bit(folder, tmp_path):
+    shutil.copy(folder / "law.ftlm", tmp_path)
+    path = tmp_path / "law.ftlm"
+    expected = json.loads((folder / "law.json").read_text(encoding="utf-8"))
+    assert ftlm.search_status(path)["stage"].complete
+    assert json.loads(json.dumps(ftlm.resume_search(path)["stage"].to_dict())) == expected
+    assert path.read_bytes() == (folder / "law.ftlm").read_bytes()
+
+
+def test_a_store_under_an_order_law_that_was_cut_goes_on(folder, tmp_path):
+    path = tmp_path / "law.ftlm"
+    whole = (folder / "law.ftlm").read_bytes()
+    path.write_bytes(whole[: len(whole) * 3 // 5])
+    status = ftlm.search_status(path)["stage"]
+    assert 0 < status.done < status.candidates
+    expected = json.loads((folder / "law.json").read_text(encoding="utf-8"))
+    found = ftlm.resume_search(path)["stage"]
+    # The processor that began it may have rounded otherwise in the last place.
+    assert [row.index for row in found.table] == [row["index"] for row in expected["table"]]
+    assert [row.score for row in found.table] == pytest.approx([r["score"] for r in expected["table"]], rel=1e-9)
+    assert found.candidates == expected["candidates"]
