@@ -7,6 +7,7 @@ import functools
 import json
 import os
 import platform
+import re
 import sys
 from dataclasses import replace
 from enum import StrEnum
@@ -222,6 +223,11 @@ def pairs(option: str, given: list[str] | None) -> dict[str, str]:
     for item in given or []:
         name, equals, value = item.partition("=")
         value = value if equals else name
+        if not equals and name and not re.fullmatch(r"[^\W\d][\w.\[\]]*", name):
+            short = re.sub(r"\W+", "_", name.partition("(")[0]).strip("_0123456789").lower() or "name"
+            raise ModelError(
+                f'{option} {item!r} has no name of its own; write NAME=…, such as {option} "{short}={item}"'
+            )
         if not name or not value:
             raise ModelError(f"{option} {item!r} is not NAME=VALUE")
         if name in found:
@@ -425,6 +431,8 @@ def check_writable(paths: list[str | None], *, force: bool) -> None:
     for path in paths:
         if path is None:
             continue
+        if Path(path).is_dir():
+            raise DataError(f"{path} is a folder; name a file in it")
         if Path(path).exists() and not force:
             raise DataError(f"{path} exists; choose another name, or overwrite it with --force")
         if not Path(path).resolve().parent.is_dir():

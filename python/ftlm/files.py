@@ -188,8 +188,8 @@ def load(
     pool = _Pool(tables)
     if not asked.outputs:
         raise DataError(
-            f"outputs=: there is none; name the signals with inputs={{name: column}} and outputs={{name: column}}, "
-            f"or in a columns file; {pool.described()}"
+            f"no output is named; name the signals with inputs={{name: column}} and outputs={{name: column}}, "
+            f"or in a columns file (commands: -u NAME=COLUMN -y NAME=COLUMN, or --columns FILE); {pool.described()}"
         )
     labels: dict[str, str] = {}
     used: list[_Column] = []

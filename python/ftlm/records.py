@@ -11,6 +11,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.checks import whole_number
 from ftlm.errors import DataError, ModelError
+from ftlm.runs import nearest
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -200,8 +201,8 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
         return _core.pulse_means(np.append(rate, rate[-1]), m, True)
     if name not in run:
         raise DataError(
-            f"run {run.name!r} has no signal {name!r}, which the model needs; "
-            f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs="
+            f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
+            f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs= (commands: -u and -y)"
         )
     samples = run[name]
     if name in structure.free_delays:
