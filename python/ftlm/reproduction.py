@@ -564,19 +564,20 @@ class _Work:
             self.derived(candidates["output error"].model),
         )  # fmt: skip
 
-    def candidate(
-        self, label: str, model: Model, result: Identification | None = None, *, m: int | None = None
-    ) -> Candidate:
-        """Both errors of a model on both runs, and its free run from the currents alone."""
-        same = result is not None and result.task is not None and any(run is self.on for run in result.task.runs)
-        if result is not None and not same:
-            # Identified from every so manieth row; judged as all others are.
-            m = default_m(self.runs, power_of_two=False)
-        estimation = result.comparison if result is not None and same else compare(model, self.on, m=m)
+    def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
+        """Both errors of a model on both runs, and its free run from the currents alone.
+
+        Whatever a method worked on, all are judged on the paper's pulses: a sum over other pulses is another number.
+        """
+        m = default_m([self.on], power_of_two=True)
+        own = [] if result is None or result.task is None else result.task.runs
+        known = result.comparison if result is not None and any(run is self.on for run in own) else None
+        model = model if model.m == m else replace(model, m=m)
+        estimation = known if known is not None and known.m == m else compare(model, self.on)
         alone_model = replace(model, structure=replace(model.structure, coupling="simulated"))
         whole = len(model.equations) > 1
-        alone = {r.name: compare(alone_model, r, m=m).output_error for r in self.runs} if whole else {}
-        validation = None if self.off is None else compare(model, self.off, m=m)
+        alone = {r.name: compare(alone_model, r).output_error for r in self.runs} if whole else {}
+        validation = None if self.off is None else compare(model, self.off)
         return Candidate(label, model, estimation, validation, alone, result)
 
     def integer(self) -> list[Candidate]:

@@ -12,6 +12,7 @@ import pytest
 import ftlm
 from ftlm import DataError, printed
 from ftlm.report.reproduction import reproduction_text
+from ftlm.report.tables import grouped_warnings
 from ftlm.reproduction import claims, settled_at, stages_of, table_3_coefficients, thinned
 from test_cli import ftlm_command
 from test_derivation import STIFFNESS_PAIRS, TABLE_3
@@ -363,3 +364,15 @@ def test_a_stage_that_fails_ends_the_other(reproduction):
 def test_threads_do_not_change_a_number(reproduction):
     one = ftlm.reproduce(step=0.25, genetic=ftlm.Genetic(seeds=(0, 1), evaluations=800), threads=1)
     assert one.to_dict() == reproduction.to_dict()
+
+
+def test_warnings_that_differ_in_numbers_alone_stand_together(reproduction):
+    result = reproduction.stages[1].candidates["p = 7"].result
+    words = ("theta11: off by 3 %", "order alpha1 = 1.05 is on the edge")
+    other = ("theta11: off by 4.5 %", "theta12: off by 3 %")
+    found = grouped_warnings({"a": replace(result, warnings=words), "b": replace(result, warnings=other), "c": None})
+    assert found == [
+        "a, b: theta11: off by 3 % (numbers of the first)",
+        "a: order alpha1 = 1.05 is on the edge",
+        "b: theta12: off by 3 %",
+    ]

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ftlm.models import numeric
 from ftlm.report.figures import comparison_charts, trace_chart
 from ftlm.report.page import Section, write_page
-from ftlm.report.tables import PaperRow, Table, paper_table, paper_table_text, search_summary
+from ftlm.report.tables import (
+    PaperRow,
+    Table,
+    equation_html,
+    estimates_table,
+    grouped_warnings,
+    paper_table,
+    paper_table_text,
+    search_summary,
+    symbol,
+)
 
 if TYPE_CHECKING:
     import os
@@ -126,7 +135,6 @@ def demo_page(found: Demo, path: str | os.PathLike[str], *, force: bool = False)
     for stage, results in found.results.items():
         best = results["output error"]
         units = dict(best.model.units)
-        warnings = [f"{label}: {w}" for label, result in results.items() for w in result.warnings]
         figures = comparison_charts(best.comparison, units=units, label="output error, square run")
         figures += comparison_charts(best.model.compare(found.sine), units=units, label="output error, sine run")
         paper = results[max((n for n in results if n.startswith("p = ")), key=lambda n: int(n[4:]))]
@@ -134,26 +142,20 @@ def demo_page(found: Demo, path: str | os.PathLike[str], *, force: bool = False)
         for output, traces in found.traces.items():
             if output in best.model.outputs:
                 named = [(f"p = {p}", trace) for p, trace in traces.items()]
-                figures.append(trace_chart(named, title=f"Error (45) of {output} after each step of the recursion"))
+                figures.append(
+                    trace_chart(named, title=f"Error (45) of {symbol(output)} after each step of the recursion")
+                )
         sections.append(
             Section(
                 f"Stage {stage}",
                 paragraphs=[
                     "Joint output error, order law and coefficient law imposed:",
-                    *(numeric(e) for e in best.model.equations),
-                    "True values of this simulated arm: "
-                    + ", ".join(f"{n} = {v:.6g}" for n, v in found.truth[stage].items())
-                    + ".",
-                    "Estimates with standard errors: "
-                    + ", ".join(
-                        f"{n} = {v:.6g} ± {best.standard_errors[n]:.2g}"
-                        for n, v in {**best.orders, **(best.joint.coefficients if best.joint else {})}.items()
-                    )
-                    + ".",
+                    *(equation_html(e) for e in best.model.equations),
                     NOTE,
                 ],
-                warnings=warnings,
+                warnings=grouped_warnings(results),
                 tables=[
+                    estimates_table(best, found.truth[stage]),
                     paper_table(paper_rows(found, stage), title=f"Stage {stage}, square current"),
                     search_summary({f"{n}, {o}": s for n, r in results.items() for o, s in r.searches.items()}),
                 ],

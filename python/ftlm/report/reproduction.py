@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -27,7 +26,17 @@ from ftlm.report.figures import (
 )
 from ftlm.report.landscape import output_error_landscape
 from ftlm.report.page import Section, check_free, write_page
-from ftlm.report.tables import Exact, Table, equation_html, number, search_summary, symbol, symbol_html
+from ftlm.report.tables import (
+    Exact,
+    Table,
+    equation_html,
+    estimates_table,
+    grouped_warnings,
+    number,
+    search_summary,
+    symbol,
+    symbol_html,
+)
 from ftlm.reproduction import (
     RIVAL_ALPHA,
     TRACE_EVERY,
@@ -391,22 +400,6 @@ def bounds_table(found: Reproduction) -> Table:
     )
 
 
-def intervals_table(found: Reproduction, stage: Stage) -> Table:
-    """Orders and coefficients by output error with intervals, and the truth where it is known."""
-    result = stage.candidates["output error"].result
-    truth = found.truth.get(stage.number, {})
-    rows: list[list[Cell]] = []
-    if result is not None and result.joint is not None:
-        for name, value in {**result.orders, **result.joint.coefficients}.items():
-            low, high = result.intervals[name]
-            rows.append([symbol_html(name), value, result.standard_errors[name], low, high, truth.get(name)])
-    columns = ["parameter", "value", "standard error", "from", "to", "true value"]
-    groups = [("", 3), ("95 % interval", 2), ("", 1)]
-    if not truth:
-        rows, columns, groups = [r[:-1] for r in rows], columns[:-1], groups[:-1]
-    return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
-
-
 # ------------------------------------------------------------------------------------------------ figures
 
 
@@ -578,22 +571,6 @@ def _flow(described: str, *, narrow: bool) -> Markup:
 # ------------------------------------------------------------------------------------------------ the page
 
 
-def grouped_warnings(stage: Stage) -> list[str]:
-    """Warnings of all models, those that differ in numbers alone together."""
-    groups: dict[str, tuple[str, list[str]]] = {}
-    for label, candidate in stage.candidates.items():
-        for warning in () if candidate.result is None else candidate.result.warnings:
-            # Digits of names stay: theta11 is not theta12.
-            key = re.sub(r"(?<![A-Za-z\d.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", warning)
-            groups.setdefault(key, (warning, []))[1].append(label)
-    found = []
-    for warning, labels in groups.values():
-        names = list(dict.fromkeys(labels))
-        alike = "" if len(labels) == 1 else " (numbers of the first)"
-        found.append(f"{', '.join(names)}: {warning}{alike}")
-    return found
-
-
 def _stage_section(found: Reproduction, stage: Stage) -> Section:
     number = stage.number
     table = 4 if number == 1 else 5
@@ -610,10 +587,10 @@ def _stage_section(found: Reproduction, stage: Stage) -> Section:
             "Joint output error, order law and coefficient law imposed:",
             *(equation_html(e) for e in joint.model.equations),
         ],
-        warnings=grouped_warnings(stage),
+        warnings=grouped_warnings({label: c.result for label, c in stage.candidates.items()}),
         tables=[
             model_table(stage, f"Table {table}. Identified models of stage {number}, square input"),
-            intervals_table(found, stage),
+            estimates_table(joint.result, found.truth.get(stage.number, {})),
             fits_table(stage),
             search_summary(searches),
         ],

@@ -31,6 +31,8 @@ __all__ = [
     "Table",
     "equation_html",
     "errors_table",
+    "estimates_table",
+    "grouped_warnings",
     "information_table",
     "initial_terms_table",
     "number",
@@ -338,6 +340,35 @@ def parameter_table(model: Model, joint: JointFit | None = None, *, title: str =
     return Table(
         title, tuple(columns[i] for i in kept), [[row[i] for i in kept] for row in rows], groups=groups, note=note
     )
+
+
+def estimates_table(result: Identification | None, truth: Mapping[str, float] | None = None) -> Table:
+    """Orders and coefficients of a joint fit with intervals, beside their true values where those are known."""
+    rows: list[list[Cell]] = []
+    if result is not None and result.joint is not None:
+        for name, value in {**result.orders, **result.joint.coefficients}.items():
+            low, high = result.intervals[name]
+            known = [truth.get(name)] if truth else []
+            rows.append([symbol_html(name), value, result.standard_errors[name], low, high, *known])
+    columns, groups = ["parameter", "value", "standard error", "from", "to"], [("", 3), ("95 % interval", 2)]
+    if truth:
+        columns, groups = [*columns, "true value"], [*groups, ("", 1)]
+    return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
+
+
+def grouped_warnings(results: Mapping[str, Identification | None]) -> list[str]:
+    """Warnings of several results by label, those that differ in numbers alone together."""
+    groups: dict[str, tuple[str, list[str]]] = {}
+    for label, result in results.items():
+        for warning in () if result is None else result.warnings:
+            # Digits of names stay: theta11 is not theta12.
+            key = re.sub(r"(?<![A-Za-z\d.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", warning)
+            groups.setdefault(key, (warning, []))[1].append(label)
+    found = []
+    for warning, labels in groups.values():
+        alike = "" if len(labels) == 1 else " (numbers of the first)"
+        found.append(f"{', '.join(dict.fromkeys(labels))}: {warning}{alike}")
+    return found
 
 
 def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic starts") -> Table:
