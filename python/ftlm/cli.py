@@ -489,7 +489,8 @@ def demo(
             Path(out), step=step, noise=noise, seed=seed, threads=threads, force=force, say=progress.say,
             progress=progress,
         )  # fmt: skip
-    page = demo_page(found, Path(out) / "demo.html", force=force)
+        progress.say("writing the page")
+        page = demo_page(found, Path(out) / "demo.html", force=force)
     found.files.append(page)
     if as_json:
         show(found, as_json=True)
@@ -597,6 +598,7 @@ def identify(
     if out is not None:
         found.model.save(out, force=force)
     if report is not None:
+        progress.say("writing the report")
         found.report(report, validation=others or None, force=force)
     checked = found.validate(others) if others else None
     if as_json:
