@@ -75,6 +75,8 @@ SETTLED = 0.01
 REFINED = 0.1
 #: Discretisation that the first fit on all samples may leave, in standard deviations of the noise.
 NOTICED = 0.3
+#: A pole of this many radians a sample is faster than the samples see.
+FAST_POLE = 0.2
 #: Finest grid: pulses a sample interval.
 FINEST = 16
 #: Own bounds of orders where the structure gives none.
@@ -536,6 +538,80 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, thre
 
 
 @dataclass(frozen=True)
+class LowerOrder:
+    """A problem one of whose equations ends with its highest own term: what is left of it behind a fast pole.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    coefficient
+        Of the term that is now the highest, 1 there.
+    factor
+        Known factor of that term.
+    others
+        Coefficients of the equation's other terms.
+    fast
+        Size of the term's coefficient that makes the pole fast.
+    initial
+        Initial terms of the equation of lower order: a power of t that it integrates to would be a drive.
+    """
+
+    problem: FreeProblem
+    coefficient: str
+    factor: float
+    others: tuple[str, ...]
+    fast: float
+    initial: Any
+
+    def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
+        """The same dynamics in the whole problem, but for what is faster than the sampling."""
+        values = dict(zip(self.problem.coefficients, attempt.coefficients, strict=True))
+        values |= {n: self.fast * values[n] for n in self.others}
+        values[self.coefficient] = -self.fast / self.factor
+        known = dict(zip(self.problem.orders, attempt.orders, strict=True))
+        return replace(
+            attempt,
+            orders=[known[n] for n in whole.orders],
+            coefficients=[values[n] for n in whole.coefficients],
+            origin=f"{attempt.origin}, from the equation of lower order",
+        )
+
+
+def lower_orders(problem: FreeProblem, runs: Sequence[Run], initial: Any) -> list[LowerOrder]:
+    """The problem of lower order of one equation whose own orders are numbers; free orders get there by themselves."""
+    structure = problem.structure
+    if (
+        structure.has_order_law
+        or problem.products
+        or (structure.coupling == "simulated"
+        and len(structure.equations) > 1)
+    ):
+        return []
+    step = max(run.step for run in runs)
+    item = structure.equations[0]
+    own = [t for t in item.terms if t.signal == item.output]
+    if item.order.names or not own or any(t.order.names for t in own):
+        return []
+    highest = max(own, key=lambda t: t.order.constant)
+    rest = tuple(t for t in item.terms if t is not highest)
+    known = any(t.fixed is not None or t.coefficient == highest.coefficient for t in rest)
+    if not isinstance(highest.coefficient, str) or highest.order.constant <= 0 or known:
+        return []
+    if not isinstance(initial, str):
+        initial = tuple(e for e in initial if e < highest.order.constant)
+    try:
+        lower = replace(item, order=highest.order, terms=rest)
+        reduced = FreeProblem.of(replace(structure, equations=(lower,)))
+    except FtlmError:
+        # A term of another signal differentiates more often than the equation of lower order integrates.
+        return []
+    fast = (FAST_POLE / step) ** (item.order.constant - highest.order.constant)
+    names = tuple(t.coefficient for t in rest if isinstance(t.coefficient, str))
+    return [LowerOrder(reduced, highest.coefficient, highest.factor, names, fast, initial)]
+
+
+@dataclass(frozen=True)
 class Simpler:
     """A problem with one own term less.
 
@@ -547,11 +623,14 @@ class Simpler:
         What is 0 in it.
     order
         Highest order of the equation that lacks the term.
+    initial
+        Initial terms.
     """
 
     problem: FreeProblem
     coefficient: str
     order: Order
+    initial: Any
 
     def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
         """The same point of the whole problem; the order of a term that is 0 may be any, so it is half the highest."""
@@ -566,7 +645,7 @@ class Simpler:
         )
 
 
-def simpler(problem: FreeProblem) -> list[Simpler]:
+def simpler(problem: FreeProblem, initial: Any) -> list[Simpler]:
     """Problems with one own term less; none under a law, where no coefficient can be 0 by itself."""
     structure = problem.structure
     if structure.has_order_law or problem.products:
@@ -582,7 +661,7 @@ def simpler(problem: FreeProblem) -> list[Simpler]:
             names = {n for e in equations for n in e.order_names}
             values = {n: v for n, v in structure.order_values.items() if n in names}
             reduced = replace(structure, equations=equations, order_values=values)
-            out.append(Simpler(FreeProblem.of(reduced), term.coefficient, item.order))
+            out.append(Simpler(FreeProblem.of(reduced), term.coefficient, item.order, initial))
     return out
 
 
@@ -820,18 +899,22 @@ def fit_output_error(
         coarse: list[Any] = []
         attempts = delayed_attempts(runs, problem, initial, threads)
 
-        def tried(attempt: Attempt, evaluations: int, of: FreeProblem) -> Attempt | None:
+        def tried(attempt: Attempt, evaluations: int, of: FreeProblem, begin: Any) -> Attempt | None:
             try:
-                return descend(of, coarse, signals, initial, attempt, evaluations=evaluations)
+                return descend(of, coarse, signals, begin, attempt, evaluations=evaluations)
             except FtlmError:
                 # A start whose free run is not finite is no start; if none is left, that is said below.
                 return None
 
-        def race(runners: list[Attempt], evaluations: int, of: FreeProblem = problem) -> list[Attempt]:
+        def race(
+            runners: list[Attempt], evaluations: int, of: FreeProblem = problem, begin: Any = initial
+        ) -> list[Attempt]:
             ended, count = [], len(runners)
             with ThreadPoolExecutor(threads) as pool:
                 try:
-                    for done, attempt in enumerate(pool.map(tried, runners, [evaluations] * count, [of] * count)):
+                    for done, attempt in enumerate(
+                        pool.map(tried, runners, *([v] * count for v in (evaluations, of, begin)))
+                    ):
                         if attempt is not None:
                             ended.append(attempt)
                         if progress is not None:
@@ -854,13 +937,18 @@ def fit_output_error(
                 break
             # The coarse grid has optima of its own: once more from the same starts, on half the step.
             level *= 2
-        # Whatever a simpler equation reaches, this one reaches too: it starts there with the term's coefficient at 0.
-        for less in simpler(problem) if reached else []:
-            laps = race(delayed_attempts(runs, less.problem, initial, threads), FIRST_LAP, less.problem)
-            laps = race(laps[:FINALISTS], SECOND_LAP, less.problem)
+        # Whatever a simpler equation reaches, this one reaches too: it starts there with the term's coefficient at 0,
+        # or with a pole too fast to see.
+        others: list[Simpler | LowerOrder] = [*simpler(problem, initial), *lower_orders(problem, runs, initial)]
+        for less in others if reached else []:
+            laps = race(
+                delayed_attempts(runs, less.problem, less.initial, threads), FIRST_LAP, less.problem, less.initial
+            )
+            laps = race(laps[:FINALISTS], SECOND_LAP, less.problem, less.initial)
             reached = sorted(reached + [less.embedded(a, problem) for a in laps[:1]], key=lambda a: a.level)
         ahead = max(FEWEST, len(reached) // RUNNERS)
-        reached = sorted(race(reached[:ahead], SECOND_LAP) + reached[ahead:], key=lambda a: a.level)
+        reached = race(reached[:ahead], SECOND_LAP) + reached[ahead:]
+        reached = by_both_grids(problem, thinned(alike, 2 * level), initial, reached)
         starts = [(a.level, a.origin) for a in reached]
         kept = distinct(reached)[:FINALISTS]
         finalists = [a for a in kept if a.level <= CONTENDER * kept[0].level]
@@ -887,7 +975,7 @@ def fit_output_error(
             # No finite free run on this grid; the others have one.
             if attempt is finalists[-1] and not ends:
                 raise
-    best = min(ends, key=lambda a: a.level)
+    best = by_both_grids(problem, experiments(alike, 2 * every), initial, ends)[0]
     best = lowest(problem, near, signals, initial, best, evaluations=120)
     best = descend(problem, experiments(weights, every), signals, initial, best, evaluations=120)
 
@@ -934,6 +1022,26 @@ def fit_output_error(
         products=dict(problem.products),
         delays=dict(zip(problem.delays, delays, strict=True)),
     )
+
+
+def by_both_grids(problem: FreeProblem, finer: list[Any], initial: Any, reached: Sequence[Attempt]) -> list[Attempt]:
+    """Attempts by their cost on their own grid or on the finer one, whichever is the larger; the least first.
+
+    The pulse scheme of a stiff equation has a mode that alternates from pulse to pulse. A fit may use it to follow
+    noise, at the cost of a free run that no other grid has.
+    """
+
+    def worse(attempt: Attempt) -> float:
+        try:
+            there = descend(problem, finer, problem.structure.signals, initial, attempt, evaluations=1)
+        except FtlmError:
+            return math.inf
+        return max(attempt.level, there.level)
+
+    costs = [worse(a) for a in reached]
+    if not any(map(math.isfinite, costs)):
+        return sorted(reached, key=lambda a: a.level)
+    return [reached[i] for i in sorted(range(len(reached)), key=lambda i: (costs[i], reached[i].level))]
 
 
 def grid_matters(

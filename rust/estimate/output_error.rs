@@ -13,6 +13,7 @@ use crate::fractional::kernel_with_derivative;
 use crate::means::delayed;
 use crate::regressors::Record;
 use crate::series::{self, Buffers, Kernel, Solver, SumOfProducts};
+use crate::simulate::nyquist_margin;
 use crate::small::back_substitute;
 
 /// Own-output orders closer to α than this make the equation say that the output equals itself.
@@ -207,6 +208,9 @@ struct Part {
     shifted: Vec<(Vec<f64>, Vec<f64>)>,
 }
 
+/// Least response of the divisor at Nyquist's frequency, as a share of its leading coefficient, that a step may end at.
+const RESOLVED: f64 = 0.02;
+
 /// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
 const FACTORS: usize = 3;
 
@@ -248,6 +252,32 @@ impl FreeModel {
         } else {
             (signal == self.equations[i].output).then_some(i)
         }
+    }
+
+    /// Whether every grid sees what the own terms of each equation do, as far as equations stand alone.
+    ///
+    /// At Nyquist's frequency the divisor is [`nyquist_margin`] beside its leading coefficient: negative, the scheme has
+    /// a mode that grows from pulse to pulse; near 0, one that hardly decays. A fit would follow noise with it.
+    fn resolved(&self, experiments: &[Experiment], point: &Point) -> bool {
+        if self.coupled && self.equations.len() > 1 {
+            return true;
+        }
+        let structures = self.structures(&point.orders);
+        structures.iter().zip(&self.equations).all(|(structure, equation)| {
+            let own: Vec<(f64, f64)> = structure
+                .terms
+                .iter()
+                .zip(&equation.terms)
+                .filter(|(term, _)| term.signal == structure.output)
+                .map(|(term, (_, _, c))| (c.at(&point.coefficients), structure.order - term.order))
+                .collect();
+            experiments.iter().all(|experiment| {
+                let h = experiment.record.step();
+                let first = |&(c, eta): &(f64, f64)| c * libm::pow(h, eta) / libm::tgamma(eta + 2.0);
+                let leading = 1.0 - own.iter().map(first).sum::<f64>();
+                nyquist_margin(&own, h) / leading >= RESOLVED
+            })
+        })
     }
 
     /// Residuals at a point.
@@ -594,6 +624,7 @@ pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, setting
     let mut current = model.evaluate(experiments, &point)?;
     let mut jacobian = model.jacobian(experiments, &point, &current)?;
     let mut evaluations = 1;
+    let mut resolved = model.resolved(experiments, &point);
     let mut damping = 1e-3;
     let mut status = Status::Exhausted;
     'outer: while evaluations < settings.evaluations {
@@ -610,8 +641,10 @@ pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, setting
                 break 'outer;
             }
             evaluations += 1;
+            // From where the grid sees all of the equation no step leads to where it does not.
+            let sees = model.resolved(experiments, &next);
             match model.evaluate(experiments, &next) {
-                Ok(found) if found.cost.is_finite() && found.cost < current.cost => {
+                Ok(found) if found.cost.is_finite() && found.cost < current.cost && (sees || !resolved) => {
                     let slopes = match model.jacobian(experiments, &next, &found) {
                         Ok(slopes) => slopes,
                         Err(Error::Diverged { .. }) => {
@@ -625,7 +658,7 @@ pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, setting
                         Err(error) => return Err(error),
                     };
                     let gain = (current.cost - found.cost) / current.cost.max(f64::MIN_POSITIVE);
-                    (point, current, jacobian) = (next, found, slopes);
+                    (point, current, jacobian, resolved) = (next, found, slopes, sees);
                     damping = (damping * 0.1).max(1e-12);
                     if gain <= settings.tolerance {
                         status = Status::Converged;
