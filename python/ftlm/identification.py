@@ -505,7 +505,7 @@ def identify(
     for search in searches.values():
         warnings += [f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in search.edges.items()]
     warnings += [f"run {r.name}: {w}" for r in found for w in r.warnings] + _unexcited(found, structure)
-    warnings += discretisation(model, comparison)
+    warnings += discretisation(model, comparison) + growing(model)
     tests, criteria = _judged(model, found, len(orders) + len(coefficients))
     warnings += [] if tests is None else residual_warnings(tests)
     used = {**settings.to_dict(), "m": pulses, "initial": initial, **({"rank": rank} if rank > 1 else {})}
@@ -618,7 +618,7 @@ def _identify_output_error(
     }  # fmt: skip
     warnings = list(comparison.warnings) + _uncertain(joint, problem)
     warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings] + _unexcited(runs, structure)
-    warnings += discretisation(model, comparison)
+    warnings += discretisation(model, comparison) + growing(model)
     tests, criteria = _judged(model, runs, len(joint.names))
     # That they are coloured is said already, with what it means for the intervals.
     warnings += [] if tests is None else [w for w in residual_warnings(tests, floor=ROUNDING) if "not white" not in w]
@@ -685,7 +685,7 @@ def _identify_genetic(
                 "it has not found the optimum of each"
             )
     warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings] + _unexcited(runs, structure)
-    warnings += discretisation(model, comparison)
+    warnings += discretisation(model, comparison) + growing(model)
     tests, criteria = _judged(model, runs, len(orders) + len(coefficients))
     warnings += [] if tests is None else residual_warnings(tests)
     used = {
@@ -925,6 +925,14 @@ def discretisation(model: Model, comparison: Comparison) -> list[str]:
                 "whether or not the model is; raise m"
             )
     return warnings
+
+
+def growing(model: Model) -> list[str]:
+    """Warn of poles with a positive real part: within one run the input may hide what they do, after it nothing does."""
+    found = model.stability(coupling=model.structure.coupling)
+    if not found.unstable_poles > 0:
+        return []
+    return [f"the model is {found}: its free run grows without bound, however well it fits a run of this length"]
 
 
 @dataclass(frozen=True)

@@ -584,8 +584,7 @@ def lower_orders(problem: FreeProblem, runs: Sequence[Run], initial: Any) -> lis
     if (
         structure.has_order_law
         or problem.products
-        or (structure.coupling == "simulated"
-        and len(structure.equations) > 1)
+        or (structure.coupling == "simulated" and len(structure.equations) > 1)
     ):
         return []
     step = max(run.step for run in runs)

@@ -111,3 +111,18 @@ def test_every_figure_of_a_report_follows_from_the_saved_model_and_the_run(noisy
     expected |= set(loaded.orders.values()) | set(loaded.coefficients.values())
     expected |= {v for v in loaded.estimate.standard_errors.values() if v is not None}
     assert expected <= shown
+
+
+@pytest.mark.parametrize("method", ["output-error", "instrumental-variables", "least-squares"])
+def test_an_unstable_model_is_called_so_however_well_it_fits(method: str) -> None:
+    rng = np.random.default_rng(4)
+    u = np.repeat(rng.choice([-1.0, 1.0], 20), 20)
+    blank = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": 0 * u})
+    for growth, grows in ((0.5, True), (-0.5, False)):
+        clean = ftlm.Model(ftlm.equation(f"D y = {growth} y + u")).simulate(blank, tolerance=1e-6)["y"]
+        noisy = clean + 1e-4 * np.std(clean) * rng.standard_normal(u.size)
+        run = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": noisy})
+        found = ftlm.identify(run, ftlm.equation("D y = a0 y + b0 u", initial="rest"), method=method)
+        assert found.fit_percent["y"] > 99
+        said = [w for w in found.warnings if "1 pole with a positive real part" in w and "grows without bound" in w]
+        assert len(said) == grows
