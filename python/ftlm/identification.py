@@ -928,7 +928,7 @@ def discretisation(model: Model, comparison: Comparison) -> list[str]:
 
 
 def growing(model: Model) -> list[str]:
-    """Warn of poles with a positive real part: within one run the input may hide what they do, after it nothing does."""
+    """Warn of poles with a positive real part: within one run the input may hide what they do, later nothing does."""
     found = model.stability(coupling=model.structure.coupling)
     if not found.unstable_poles > 0:
         return []
