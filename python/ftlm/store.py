@@ -306,6 +306,8 @@ class Contents:
         What is known of each.
     version
         Version of ftlm that made it.
+    algorithm
+        Number of the algorithm that its rounds follow.
     end
         Offset behind the last whole frame.
     digest
@@ -319,6 +321,7 @@ class Contents:
     requests: tuple[Request, ...]
     sections: list[Section]
     version: str
+    algorithm: int
     end: int
     digest: bytes
     torn: int = 0
@@ -420,10 +423,8 @@ def _parse(path: str | os.PathLike[str], data: memoryview) -> Contents:
 def _opened(frame: Requests | Frame, end: int, digest: bytes) -> Contents:
     if not isinstance(frame, Requests) or not frame.requests:
         raise ModelError("the first frame holds no request")
-    if frame.algorithm != ALGORITHM:
-        raise ModelError(f"its rounds follow algorithm {frame.algorithm}, this version's is {ALGORITHM}")
     sections = [Section(law=r.structure.has_order_law) for r in frame.requests]
-    return Contents(frame.requests, sections, frame.version, end, digest)
+    return Contents(frame.requests, sections, frame.version, frame.algorithm, end, digest)
 
 
 class Store:
@@ -581,6 +582,13 @@ class Store:
         self._last = time.monotonic()
 
     def _append(self, frames: Sequence[Frame]) -> None:
+        found = self.contents
+        if found.algorithm != ALGORITHM:
+            # A finished search is only read, whatever made it.
+            raise DataError(
+                f"store {self.path} is of ftlm {found.version}, whose rounds follow algorithm {found.algorithm}; this "
+                f"version's is {ALGORITHM}: finish the search with that version, or start it again in another file"
+            )
         data, digest, offset = [], self._digest, self._end
         for frame in frames:
             payload = _encoder.encode(frame)

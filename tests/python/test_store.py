@@ -633,6 +633,21 @@ def test_another_search_is_refused_and_leaves_the_store(run, whole, tmp_path, ch
     assert path.read_bytes() == whole
 
 
+def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_where_not(
+    run, whole, expected, tmp_path, monkeypatch
+):
+    finished, half = tmp_path / "finished.ftlm", tmp_path / "half.ftlm"
+    finished.write_bytes(whole)
+    half.write_bytes(whole[: len(whole) // 2])
+    monkeypatch.setattr("ftlm.store.ALGORITHM", 2)
+    assert bytes_of(ftlm.resume_search(finished)["y"]) == expected
+    assert finished.read_bytes() == whole
+    kept = read_store(half).end
+    with pytest.raises(ftlm.DataError, match=r"follow algorithm 1; this version's is 2: finish the search with that"):
+        ftlm.resume_search(half)
+    assert half.read_bytes() == whole[:kept]
+
+
 def test_a_second_writer_is_refused_and_readers_are_not(run, whole, expected, tmp_path):
     path = tmp_path / "s.ftlm"
     path.write_bytes(whole)
