@@ -656,6 +656,30 @@ fn output_error(records: &[Record], structures: &[Structure], responses: &[Vec<V
     total
 }
 
+/// The equations that solutions make.
+pub(crate) fn equations(structures: &[Structure], solutions: &[Solution]) -> Vec<Equation> {
+    let pairs = structures.iter().zip(solutions);
+    pairs.map(|(s, x)| Equation { structure: s.clone(), coefficients: x[..s.terms.len()].to_vec() }).collect()
+}
+
+/// (exponent, coefficient) of the initial terms of record r that solutions hold, per equation.
+pub(crate) fn initial_terms(
+    r: usize,
+    structures: &[Structure],
+    exponents: &[Vec<f64>],
+    solutions: &[Solution],
+) -> Vec<Vec<(f64, f64)>> {
+    exponents
+        .iter()
+        .zip(structures)
+        .zip(solutions)
+        .map(|((exponents, s), x)| {
+            let first = s.terms.len() + r * exponents.len();
+            exponents.iter().copied().zip(x[first..].iter().copied()).collect()
+        })
+        .collect()
+}
+
 /// Free runs of all equations together on every record, damped where they grow.
 #[allow(clippy::cast_precision_loss)]
 fn coupled(
@@ -664,23 +688,11 @@ fn coupled(
     exponents: &[Vec<f64>],
     solutions: &[Solution],
 ) -> Result<(Vec<Vec<Vec<f64>>>, bool)> {
-    let equations: Vec<Equation> = structures
-        .iter()
-        .zip(solutions)
-        .map(|(s, x)| Equation { structure: s.clone(), coefficients: x[..s.terms.len()].to_vec() })
-        .collect();
+    let equations = equations(structures, solutions);
     let mut damped = false;
     let mut out = Vec::with_capacity(clean.len());
     for (r, record) in clean.iter().enumerate() {
-        let initial: Vec<Vec<(f64, f64)>> = exponents
-            .iter()
-            .zip(structures)
-            .zip(solutions)
-            .map(|((exponents, s), x)| {
-                let first = s.terms.len() + r * exponents.len();
-                exponents.iter().copied().zip(x[first..].iter().copied()).collect()
-            })
-            .collect();
+        let initial = initial_terms(r, structures, exponents, solutions);
         let m = record.m() as f64;
         let mut gamma = 0.0;
         let outputs = loop {

@@ -7,9 +7,11 @@
 //! term what a change of its coefficient does to the free run, so where the steps stand still the weighted output error
 //! does, too.
 
-use crate::equation::{Equation, Structure};
+use crate::equation::Structure;
 use crate::error::Result;
-use crate::estimate::instrumental_variables::{dot, grows, long_run, unmoved, Dropped, Settings, Solution};
+use crate::estimate::instrumental_variables::{
+    dot, equations, grows, initial_terms, long_run, unmoved, Dropped, Settings, Solution,
+};
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 use crate::{simulate, small};
@@ -128,32 +130,15 @@ impl Problem<'_> {
         out
     }
 
-    fn equations(&self, solutions: &[Solution]) -> Vec<Equation> {
-        self.structures
-            .iter()
-            .zip(solutions)
-            .map(|(s, x)| Equation { structure: s.clone(), coefficients: x[..s.terms.len()].to_vec() })
-            .collect()
-    }
-
     /// Free runs and their cost; None where one leaves ten times its output's size.
     #[allow(clippy::cast_precision_loss)]
     fn point(&self, solutions: &[Solution]) -> Result<Option<Point>> {
-        let equations = self.equations(solutions);
+        let equations = equations(self.structures, solutions);
         let mut responses = Vec::with_capacity(self.records.len());
         let mut sums = vec![0.0; equations.len()];
         let mut count = 0;
         for (r, record) in self.clean.iter().enumerate() {
-            let initial: Vec<Vec<(f64, f64)>> = self
-                .exponents
-                .iter()
-                .zip(self.structures)
-                .zip(solutions)
-                .map(|((exponents, s), x)| {
-                    let first = s.terms.len() + r * exponents.len();
-                    exponents.iter().copied().zip(x[first..].iter().copied()).collect()
-                })
-                .collect();
+            let initial = initial_terms(r, self.structures, self.exponents, solutions);
             let outputs = simulate::respond(&equations, record, &initial)?;
             for ((response, equation), sum) in outputs.iter().zip(&equations).zip(&mut sums) {
                 let measured = self.records[r].signal(equation.structure.output);
@@ -182,7 +167,7 @@ impl Problem<'_> {
         with_covariance: bool,
     ) -> Result<Option<Stepped>> {
         let (n, k) = (self.structures.len(), unknowns.len());
-        let equations = self.equations(solutions);
+        let equations = equations(self.structures, solutions);
         let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
         let mut parts = Vec::with_capacity(self.records.len());
         for (r, record) in self.records.iter().enumerate() {
