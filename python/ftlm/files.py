@@ -272,6 +272,18 @@ def _tables(paths: list[Path]) -> list[_Table]:
     return [read[path] if path in read else _read_text(path) for path in paths]
 
 
+def column_names(path: PathLike) -> tuple[str, ...] | None:
+    """Names of the columns of one file; None for a run that ftlm wrote, which names its own signals.
+
+    Raises
+    ------
+    DataError
+        As :func:`load`.
+    """
+    (table,) = _tables(_paths(path))
+    return None if table.header is not None else _Pool([table]).names
+
+
 # --- what is asked for ------------------------------------------------------------------------------------------------
 
 
@@ -390,9 +402,14 @@ class _Pool:
                 matrix = None if column.matrix is None else prefix + column.matrix
                 self._columns[name] = replace(column, name=name, matrix=matrix)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What can be asked for by name."""
+        return tuple(name for name in self._columns if name)
+
     def described(self) -> str:
         skipped = {name: why for table in self._tables for name, why in table.skipped.items()}
-        text = f"the columns are {listed(name for name in self._columns if name)}"
+        text = f"the columns are {listed(self.names)}"
         if skipped:
             text += "; not read: " + ", ".join(f"{name!r} ({why})" for name, why in list(skipped.items())[:10])
         return text

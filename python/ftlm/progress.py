@@ -56,11 +56,14 @@ class _Bars:
     def drop(self, task: TaskID) -> None:
         """Remove a bar, and with the last one the display."""
         with self._lock:
-            if self._shown is not None:
+            if self._shown is None:
+                return
+            if len(self._shown.tasks) > 1:
                 self._shown.remove_task(task)
-                if not self._shown.tasks:
-                    self._shown.stop()
-                    self._shown = None
+            else:
+                # Stopping paints the last state once more, which a bar that ended between two paintings needs.
+                self._shown.stop()
+                self._shown = None
 
 
 class Progress:

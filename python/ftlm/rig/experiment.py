@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ftlm.errors import DataError, FtlmError, ModelError, RigFault
-from ftlm.files import load
+from ftlm.files import column_names, load
 from ftlm.rig.rig import COLUMNS, CURRENT_LIMIT, LONGEST, Limits, Rig
 from ftlm.rig.virtual import ArmParameters, VirtualBoard
 from ftlm.runs import Run, build, is_run_name
@@ -168,15 +168,10 @@ class Excitation:
     def _file(self, t: Floats, rate: float) -> Floats:
         if self.file is None:
             raise ModelError("input = 'csv' needs a file; give it as file= (--file)")
-        run = None
-        for outputs in (None, ["I1", "I2"], ["I1"], ["I2"]):
-            try:
-                run = load(self.file, outputs=outputs) if outputs else load(self.file)
-                break
-            except DataError as error:
-                # Only a missing column is a reason to look for another one.
-                if "is not in" not in str(error) and "outputs=: there is none" not in str(error):
-                    raise
+        names = column_names(self.file)
+        currents = [name for name in INPUTS if names is not None and name in names]
+        # A run that ftlm wrote knows its signals; any other file is asked for the currents alone.
+        run = load(self.file) if names is None else load(self.file, outputs=currents) if currents else None
         if run is None or not any(name in run for name in INPUTS):
             raise DataError(f"{str(self.file)!r} has no column I1 or I2; name the currents [A] so")
         rows = np.minimum(np.floor(t / run.step + 1e-6).astype(np.int64), run.length - 1)
