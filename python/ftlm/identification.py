@@ -857,8 +857,10 @@ def _step_bias(
         return []
     carried = min(run.length - 1 for run in runs)
     finer = f"raise m, up to {carried}, or " if m < carried else ""
+    # Far from the limit a third of the move says no more than that it is large.
+    amount = f"about {moved[worst]:.2g}" if moved[worst] <= 10 else "more than 10"
     return [
-        f"at {m} pulses the step alone moves coefficient {worst} by about {moved[worst]:.2g} standard errors, which do "
+        f"at {m} pulses the step alone moves coefficient {worst} by {amount} standard errors, which do "
         f"not count it; {finer}use method='output-error', which refines the step"
     ]
 
