@@ -63,6 +63,8 @@ FIRST_LAP = 15
 SECOND_LAP = 60
 RUNNERS = 3
 FEWEST = 8
+#: All get as many as those ahead where the best is above the noise by this factor.
+ABOVE_FLOOR = 2.0
 #: Coarse fits that continue on all samples.
 FINALISTS = 3
 #: ... unless their coarse cost exceeds the best one's by this factor.
@@ -946,8 +948,15 @@ def fit_output_error(
             laps = race(laps[:FINALISTS], SECOND_LAP, less.problem, less.initial)
             reached = sorted(reached + [less.embedded(a, problem) for a in laps[:1]], key=lambda a: a.level)
         ahead = max(FEWEST, len(reached) // RUNNERS)
-        reached = race(reached[:ahead], SECOND_LAP) + reached[ahead:]
-        reached = by_both_grids(problem, thinned(alike, 2 * level), initial, reached)
+        rest = reached[ahead:]
+        reached = race(reached[:ahead], SECOND_LAP)
+        floor = float(
+            np.mean([(noise[o] / (COARSE_SHARE * size)) ** 2 for o, size in zip(structure.outputs, sizes, strict=True)])
+        )
+        if reached and reached[0].level > ABOVE_FLOOR * floor:
+            # Noise alone would leave less: those behind may yet be on the way to where it does.
+            rest = race(rest, SECOND_LAP)
+        reached = by_both_grids(problem, thinned(alike, 2 * level), initial, reached + rest)
         starts = [(a.level, a.origin) for a in reached]
         kept = distinct(reached)[:FINALISTS]
         finalists = [a for a in kept if a.level <= CONTENDER * kept[0].level]

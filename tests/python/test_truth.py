@@ -263,6 +263,15 @@ def test_a_richer_equation_never_fits_worse_than_a_simpler_one() -> None:
     assert any("from a" in origin and "= 0" in origin for _, origin in rich.joint.starts)
 
 
+def test_starts_that_stay_above_the_noise_are_not_the_last_word() -> None:
+    run, structure = plants.noisy_run("A2", 60, 41), plants.structure("A2")
+    found = fit_output_error([run], structure, refine=False)
+    # The third of the starts that was ahead ended at six and a hundred times the noise.
+    exact = plants.clean_run("A2")
+    for name in structure.outputs:
+        assert found.noise[name] < 1.1 * 1e-3 * np.std(exact[name])
+
+
 def test_an_order_too_many_ends_as_a_pole_too_fast_to_see_and_not_in_a_mode_of_the_scheme() -> None:
     rng = np.random.default_rng(1)
     rows = 400
