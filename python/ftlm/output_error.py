@@ -583,11 +583,7 @@ class LowerOrder:
 def lower_orders(problem: FreeProblem, runs: Sequence[Run], initial: Any) -> list[LowerOrder]:
     """The problem of lower order of one equation whose own orders are numbers; free orders get there by themselves."""
     structure = problem.structure
-    if (
-        structure.has_order_law
-        or problem.products
-        or (structure.coupling == "simulated" and len(structure.equations) > 1)
-    ):
+    if structure.has_order_law or problem.products or len(structure.equations) > 1:
         return []
     step = max(run.step for run in runs)
     item = structure.equations[0]

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 import ftlm
 from ftlm import _core
 from ftlm.demo import demo_plant
-from ftlm.output_error import FreeProblem, experiment, fit_output_error, is_white
+from ftlm.output_error import FreeProblem, experiment, fit_output_error, is_white, lower_orders
 
 THREE_TERMS = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
 
@@ -218,3 +218,16 @@ def test_the_choice_of_an_optimum_is_given_in_words() -> None:
     assert behind.choice == (
         "2 of 3 starts ended in the lowest optimum, first that of: a; the next costs 3 times as much"
     )
+
+
+def test_only_one_equation_of_whole_orders_starts_from_a_lower_one(small_run):
+    one = ftlm.equation("D^2 y = a1 D y + a0 y + b0 u", initial=(0.0, 1.0))
+    (lower,) = lower_orders(FreeProblem.of(one), [small_run], (0.0, 1.0))
+    assert [e.order.constant for e in lower.problem.structure.equations] == [1.0]
+    assert (lower.coefficient, lower.others, lower.initial) == ("a1", ("a0", "b0"), (0.0,))
+    for words in ("D^alpha y = a1 D y + a0 y + b0 u", "D^2 y = b0 u"):
+        assert lower_orders(FreeProblem.of(ftlm.equation(words)), [small_run], "rest") == []
+    # Of two equations each measures the other, but both are fitted at once.
+    pair = ftlm.flexible_link(stage=1, laws=(), coupling="measured")
+    whole = pair.with_orders({n: 2.0 if n.startswith("alpha") else 0.5 for n in pair.order_names})
+    assert lower_orders(FreeProblem.of(whole), [small_run], "rest") == []
