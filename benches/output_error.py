@@ -23,8 +23,9 @@ from scipy.special import binom, gamma
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
 
 import plants
-from ftlm.output_error import Attempt, FreeProblem, descend, experiment, fit_output_error
-from ftlm.records import record
+from ftlm.fit.joint import fit_output_error
+from ftlm.fit.problem import Attempt, FreeProblem, descend, experiment
+from ftlm.solve.records import record
 
 #: Factors on the true coefficients and shifts of the true orders from which both start.
 FACTORS = np.array([1.3, 0.8, 1.5, 1.2])

@@ -24,8 +24,9 @@ import numpy as np
 
 import ftlm
 from ftlm import _core
-from ftlm.order_search import REFINEMENTS, available_threads
-from ftlm.records import record
+from ftlm.base.checks import available_threads
+from ftlm.data.settings import REFINEMENTS
+from ftlm.solve.records import record
 from search import fft_time, plant_a_run
 
 HERE = Path(__file__).parent

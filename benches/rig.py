@@ -19,7 +19,7 @@ import numpy as np
 
 import ftlm
 from ftlm import rig
-from ftlm.demo import demo_plant
+from ftlm.paper.arm import demo_plant
 from ftlm.rig import watchdog
 from ftlm.rig.rig import Limits, Rig
 from ftlm.rig.virtual import SUBSTEP, VirtualBoard

@@ -17,9 +17,9 @@ import numpy as np
 
 import ftlm
 import literal
-from ftlm.demo import demo_plant
-from ftlm.order_search import available_threads
-from ftlm.records import record
+from ftlm.base.checks import available_threads
+from ftlm.paper.arm import demo_plant
+from ftlm.solve.records import record
 
 #: Candidates that the literal algorithm is timed on; each takes seconds.
 LITERAL = 20

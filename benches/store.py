@@ -24,8 +24,8 @@ from pathlib import Path
 import numpy as np
 
 import ftlm
-from ftlm.demo import demo_plant
-from ftlm.store import read_store
+from ftlm.paper.arm import demo_plant
+from ftlm.search.store import read_store
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 

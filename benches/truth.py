@@ -24,8 +24,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 import plants
-from ftlm.demo import demo_plant
-from ftlm.output_error import Attempt, FreeProblem, descend, experiment, fit_output_error
+from ftlm.fit.joint import fit_output_error
+from ftlm.fit.problem import Attempt, FreeProblem, descend, experiment
+from ftlm.paper.arm import demo_plant
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -1,29 +1,42 @@
 """Fractional-order models of flexible machines from measured data.
 
-Public names in the order in which a measurement passes them: runs, operators, equations and models, identification and
-order search, simulation and validation.
-
-What models are made of is imported at once, every other module when one of its names is first asked for: to import all
-of them takes longer than numpy does.
+Names are imported when they are first asked for: all of them together take longer than numpy does. Where each lives is
+the way of a measurement: data, files, solve, judge, fit, model, search, identification, and beside it arm, rig, paper.
 """
 
 import importlib as _importlib
 import typing as _typing
 
-from ftlm.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
-
-# A function with the name of its module: imported late, the module would take its place.
-from ftlm.flexible_link import PARAMETERS, LinkParameters, flexible_link, link_model, order_law
-
 if _typing.TYPE_CHECKING:
     from ftlm import rig
     from ftlm._core import __version__
-    from ftlm.baselines import Genetic
-    from ftlm.files import load
-    from ftlm.identification import Identification, Trace, identify, multi_innovation_trace
-    from ftlm.many import Identified, identify_many
-    from ftlm.models import Equation, Estimate, Model, Order, SensorFilter, Structure, Term, equation, load_model
-    from ftlm.operators import (
+    from ftlm.arm.link import flexible_link, link_model, order_law
+    from ftlm.arm.parameters import PARAMETERS, LinkParameters
+    from ftlm.base.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
+    from ftlm.data.equations import Equation, Term
+    from ftlm.data.language import equation
+    from ftlm.data.lattice import Lattice, lattice
+    from ftlm.data.orders import Order
+    from ftlm.data.run import Run
+    from ftlm.data.solved import Estimate
+    from ftlm.data.structures import SensorFilter, Structure
+    from ftlm.files.load import load
+    from ftlm.fit.genetic import Genetic
+    from ftlm.fit.recursion import Trace, multi_innovation_trace
+    from ftlm.identification.identify import identify
+    from ftlm.identification.many import Identified, identify_many
+    from ftlm.identification.physical import PhysicalParameter, physical_parameters
+    from ftlm.identification.result import Identification
+    from ftlm.judge.comparison import Comparison, compare
+    from ftlm.judge.criteria import InformationCriteria, information_criteria
+    from ftlm.judge.metrics import Metrics, metrics
+    from ftlm.judge.residuals import CorrelationTest, OutputResiduals, Residuals, resid
+    from ftlm.model.model import Model, load_model
+    from ftlm.paper.reproduction import Reproduction, reproduce
+    from ftlm.search.orders import resume_search, search_orders, search_status
+    from ftlm.search.result import SearchResult, SearchRow, StoreStatus
+    from ftlm.solve.free_run import explicit_euler, simulate
+    from ftlm.solve.operators import (
         block_pulse_matrix,
         fractional_derivative,
         fractional_integral,
@@ -32,168 +45,59 @@ if _typing.TYPE_CHECKING:
         haar_transform,
         operational_matrix,
     )
-    from ftlm.order_search import (
-        Lattice,
-        SearchResult,
-        SearchRow,
-        StoreStatus,
-        lattice,
-        resume_search,
-        search_orders,
-        search_status,
-    )
-    from ftlm.physical import PhysicalParameter, physical_parameters
-    from ftlm.reproduction import Reproduction, reproduce
-    from ftlm.residuals import (
-        CorrelationTest,
-        InformationCriteria,
-        OutputResiduals,
-        Residuals,
-        information_criteria,
-        resid,
-    )
-    from ftlm.runs import Run
-    from ftlm.simulation import explicit_euler, simulate
-    from ftlm.validation import Comparison, Metrics, compare, metrics
 
 __all__ = [
-    "PARAMETERS",
-    "Comparison",
-    "ConvergenceError",
-    "CorrelationTest",
-    "DataError",
-    "Equation",
-    "Estimate",
-    "FtlmError",
-    "Genetic",
-    "Identification",
-    "Identified",
-    "InformationCriteria",
-    "InternalError",
-    "Lattice",
-    "LinkParameters",
-    "Metrics",
-    "Model",
-    "ModelError",
-    "Order",
-    "OutputResiduals",
-    "PhysicalParameter",
-    "Reproduction",
-    "Residuals",
-    "RigFault",
-    "Run",
-    "SearchResult",
-    "SearchRow",
-    "SensorFilter",
-    "StoreStatus",
-    "Structure",
-    "Term",
-    "Trace",
-    "__version__",
-    "block_pulse_matrix",
-    "compare",
-    "equation",
-    "explicit_euler",
-    "flexible_link",
-    "fractional_derivative",
-    "fractional_integral",
-    "haar_inverse",
-    "haar_matrix",
-    "haar_transform",
-    "identify",
-    "identify_many",
-    "information_criteria",
-    "lattice",
-    "link_model",
-    "load",
-    "load_model",
-    "metrics",
-    "multi_innovation_trace",
-    "operational_matrix",
-    "order_law",
-    "physical_parameters",
-    "reproduce",
-    "resid",
-    "resume_search",
-    "rig",
-    "search_orders",
-    "search_status",
-    "simulate",
-]
+    "PARAMETERS", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation", "Estimate",
+    "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria", "InternalError", "Lattice",
+    "LinkParameters", "Metrics", "Model", "ModelError", "Order", "OutputResiduals", "PhysicalParameter",
+    "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow", "SensorFilter", "StoreStatus",
+    "Structure", "Term", "Trace", "__version__", "block_pulse_matrix", "compare", "equation", "explicit_euler",
+    "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse", "haar_matrix",
+    "haar_transform", "identify", "identify_many", "information_criteria", "lattice", "link_model", "load",
+    "load_model", "metrics", "multi_innovation_trace", "operational_matrix", "order_law", "physical_parameters",
+    "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status", "simulate",
+]  # fmt: skip
 
 #: Where each name lives.
 _HOMES = {
     name: home
     for home, names in {
-        "_core": ("__version__",),
-        "baselines": ("Genetic",),
-        "files": ("load",),
-        "reproduction": ("Reproduction", "reproduce"),
-        "identification": (
-            "Identification",
-            "Trace",
-            "identify",
-            "multi_innovation_trace",
-        ),
-        "models": (
-            "Equation",
-            "Estimate",
-            "Model",
-            "Order",
-            "SensorFilter",
-            "Structure",
-            "Term",
-            "equation",
-            "load_model",
-        ),
-        "operators": (
-            "block_pulse_matrix",
-            "fractional_derivative",
-            "fractional_integral",
-            "haar_inverse",
-            "haar_matrix",
-            "haar_transform",
-            "operational_matrix",
-        ),
-        "many": ("Identified", "identify_many"),
-        "order_search": (
-            "Lattice",
-            "SearchResult",
-            "SearchRow",
-            "StoreStatus",
-            "lattice",
-            "resume_search",
-            "search_orders",
-            "search_status",
-        ),
-        "physical": (
-            "PhysicalParameter",
-            "physical_parameters",
-        ),
-        "residuals": (
-            "CorrelationTest",
-            "InformationCriteria",
-            "OutputResiduals",
-            "Residuals",
-            "information_criteria",
-            "resid",
-        ),
-        "runs": ("Run",),
-        "simulation": (
-            "explicit_euler",
-            "simulate",
-        ),
-        "validation": (
-            "Comparison",
-            "Metrics",
-            "compare",
-            "metrics",
-        ),
+        "_core": "__version__",
+        "arm.link": "flexible_link link_model order_law",
+        "arm.parameters": "LinkParameters PARAMETERS",
+        "base.errors": "ConvergenceError DataError FtlmError InternalError ModelError RigFault",
+        "data.equations": "Equation Term",
+        "data.language": "equation",
+        "data.lattice": "Lattice lattice",
+        "data.orders": "Order",
+        "data.run": "Run",
+        "data.solved": "Estimate",
+        "data.structures": "SensorFilter Structure",
+        "files.load": "load",
+        "fit.genetic": "Genetic",
+        "fit.recursion": "Trace multi_innovation_trace",
+        "identification.identify": "identify",
+        "identification.many": "Identified identify_many",
+        "identification.physical": "PhysicalParameter physical_parameters",
+        "identification.result": "Identification",
+        "judge.comparison": "Comparison compare",
+        "judge.criteria": "InformationCriteria information_criteria",
+        "judge.metrics": "Metrics metrics",
+        "judge.residuals": "CorrelationTest OutputResiduals Residuals resid",
+        "model.model": "Model load_model",
+        "paper.reproduction": "Reproduction reproduce",
+        "search.orders": "resume_search search_orders search_status",
+        "search.result": "SearchResult SearchRow StoreStatus",
+        "solve.free_run": "explicit_euler simulate",
+        "solve.operators": "block_pulse_matrix fractional_derivative fractional_integral haar_inverse haar_matrix "
+        "haar_transform operational_matrix",
     }.items()
-    for name in names
+    for name in names.split()
 }
 #: Modules that are asked for as attributes.
-_MODULES = frozenset({*_HOMES.values(), "plot", "progress", "rig"})
+_MODULES = frozenset(
+    {"advice", "demo", "errors", "exports", "frequency", "plot", "progress", "report", "reproduction", "rig"}
+)
 
 
 def __getattr__(name: str) -> object:

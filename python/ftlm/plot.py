@@ -1,4 +1,4 @@
-"""Figures for papers as matplotlib objects: fits, residual tests, order landscapes, Bode plots; drawn in `report`."""
+"""Figures for papers as matplotlib objects: fits, residual tests, order landscapes, Bode plots."""
 
 from ftlm.report.plots import bode, fit, landscape, residuals
 

@@ -11,8 +11,9 @@ import msgspec
 import numpy as np
 
 import ftlm
-from ftlm import files, store
-from ftlm.models import Order, parse_values
+from ftlm.data.orders import Order, parse_values
+from ftlm.files import apart
+from ftlm.search import store
 
 #: Files of the fuzzers live in memory where there is such a place.
 FOLDER = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())
@@ -55,7 +56,7 @@ def parquet(data):
 
 def answer(data):
     """What the child that reads .mat and parquet files says; it may have been taken over by the file."""
-    answers = files._Answers(data)
+    answers = apart._Answers(data)
     while answers.table(Path("x.mat")) is not None:
         pass
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 import ftlm
-from ftlm.order_search import make_job
-from ftlm.store import Store
+from ftlm.search.orders import make_job
+from ftlm.search.store import Store
 
 HERE = Path(__file__).resolve().parent
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.advice import spectral_lines
+from ftlm.data.advice import spectral_lines
 
 DATA = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="measured data are not here; set FTLM_DATA")

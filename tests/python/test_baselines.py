@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm import baselines
-from ftlm.baselines import Genetic, genetic_search, polynomial, simulated_binary
-from ftlm.order_search import prepare
+from ftlm.fit import genetic
+from ftlm.fit.genetic import Genetic, genetic_search, polynomial, simulated_binary
+from ftlm.solve.records import prepare
 
 EQUATION = "D^alpha y = a D^nu y + c y + b u"
 BOUNDS = {"a": (-10.0, 0.0), "c": (-20.0, 0.0), "b": (0.0, 10.0)}
@@ -50,7 +50,7 @@ def test_what_the_result_depends_on_is_told(found):
 
 def test_orders_keep_to_their_steps_and_below_alpha(found):
     for value in found.orders.values():
-        assert value == pytest.approx(round(value / baselines.RESOLUTION) * baselines.RESOLUTION, abs=1e-12)
+        assert value == pytest.approx(round(value / genetic.RESOLUTION) * genetic.RESOLUTION, abs=1e-12)
     assert found.orders["nu"] < found.orders["alpha"]
 
 
@@ -74,7 +74,7 @@ def test_equal_seeds_give_equal_results_for_any_number_of_threads_and_touch_no_g
 
 def test_leaving_hopeless_candidates_early_changes_nothing(small_run, monkeypatch):
     early = searched(small_run)
-    monkeypatch.setattr(baselines._Kept, "limit", property(lambda self: np.inf))
+    monkeypatch.setattr(genetic._Kept, "limit", property(lambda self: np.inf))
     assert searched(small_run) == early
 
 

@@ -12,7 +12,8 @@ from typer.testing import CliRunner
 import ftlm
 import plants
 from ftlm import _core, cli
-from ftlm.output_error import Attempt, FreeProblem, descend, experiment, fit_output_error
+from ftlm.fit.joint import fit_output_error
+from ftlm.fit.problem import Attempt, FreeProblem, descend, experiment
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 

@@ -14,8 +14,8 @@ from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPool
 import pytest
 
 import ftlm
-from ftlm import rounds
 from ftlm.errors import ConvergenceError, DataError, ModelError
+from ftlm.search import work as rounds
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 

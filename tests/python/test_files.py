@@ -14,10 +14,10 @@ import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ftlm import files
+from ftlm.data.run import Run
 from ftlm.errors import DataError
-from ftlm.files import load
-from ftlm.runs import Run
+from ftlm.files import apart
+from ftlm.files.load import load
 
 DATA = Path(os.environ.get("FTLM_DATA") or Path(__file__).resolve().parents[2].parent / "shared" / "data")
 PSF = DATA / "two_link_psf"
@@ -96,7 +96,7 @@ def test_any_file_that_is_text_is_read_as_text(tmp_path, name):
 def test_a_file_of_many_blocks_is_read_whole(tmp_path, monkeypatch):
     path = write(tmp_path, "# note\nt,u,y\n" + rows(500))
     whole = load(path, **HEADED)
-    monkeypatch.setattr(files, "_BLOCK", 97)
+    monkeypatch.setattr("ftlm.files.text._BLOCK", 97)
     pieces = load(path, **HEADED)
     assert pieces["u"].tobytes() == whole["u"].tobytes()
     text = ("t,u,y\n" + rows(500)).replace("\n1.50,", "\n1.50,oops").replace("\n3.50,", "\n3.50,oops")
@@ -292,7 +292,7 @@ def test_bad_paths_are_refused(tmp_path, monkeypatch):
     for name in ("x.parquet", "x.PQ"):
         pytest.importorskip("pyarrow", reason="pyarrow is not here; pip install -r requirements-test.txt")
         messages(["damaged", "intact copy"], lambda name=name: load(write(tmp_path, b"PAR1", name)))
-    monkeypatch.setattr(files, "_SIZE_LIMIT", 100)
+    monkeypatch.setattr("ftlm.files.load._SIZE_LIMIT", 100)
     messages(["square.csv", "more than the limit of 100"], lambda: load(path, **HEADED))
 
 
@@ -541,26 +541,26 @@ def reader(folder, body):
 )
 def test_a_reader_that_dies_or_babbles_gives_a_data_error(tmp_path, monkeypatch, body, words):
     path = mat(tmp_path, V=table())
-    monkeypatch.setattr(files, "_READER", reader(tmp_path, body))
-    monkeypatch.setattr(files, "_READER_SECONDS", 1.0)
+    monkeypatch.setattr(apart, "_READER", reader(tmp_path, body))
+    monkeypatch.setattr(apart, "_READER_SECONDS", 1.0)
     messages(["x.mat", *words], lambda: load(path, outputs={"y": "V.3"}))
 
 
 def test_a_crash_names_the_file_that_caused_it(tmp_path, monkeypatch):
     paths = [mat(tmp_path, f"{name}.mat", **{name: table()}) for name in "abc"]
     body = "print('{}', flush=True)\nos.kill(os.getpid(), signal.SIGSEGV)"
-    monkeypatch.setattr(files, "_READER", reader(tmp_path, body.replace("{}", '{"error": "e", "way_out": "w"}')))
+    monkeypatch.setattr(apart, "_READER", reader(tmp_path, body.replace("{}", '{"error": "e", "way_out": "w"}')))
     messages(["a.mat", "e; w"], lambda: load(paths, outputs={"y": "a.3"}))
     good = '{"arrays": [{"name": "a", "rows": 1, "columns": 1, "type": "float64"}], "skipped": {}}'
     body = f"sys.stdout.write('{good}\\\\n' + '\\\\0' * 8)\nsys.stdout.flush()\nos.kill(os.getpid(), signal.SIGSEGV)"
-    monkeypatch.setattr(files, "_READER", reader(tmp_path, body.replace("\\\\", "\\")))
+    monkeypatch.setattr(apart, "_READER", reader(tmp_path, body.replace("\\\\", "\\")))
     messages(["b.mat", "signal 11"], lambda: load(paths, outputs={"y": "a"}))
 
 
 def test_missing_scipy_is_said(tmp_path, monkeypatch):
     path = mat(tmp_path, V=table())
-    found = files.importlib.util.find_spec
-    monkeypatch.setattr(files.importlib.util, "find_spec", lambda name: None if name == "scipy" else found(name))
+    found = apart.importlib.util.find_spec
+    monkeypatch.setattr(apart.importlib.util, "find_spec", lambda name: None if name == "scipy" else found(name))
     messages(["scipy", "pip install 'ftlm[mat]'"], lambda: load(path, outputs={"y": "V.3"}))
 
 

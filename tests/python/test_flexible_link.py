@@ -280,7 +280,7 @@ def test_both_stages_simulate_as_each_alone(plant, drive):
 
 def arm_in_motion(rows, noise=0.0):
     """Both stages under one square current; they do not drive each other in the model."""
-    from ftlm.demo import demo_plant
+    from ftlm.paper.arm import demo_plant
 
     step = 0.002
     current = np.where((np.arange(rows) * step + step / 2) % 2 < 1, 0.3, -0.3)
@@ -330,7 +330,7 @@ def test_the_whole_arm_is_searched_stage_by_stage():
 
 @pytest.mark.slow
 def test_the_whole_arm_is_one_joint_fit():
-    from ftlm.demo import demo_plant
+    from ftlm.paper.arm import demo_plant
 
     found = ftlm.identify(arm_in_motion(5000, 0.01), replace(ftlm.flexible_link(stage="both"), initial="rest"))
     assert len(found.joint.names) == 20

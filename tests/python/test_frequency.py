@@ -8,8 +8,9 @@ import pytest
 
 import ftlm
 from ftlm import frequency
-from ftlm.demo import demo_plant
-from ftlm.frequency import right_zeros
+from ftlm.paper.arm import demo_plant
+from ftlm.solve.frequency import model_numbers
+from ftlm.solve.stability import _roots, right_zeros
 
 TWO = "D^1.7 y = -20 y - 2 D^0.7 y + 15 z + 10 u; D^1.2 z = -5 z + 3 D^0.4 y + 2 D^0.3 u + v"
 
@@ -160,7 +161,7 @@ def test_matignon_and_the_argument_principle_agree():
         powers = np.sort(rng.choice(np.arange(1, 31), terms, replace=False)) / 10
         values = rng.choice([-1, 1], terms + 1, p=[0.25, 0.75]) * 10 ** rng.uniform(-2, 2, terms + 1)
         polynomial = {0.0: float(values[0])} | dict(zip(powers.tolist(), values[1:].tolist(), strict=True))
-        base, roots = frequency._roots(polynomial)
+        base, roots = _roots(polynomial)
         by_roots = int(np.sum(np.abs(np.angle(roots)) < base * math.pi / 2))
         count, on_axis = right_zeros(polynomial)
         assert not on_axis
@@ -258,7 +259,7 @@ def test_laws_carry_their_uncertainty_to_every_number(fits):
 def test_the_covariance_of_a_tied_coefficient_is_that_of_its_product(plant, drive, with_noise):
     clean = plant("A").simulate(drive("A", 1500), tolerance=1e-5)
     fit = ftlm.identify(with_noise(clean, 1e-4, 1), ftlm.flexible_link(stage=1))
-    numbers = frequency.model_numbers(fit.model)
+    numbers = model_numbers(fit.model)
     deviation = np.sqrt(np.diag(np.array(fit.model.estimate.covariance)))
     errors, values = fit.standard_errors, fit.joint.coefficients
     at = {t.name: 9 * i + 2 * k + 2 for i, e in enumerate(fit.model.equations) for k, t in enumerate(e.terms)}

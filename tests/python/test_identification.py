@@ -9,7 +9,7 @@ import pytest
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.records import record, structure_tuple
+from ftlm.solve.records import record, structure_tuple
 
 METHODS = ("least-squares", "multi-innovation")
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"

@@ -12,7 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ftlm
-from ftlm.models import SensorFilter, check_initial, grid, numeric, parse_equation, parse_values, write_atomically
+from ftlm.base.output import write_atomically
+from ftlm.data.equations import numeric
+from ftlm.data.language import parse_equation
+from ftlm.data.orders import grid, parse_values
+from ftlm.data.structures import SensorFilter, check_initial
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Orders

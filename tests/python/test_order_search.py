@@ -17,7 +17,8 @@ import ftlm
 import ftlm.progress
 import oracles
 from ftlm import _core
-from ftlm.order_search import Settings, available_threads, check_threads
+from ftlm.base.checks import available_threads, check_threads
+from ftlm.data.settings import Settings
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 GRID = {"alpha": [1.4, 1.6, 1.8], "beta": [0.0, 0.3, 0.6, 0.9], "mu": [0.0, 0.3, 0.6, 0.9], "nu": [0.0, 0.2]}

@@ -10,8 +10,11 @@ from scipy.optimize import least_squares
 
 import ftlm
 from ftlm import _core
-from ftlm.demo import demo_plant
-from ftlm.output_error import FreeProblem, experiment, fit_output_error, is_white, lower_orders
+from ftlm.base.statistics import is_white
+from ftlm.fit.joint import fit_output_error
+from ftlm.fit.problem import FreeProblem, experiment
+from ftlm.fit.simpler import lower_orders
+from ftlm.paper.arm import demo_plant
 
 THREE_TERMS = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
 

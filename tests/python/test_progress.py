@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from ftlm import progress
+from ftlm.base import progress
 from ftlm.progress import Progress, Stoppable
 
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.order_search import prepare
-from ftlm.records import default_m, equation_tuple, initial_tuple, record, structure_tuple
+from ftlm.solve.records import default_m, equation_tuple, initial_tuple, prepare, record, structure_tuple
 
 
 def make_run(outputs=None, inputs=None, step=0.1, **options):

@@ -12,7 +12,9 @@ import pytest
 
 import ftlm
 from ftlm import report
-from ftlm.report import figures, tables
+from ftlm.paint import axes
+from ftlm.paint import text as words
+from ftlm.paint.lines import LINE
 
 HOSTILE = "</script><script>alert(1)</script>\"><svg onload=alert(1)> & 'x'"
 VOID = {"meta", "link", "br", "hr", "img", "input"}
@@ -346,25 +348,25 @@ def test_many_runs_stay_within_two_megabytes(tmp_path, identified, square):
 
 
 def test_numbers_read_alike():
-    assert tables.number(-863.33256) == "−863.33"
-    assert tables.number(0.1) == "0.10000"
-    assert tables.number(12345.0) == "12345"
-    assert tables.number(1.23456e-7) == "1.2346×10⁻⁷"
-    assert tables.number(313845) == tables.number(np.int64(313845)) == "313\u202f845"
-    assert tables.number(tables.Exact(0.95)) == "0.95"
-    assert tables.number(0.0) == "0"
-    assert tables.number(math.inf) == "∞ diverged"
-    assert tables.number(-math.inf) == "−∞ diverged"
-    assert tables.number(math.nan) == "undefined"
+    assert words.number(-863.33256) == "−863.33"
+    assert words.number(0.1) == "0.10000"
+    assert words.number(12345.0) == "12345"
+    assert words.number(1.23456e-7) == "1.2346×10⁻⁷"
+    assert words.number(313845) == words.number(np.int64(313845)) == "313\u202f845"
+    assert words.number(words.Exact(0.95)) == "0.95"
+    assert words.number(0.0) == "0"
+    assert words.number(math.inf) == "∞ diverged"
+    assert words.number(-math.inf) == "−∞ diverged"
+    assert words.number(math.nan) == "undefined"
 
 
 def test_names_are_written_by_hand():
-    assert tables.symbol("theta12") == "θ₁₂"
-    assert tables.symbol("I1") == "I₁"
-    assert tables.symbol("motor2") == "motor2"
-    assert tables.symbol("<b>") == "<b>"
-    assert str(tables.symbol_html("mu2")) == "<i>μ</i><sub>2</sub>"
-    assert str(tables.symbol_html("<b>")) == "<i>&lt;b&gt;</i>"
+    assert words.symbol("theta12") == "θ₁₂"
+    assert words.symbol("I1") == "I₁"
+    assert words.symbol("motor2") == "motor2"
+    assert words.symbol("<b>") == "<b>"
+    assert str(words.symbol_html("mu2")) == "<i>μ</i><sub>2</sub>"
+    assert str(words.symbol_html("<b>")) == "<i>&lt;b&gt;</i>"
 
 
 def test_equation_reads_as_on_paper():
@@ -481,7 +483,7 @@ def test_ticks_are_sane(seed):
     rng = np.random.default_rng(seed)
     low = float(rng.standard_normal() * 10.0 ** rng.integers(-12, 12))
     high = low + float(abs(rng.standard_normal()) * 10.0 ** rng.integers(-3, 3) * (abs(low) + 1e-12))
-    found = figures.ticks(low, high, 5)
+    found = axes.ticks(low, high, 5)
     steps = np.diff(found.values)
     slack = 1e-6 * (high - low)
     assert 2 <= len(found.values) <= 12
@@ -494,10 +496,10 @@ def test_ticks_are_sane(seed):
 
 
 def test_ticks_are_round():
-    assert figures.ticks(0, 10, 5).labels == ["0", "2", "4", "6", "8", "10"]
-    assert figures.ticks(-0.1, 0.1, 5).labels == ["−0.10", "−0.05", "0.00", "0.05", "0.10"]
-    assert figures.ticks(0, 0.3, 3).values == [0, 0.1, 0.2, 0.3]
-    small = figures.ticks(-1e-7, 1e-7, 5)
+    assert axes.ticks(0, 10, 5).labels == ["0", "2", "4", "6", "8", "10"]
+    assert axes.ticks(-0.1, 0.1, 5).labels == ["−0.10", "−0.05", "0.00", "0.05", "0.10"]
+    assert axes.ticks(0, 0.3, 3).values == [0, 0.1, 0.2, 0.3]
+    small = axes.ticks(-1e-7, 1e-7, 5)
     assert (small.labels[0], small.factor) == ("−100", "×10⁻⁹")
 
 
@@ -505,8 +507,8 @@ def test_decimation_keeps_extremes_and_ends():
     rng = np.random.default_rng(5)
     y = rng.standard_normal(100_000)
     y[[12_345, 54_321, 77_777]] = [40.0, -50.0, np.nan]
-    kept = report.figures.decimate(y)
-    assert kept.size <= report.figures.POINTS
+    kept = axes.decimate(y)
+    assert kept.size <= axes.POINTS
     assert np.all(np.diff(kept) > 0)
     assert {0, 12_345, 54_321, y.size - 1} <= set(kept.tolist())
     assert np.all(np.isfinite(y[kept]))
@@ -514,8 +516,8 @@ def test_decimation_keeps_extremes_and_ends():
     for part in np.array_split(np.arange(y.size), 300):
         inside = kept[(kept >= part[0]) & (kept <= part[-1])]
         assert inside.size >= 2
-    np.testing.assert_array_equal(report.figures.decimate([1.0, np.inf, 2.0]), [0, 2])
-    assert report.figures.decimate(np.full(3, np.nan)).size == 0
+    np.testing.assert_array_equal(axes.decimate([1.0, np.inf, 2.0]), [0, 2])
+    assert axes.decimate(np.full(3, np.nan)).size == 0
 
 
 def paths_of(svg):
@@ -607,7 +609,7 @@ def test_lines_are_told_apart_without_colour():
     heights = [
         float(y) for y in re.findall(r'<text x="[\d.]+" y="([\d.]+)" text-anchor="start">(?:measured|p = )', chart.svg)
     ]
-    assert np.min(np.diff(np.sort(heights))) >= figures.LINE - 0.11
+    assert np.min(np.diff(np.sort(heights))) >= LINE - 0.11
 
 
 def test_extreme_data_still_draw():

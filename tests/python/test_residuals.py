@@ -9,7 +9,8 @@ import pytest
 
 import ftlm
 from ftlm import _core
-from ftlm.residuals import chi_squared_99, residual_warnings
+from ftlm.base.statistics import chi_squared_99
+from ftlm.judge.residuals import residual_warnings
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
 

@@ -14,9 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from ftlm.data.run import Run
+from ftlm.data.several import check_compatible
 from ftlm.errors import DataError, FtlmError
-from ftlm.files import load
-from ftlm.runs import Run, check_compatible
+from ftlm.files.load import load
 
 N = 50
 

@@ -20,7 +20,8 @@ import ftlm
 import store as bench
 from ftlm import _core
 from ftlm.errors import ModelError
-from ftlm.store import MAGIC, Joined, Rounds, Store, Verdicts, read_store
+from ftlm.search.frames import MAGIC, Joined, Rounds, Verdicts
+from ftlm.search.store import Store, read_store
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 COARSE = ftlm.lattice(step=0.1)
@@ -101,7 +102,7 @@ def test_several_runs_a_delay_and_a_sensor_filter_survive_in_a_store(run, tmp_pa
 
 def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
     """R4: any number of threads, any stretch of rounds, in any order."""
-    from ftlm.order_search import make_job
+    from ftlm.search.orders import make_job
 
     job = make_job(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
     work, _ = job.work()
@@ -340,8 +341,8 @@ def search_stage(run, path=None, *, structure=None, lattice=None, **options):
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Some candidates a frame, so that a small store has many."""
-    monkeypatch.setattr("ftlm.rounds.FEWEST", 16)
-    monkeypatch.setattr("ftlm.rounds.PIECE", 0.0)
+    monkeypatch.setattr("ftlm.search.rounds.FEWEST", 16)
+    monkeypatch.setattr("ftlm.search.rounds.PIECE", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -450,7 +451,7 @@ def test_a_stage_goes_on_wherever_it_was_cut(stage_run, stage_store, stage_expec
 def test_a_finished_search_of_a_stage_is_only_read(stage_run, stage_store, stage_expected, tmp_path, monkeypatch):
     path = tmp_path / "s.ftlm"
     path.write_bytes(stage_store)
-    monkeypatch.setattr("ftlm.rounds.StageWork.ready", None)
+    monkeypatch.setattr("ftlm.search.work.StageWork.ready", None)
     assert bytes_of(ftlm.resume_search(path)["stage"]) == stage_expected
     assert ftlm.search_status(path)["stage"].complete
     held = msgspec.structs.asdict(read_store(path).sections[0].joined)
@@ -513,7 +514,7 @@ def test_the_search_of_another_stage_is_refused(stage_run, stage_store, tmp_path
 
 def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_pieces, tmp_path):
     """What a forger would write: whole frames, under digests that are right."""
-    from ftlm.order_search import make_job
+    from ftlm.search.orders import make_job
 
     job = make_job(stage_run, ftlm.flexible_link(), ftlm.Lattice(orders=STAGE), m=64, keep=8)
     work, _ = job.stage_work()
@@ -639,7 +640,7 @@ def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_w
     finished, half = tmp_path / "finished.ftlm", tmp_path / "half.ftlm"
     finished.write_bytes(whole)
     half.write_bytes(whole[: len(whole) // 2])
-    monkeypatch.setattr("ftlm.store.ALGORITHM", 2)
+    monkeypatch.setattr("ftlm.search.store.ALGORITHM", 2)
     assert bytes_of(ftlm.resume_search(finished)["y"]) == expected
     assert finished.read_bytes() == whole
     kept = read_store(half).end
@@ -679,7 +680,7 @@ def test_a_full_disk_leaves_the_store_whole(run, expected, tmp_path, monkeypatch
         return written
 
     with monkeypatch.context() as patch:
-        patch.setattr("ftlm.store.os.write", full)
+        patch.setattr("ftlm.search.store.os.write", full)
         with pytest.raises(ftlm.DataError, match=r"cannot be written: No space left on device; what it holds is whole"):
             search(run, path)
     assert read_store(path).torn == 0
@@ -689,7 +690,7 @@ def test_a_full_disk_leaves_the_store_whole(run, expected, tmp_path, monkeypatch
 
 def _header(run, path):
     """A store whose search has only begun: its size."""
-    from ftlm.order_search import make_job
+    from ftlm.search.orders import make_job
 
     job = make_job(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
     Store(path, [job.request("y")]).close()
@@ -795,7 +796,7 @@ def test_paths_that_hold_no_store_are_refused(run, tmp_path):
 
 
 def test_the_core_refuses_checkpoints_and_parts_of_another_search(run):
-    from ftlm.order_search import make_job
+    from ftlm.search.orders import make_job
 
     job = make_job(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
     work, _ = job.work()

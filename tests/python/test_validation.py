@@ -9,7 +9,7 @@ import pytest
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.validation import near_identity
+from ftlm.judge.comparison import near_identity
 
 
 def noisy(run, sigma, seed):

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import importlib
 import io
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ftlm.errors import ModelError
-from ftlm.identification import Identification
-from ftlm.models import Model
-from ftlm.report.figures import LINES, bode_curves, pulse_times, response_frequencies
-from ftlm.report.landscape import Landscape, output_error_landscape
-from ftlm.report.landscape import landscape as scores_of
-from ftlm.report.tables import symbol
-from ftlm.residuals import Residuals
-from ftlm.validation import Comparison
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from numpy.typing import ArrayLike
-
-    from ftlm.runs import Run
-
-__all__ = ["bode", "fit", "landscape", "residuals"]
+from ftlm.base.errors import ModelError
+from ftlm.data.run import Run
+from ftlm.identification.landscape import output_error_landscape
+from ftlm.identification.result import Identification
+from ftlm.judge.charts import pulse_times
+from ftlm.judge.comparison import Comparison
+from ftlm.judge.residuals import Residuals
+from ftlm.model.charts import bode_curves, response_frequencies
+from ftlm.model.model import Model
+from ftlm.paint.heat import Landscape
+from ftlm.paint.lines import LINES
+from ftlm.paint.text import symbol
+from ftlm.search.orders import landscape as scores_of
 
 #: Width of a figure, and height of one row of axes [inches]: a journal's double column.
 WIDTH, ROW = 7.0, 2.2

@@ -2,277 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-import json
 import math
 import os
 import signal
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from ftlm.errors import DataError, FtlmError, ModelError, RigFault
-from ftlm.files import column_names, load
-from ftlm.rig.rig import COLUMNS, CURRENT_LIMIT, LONGEST, Limits, Rig
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import DataError, FtlmError, ModelError, RigFault
+from ftlm.data.names import is_run_name
+from ftlm.data.run import Run, build
+from ftlm.fit.streaming import Streaming
+from ftlm.rig.excitation import INPUTS, Excitation, check_times, column_of
+from ftlm.rig.quanser import QuanserBoard
+from ftlm.rig.recording import UNITS, Partial, partial_of, saved
+from ftlm.rig.rig import COLUMNS, Board, Limits, Rig
 from ftlm.rig.virtual import ArmParameters, VirtualBoard
-from ftlm.runs import Run, build, is_run_name
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from ftlm.rig.rig import Board, Floats
-    from ftlm.streaming import Streaming
-
-__all__ = ["SHAPES", "Excitation", "record"]
-
-SHAPES = ("square", "sine", "chirp", "multisine", "prbs", "doublet", "csv")
-INPUTS = ("I1", "I2")
-UNITS = {name: "A" if name.startswith("I") else "rad" for name in COLUMNS}
-#: The paper's sine [rad/s].
-_SINE = 6.3
 #: The stock low-pass of the deflections: natural frequency [rad/s] and damping.
 STOCK_FILTER = (math.sqrt(157.9137), 22.6195 / (2.0 * math.sqrt(157.9137)))
 #: Rows that are handed over at a time. In real time they are few, so that writing them takes less than a sample.
 _ROWS_PACED, _ROWS_FAST = 32, 500
-
-
-@dataclass(frozen=True)
-class Excitation:
-    """A current for both motors.
-
-    Parameters
-    ----------
-    shape
-        One of SHAPES. ``"square"``: duty one half. ``"sine"``. ``"chirp"``: a sine whose frequency rises exponentially
-        over the band. ``"multisine"``: every multiple of 1/period in the band, with equal amplitudes and random phases.
-        ``"prbs"``: at random plus or minus, decided anew every `period`. ``"doublet"``: half a period plus, half minus,
-        then nothing. ``"csv"``: columns I1 and I2 [A] of a file, held from row to row.
-    amplitude
-        Largest current [A], of both motors or (stage 1, stage 2).
-    period
-        [s]; default 2 for square, doublet and multisine (there 10), 2 pi/6.3 for sine, 0.1 for prbs.
-    band
-        Lowest and highest frequency of chirp and multisine [Hz].
-    ramp
-        Time over which the amplitude grows from zero [s].
-    seed
-        Of prbs and multisine; the motors get different ones.
-    file
-        Of csv.
-    """
-
-    shape: str = "square"
-    amplitude: float | tuple[float, float] = 0.3
-    period: float | None = None
-    band: tuple[float, float] = (0.1, 20.0)
-    ramp: float = 0.0
-    seed: int = 0
-    file: str | os.PathLike[str] | None = None
-
-    def commands(self, rate: float, duration: float) -> Floats:
-        """Currents [A], shape (round(duration·rate) + 1, 2); the last row is zero.
-
-        Raises
-        ------
-        ModelError
-            A shape, amplitude, period or band that cannot be used; an amplitude over the amplifiers' limit.
-        DataError
-            A file that cannot be used.
-        """
-        rows = round(duration * rate) + 1
-        t = np.arange(rows) / rate
-        if not (isinstance(self.ramp, (int, float)) and 0 <= self.ramp <= duration):
-            raise ModelError(f"ramp = {self.ramp!r} s is outside [0, {duration:g}] s, the length of the run")
-        if self.shape == "csv":
-            found = self._file(t, rate)
-        else:
-            found = self._shapes(t, rate, duration) * np.array(self._amplitudes())
-        if self.ramp > 0:
-            found = found * np.minimum(1.0, t / self.ramp)[:, None]
-        found[-1] = 0.0
-        for k, limit in enumerate(CURRENT_LIMIT):
-            over = np.flatnonzero(np.abs(found[:, k]) > limit * (1 + 1e-12))
-            if over.size:
-                raise ModelError(
-                    f"the current of motor {k + 1} is {found[over[0], k]:.4g} A at {t[over[0]]:.4g} s ({over.size} "
-                    f"samples in all), over the limit of {limit:g} A; use a smaller amplitude"
-                )
-        return found
-
-    def _amplitudes(self) -> tuple[float, float]:
-        given = self.amplitude if isinstance(self.amplitude, (tuple, list)) else (self.amplitude, self.amplitude)
-        if len(given) != 2 or not all(isinstance(a, (int, float)) and math.isfinite(a) and a >= 0 for a in given):
-            raise ModelError(f"amplitude = {self.amplitude!r} is not a current in A, or a pair of them")
-        for k, (value, limit) in enumerate(zip(given, CURRENT_LIMIT, strict=True)):
-            if value > limit:
-                raise ModelError(
-                    f"amplitude = {value:g} A of motor {k + 1} is over the limit of {limit:g} A; use a smaller one"
-                )
-        return float(given[0]), float(given[1])
-
-    def _period(self, rate: float) -> float:
-        usual = {"sine": 2 * math.pi / _SINE, "prbs": 0.1, "multisine": 10.0}.get(self.shape, 2.0)
-        period = usual if self.period is None else self.period
-        if not (isinstance(period, (int, float)) and math.isfinite(period) and period * rate >= 2):
-            raise ModelError(f"period = {self.period!r} s is not a time of at least two samples ({2 / rate:g} s)")
-        return float(period)
-
-    def _shapes(self, t: Floats, rate: float, duration: float) -> Floats:
-        period = self._period(rate)
-        # Half a sample of slack keeps rounding from moving an edge.
-        phase = ((t + 0.5 / rate) % period) / period
-        if self.shape == "square":
-            one = np.where(phase < 0.5, 1.0, -1.0)
-        elif self.shape == "sine":
-            one = np.sin(2 * math.pi * t / period)
-        elif self.shape == "doublet":
-            one = np.where(t + 0.5 / rate < period, np.where(phase < 0.5, 1.0, -1.0), 0.0)
-        elif self.shape == "chirp":
-            low, high = self._band(rate)
-            growth = math.log(high / low)
-            one = np.sin(2 * math.pi * low * duration / growth * np.expm1(growth * t / duration))
-        elif self.shape in ("prbs", "multisine"):
-            return np.column_stack([self._random(t, rate, period, motor) for motor in (0, 1)])
-        else:
-            raise ModelError(f"input = {self.shape!r} is not known; use one of {', '.join(SHAPES)}")
-        return np.column_stack([one, one])
-
-    def _random(self, t: Floats, rate: float, period: float, motor: int) -> Floats:
-        rng = np.random.default_rng([self.seed, motor])
-        if self.shape == "prbs":
-            held = np.floor((t + 0.5 / rate) / period).astype(np.int64)
-            return rng.choice([-1.0, 1.0], size=int(held[-1]) + 1)[held]
-        low, high = self._band(rate)
-        lines = np.arange(math.ceil(low * period - 1e-9), math.floor(high * period + 1e-9) + 1)
-        lines = lines[(lines > 0) & (2 * lines <= round(period * rate))]
-        if lines.size == 0:
-            raise ModelError(f"band = {self.band!r} Hz holds no multiple of 1/period = {1 / period:g} Hz; widen it")
-        phases = rng.uniform(0, 2 * math.pi, lines.size)
-        n = max(2, round(period * rate))
-        spectrum = np.zeros(n // 2 + 1, dtype=np.complex128)
-        spectrum[lines] = np.exp(1j * phases)
-        one: Floats = np.fft.irfft(spectrum, n)
-        one /= np.abs(one).max()
-        return one[np.arange(t.size) % n]
-
-    def _band(self, rate: float) -> tuple[float, float]:
-        band = self.band
-        good = isinstance(band, (tuple, list)) and len(band) == 2 and all(isinstance(b, (int, float)) for b in band)
-        if not good or not 0 < band[0] < band[1] <= rate / 2:
-            raise ModelError(f"band = {band!r} Hz is not two rising frequencies up to half the rate, {rate / 2:g} Hz")
-        return float(band[0]), float(band[1])
-
-    def _file(self, t: Floats, rate: float) -> Floats:
-        if self.file is None:
-            raise ModelError("input = 'csv' needs a file; give it as file= (--file)")
-        names = column_names(self.file)
-        currents = [name for name in INPUTS if names is not None and name in names]
-        # A run that ftlm wrote knows its signals; any other file is asked for the currents alone.
-        run = load(self.file) if names is None else load(self.file, outputs=currents) if currents else None
-        if run is None or not any(name in run for name in INPUTS):
-            raise DataError(f"{str(self.file)!r} has no column I1 or I2; name the currents [A] so")
-        rows = np.minimum(np.floor(t / run.step + 1e-6).astype(np.int64), run.length - 1)
-        past = t > run.duration + run.step * (1 - 1e-6)
-        given = {name: run[name] for name in INPUTS if name in run}
-        zero = np.zeros(run.length)
-        found = np.column_stack([given.get(name, zero)[rows] for name in INPUTS])
-        found[past] = 0.0
-        return found
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        told = asdict(self) | {"file": None if self.file is None else Path(self.file).name}
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in told.items() if v is not None}
-
-
-def partial_of(target: Path) -> Path:
-    """Where the rows of a run are until it has ended."""
-    return target.with_name(target.stem + ".csv.partial")
-
-
-class Partial:
-    """Rows on disk while they come: a csv file beside the one asked for, which loads should the program die.
-
-    Parameters
-    ----------
-    target
-        The file asked for; None keeps nothing on disk.
-    name, step, about
-        Of the run.
-    """
-
-    def __init__(self, target: Path | None, name: str, step: float, about: dict[str, Any]) -> None:
-        self.path = None if target is None else partial_of(target)
-        self._step, self._rows = step, 0
-        self._descriptor: int | None = None
-        if self.path is None:
-            return
-        header = {
-            "name": name, "step": step, "start": 0.0, "inputs": list(INPUTS), "outputs": list(COLUMNS[2:]),
-            "units": UNITS, "intersample": dict.fromkeys(INPUTS, "zoh"),
-            "warnings": ["the recording did not end: the program died, or the disk was full"],
-            "about": about | {"faults": ["the recording did not end"]},
-        }  # fmt: skip
-        lines = f"# ftlm-run 1 {json.dumps(header, ensure_ascii=False)}\n{','.join(['t_s', *COLUMNS])}\n"
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
-        try:
-            self._descriptor = os.open(self.path, flags, 0o666)
-            self._append(lines.encode())
-        except OSError as error:
-            self.close()
-            reason = error.strerror or error
-            raise DataError(
-                f"{str(self.path)!r} cannot be written ({reason}); check the folder and the space left"
-            ) from None
-
-    def write(self, rows: Floats) -> None:
-        """Appends rows, shape (n, 9).
-
-        Raises
-        ------
-        RigFault
-            They cannot be written; whole rows stay.
-        """
-        if self._descriptor is None or len(rows) == 0:
-            self._rows += len(rows)
-            return
-        t = np.round((self._rows + np.arange(len(rows))) * self._step, 9)
-        columns = [map(repr, t.tolist()), *(map(repr, rows[:, k].tolist()) for k in range(len(COLUMNS)))]
-        text = "\n".join(map(",".join, zip(*columns, strict=True))) + "\n"
-        self._rows += len(rows)
-        try:
-            self._append(text.encode())
-        except OSError as error:
-            raise RigFault(f"the recording cannot be written to disk ({error.strerror or error}); make space") from None
-
-    def _append(self, content: bytes) -> None:
-        if self._descriptor is None:
-            return
-        whole = os.lseek(self._descriptor, 0, os.SEEK_END)
-        try:
-            while content:
-                content = content[os.write(self._descriptor, content) :]
-        except OSError:
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._descriptor, whole)
-            raise
-
-    def close(self) -> None:
-        """Closes the file."""
-        if self._descriptor is not None:
-            with contextlib.suppress(OSError):
-                os.close(self._descriptor)
-            self._descriptor = None
-
-    def remove(self) -> None:
-        """Closes and removes it: the run is in its own file."""
-        self.close()
-        if self.path is not None:
-            with contextlib.suppress(OSError):
-                self.path.unlink()
 
 
 def record(
@@ -369,7 +123,7 @@ def record(
         The rig stopped the run. The cause is in words; what was recorded is in `run` and in the file.
     """
     excitation = Excitation(input, amplitude, period, band, ramp, seed, file)
-    _check_times(duration, limit, rate, seed)
+    check_times(duration, limit, rate, seed)
     commands = excitation.commands(rate, duration)
     if sensor_filter not in (None, "stock"):
         raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or None")
@@ -395,7 +149,7 @@ def record(
         sensor_filter=STOCK_FILTER if sensor_filter else None,
     )  # fmt: skip
     for needed in () if live is None else live.signals:
-        _column(needed)
+        column_of(needed)
     partial = Partial(target, name, 1.0 / rate, about)
     recorder = _Recorder(partial, len(commands), progress, live)
     faults: list[str] = []
@@ -421,7 +175,7 @@ def record(
     except BaseException:
         partial.close()
         raise
-    return _saved(run, target, partial, force=force, ended=ended, faults=faults)
+    return saved(run, target, partial, force=force, ended=ended, faults=faults)
 
 
 def stopped_by(ended: KeyboardInterrupt | SystemExit) -> str:
@@ -433,45 +187,6 @@ def stopped_by(ended: KeyboardInterrupt | SystemExit) -> str:
     return f"stopped by {known.get(number, 'an exit of the program')}"
 
 
-def _saved(
-    run: Run | None,
-    target: Path | None,
-    partial: Partial,
-    *,
-    force: bool,
-    ended: BaseException | None,
-    faults: list[str],
-) -> Run:
-    """Write the run, and raise what ended it."""
-    place = "nothing was recorded until then"
-    if run is not None:
-        place = f"{run.length} rows were recorded until then"
-        if target is not None:
-            try:
-                save = run.to_csv if target.suffix.lower() == ".csv" else run.to_parquet
-                save(target, force=force)
-                partial.remove()
-                place += f" and are in {target}"
-            except DataError as error:
-                partial.close()
-                fault = RigFault(f"{error}; what was recorded is in {partial.path}")
-                if ended is not None:
-                    fault = RigFault(f"{'; '.join(faults)}; {place}, in {partial.path}")
-                fault.run = run
-                raise fault from None
-    else:
-        partial.remove()
-    if isinstance(ended, RigFault) or (ended is None and (faults or run is None)):
-        fault = RigFault(f"{'; '.join(faults) or 'no sample was read'}; {place}")
-        fault.run = run
-        raise fault from None
-    if ended is not None:
-        raise ended
-    if run is None:
-        raise RigFault("no sample was read")
-    return run
-
-
 class _Recorder:
     """Takes rows from a rig, to disk and to memory."""
 
@@ -481,7 +196,7 @@ class _Recorder:
         self.partial = partial
         self.live = live
         self.trouble: str | None = None
-        self.columns = [] if live is None else [_column(name) for name in live.signals]
+        self.columns = [] if live is None else [column_of(name) for name in live.signals]
         self.blocks: list[Floats] = []
         self.rows, self.done = rows, 0
         self.progress = progress
@@ -521,31 +236,6 @@ class _Recorder:
         )  # fmt: skip
 
 
-def _column(name: str) -> int:
-    if name not in COLUMNS:
-        raise ModelError(f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(COLUMNS)}")
-    return COLUMNS.index(name)
-
-
-def _check_times(duration: float, limit: float, rate: float, seed: int) -> None:
-    def number(value: object) -> bool:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-    if not number(limit) or not 0 < limit <= LONGEST:
-        raise ModelError(f"limit = {limit!r} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
-    if not number(duration) or duration <= 0:
-        raise ModelError(f"duration = {duration!r} s is not a time above 0; give the length of the run")
-    if duration > limit:
-        way_out = "raise limit= (--limit)" if duration <= LONGEST else f"no run is longer than {LONGEST:g} s"
-        raise ModelError(f"duration = {duration:g} s is over the limit of {limit:g} s; {way_out}")
-    if not number(rate) or rate <= 0:
-        raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
-    if duration * rate < 2:
-        raise ModelError(f"duration = {duration:g} s holds fewer than three samples at {rate:g} Hz; make it longer")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
-
-
 def _board(
     rig: str | Board, parameters: str | os.PathLike[str] | ArmParameters, seed: int, *, paced: bool, horizon: float,
     card: str,
@@ -555,8 +245,6 @@ def _board(
         board = VirtualBoard(found, seed=seed, paced=paced, horizon=horizon)
         return board, {"parameters": found.to_dict()}
     if rig == "q8":
-        from ftlm.rig.quanser import QuanserBoard  # noqa: PLC0415 — the driver is only needed where a board is
-
         return QuanserBoard(card=card), {"card": card}
     if isinstance(rig, str):
         raise ModelError(f"rig = {rig!r} is not known; use 'virtual' or 'q8'")

@@ -8,22 +8,17 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
-from ftlm.errors import ModelError, RigFault
+from ftlm import _core
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import ModelError, RigFault
 from ftlm.rig.rig import COLUMNS
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import ModuleType
-
-    from ftlm import _core
-    from ftlm.rig.rig import Floats
-
-__all__ = ["QuanserBoard", "driver_state"]
 
 #: Hardware clock of the board [Hz]: normal and fast update rate.
 RATE_NORMAL, RATE_FAST = 1000.0, 8000.0
@@ -46,7 +41,6 @@ NOTHING_TO_CLEAR = -599
 EXPIRED = "the watchdog expired: the program did not answer in time, and the board put 0 V out"
 #: The board's clock and the computer's drift apart; delays are counted from an instant that follows by this share.
 DRIFT = 1e-3
-
 WORDS = {
     -108: "no Q8-USB board was found; plug it in, switch it on, and check --card",
     -109: "the board is in use by another program; close that program",

@@ -7,22 +7,14 @@ import math
 import signal
 import threading
 import weakref
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from types import FrameType
+from typing import Any, Literal, Protocol
 
 from ftlm import _core
-from ftlm.errors import FtlmError, ModelError, RigFault
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from types import FrameType
-
-    import numpy as np
-    from numpy.typing import NDArray
-
-    Floats = NDArray[np.float64]
-
-__all__ = ["COLUMNS", "Board", "Limits", "Rig", "shut_down"]
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import FtlmError, ModelError, RigFault
 
 #: Deflection per volt of strain gauge [rad/V]; the sign is reversed.
 STRAIN_SCALE = (0.013636, 0.018694)

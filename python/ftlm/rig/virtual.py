@@ -7,25 +7,20 @@ import math
 import os
 import subprocess
 import tomllib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ftlm import _core
-from ftlm.errors import DataError, ModelError, RigFault
-from ftlm.flexible_link import order_law
+from ftlm.arm.link import order_law
+from ftlm.base.arrays import Floats
+from ftlm.base.checks import listed, nearest
+from ftlm.base.errors import DataError, ModelError, RigFault
 from ftlm.rig import watchdog
 from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
-from ftlm.runs import listed, nearest
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from ftlm.rig.rig import Floats
-
-__all__ = ["INJECTIONS", "ArmParameters", "StageParameters", "VirtualBoard"]
 
 #: Longest step of the simulation inside a sample [s]: deflections are then within 2e-5 of their range.
 SUBSTEP = 1e-4

@@ -20,8 +20,6 @@ import tempfile
 import time
 from pathlib import Path
 
-__all__ = ["Page", "start"]
-
 MARK = b"FTLMPAG1"
 #: Name: offset and kind of every field of the page.
 FIELDS = {

@@ -1,0 +1,1 @@
+"""Ground: errors, checks, arrays, statistics, files written, progress."""

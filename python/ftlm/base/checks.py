@@ -1,0 +1,116 @@
+"""Refuses arguments that are not what they should be, and finds the words for it."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+
+from ftlm.base.errors import DataError, ModelError
+
+
+def whole_number(value: object) -> int | None:
+    """Return a value that is a whole number as an int, anything else as None; the message is the caller's."""
+    if isinstance(value, (str, bytes, bytearray, bool)):
+        return None
+    try:
+        number = int(value)  # type: ignore[call-overload]
+        return int(number) if number == value else None
+    except (TypeError, ValueError, OverflowError):
+        return None
+
+
+def real_number(name: str, value: object) -> float:
+    """Return a real number as a float; it may be infinite or not a number, which is for the caller to judge.
+
+    Raises
+    ------
+    ModelError
+        Text, nothing, a truth value, or an integer beyond the range of floating point.
+    """
+    try:
+        if isinstance(value, (str, bytes, bytearray, bool)):
+            raise TypeError
+        return float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError, OverflowError):
+        # A long integer has no decimal form in Python.
+        shown = f"an integer of {value.bit_length()} bits" if type(value) is int else f"{value!r}"[:60]
+        raise ModelError(f"{name} = {shown} is not a number; give one") from None
+
+
+def listed(names: Iterable[object], most: int = 40) -> str:
+    """Return names for an error message: quoted, joined, and cut off after `most` of them."""
+    every = [repr(name) for name in names]
+    if not every:
+        return "none"
+    return ", ".join(every[:most]) + (f", … and {len(every) - most} more" if len(every) > most else "")
+
+
+def nearest(word: object, names: Iterable[object]) -> str:
+    """Return " (did you mean …?)" for the closest of names, or an empty string."""
+    options = [str(name) for name in names]
+    begun = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
+    found = [max(begun, key=len)] if begun else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
+    return f" (did you mean {found[0]!r}?)" if found else ""
+
+
+def bad_rows(thing: str, what: str, first: int, count: int, way_out: str) -> DataError:
+    """Return the error for bad rows: the thing, the first 0-based row, the count and the way out."""
+    return DataError(f"{thing}: {what}, first at row {first}, {count} in all; {way_out}")
+
+
+def names_to_columns(argument: str, given: object) -> dict[str, Hashable]:
+    """Return {signal: column} for what a person gave: nothing, one name, a list of names or a mapping."""
+    if given is None:
+        return {}
+    if isinstance(given, str):
+        return {given: given}
+    if isinstance(given, Mapping):
+        return dict(given)
+    if not isinstance(given, Iterable):
+        raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: column, or a list of names")
+    names = list(given)
+    for index, name in enumerate(names):
+        if not isinstance(name, str):
+            raise DataError(f"{argument}=: entry {index} is {name!r}, not a name; pass a dict of name: column")
+        if name in names[:index]:
+            raise DataError(f"{argument}=: the name {name!r} is given twice; give every name once")
+    return {name: name for name in names}
+
+
+def as_mapping(argument: str, given: object) -> Mapping[str, object]:
+    if not isinstance(given, Mapping):
+        raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: array")
+    return given
+
+
+def check_known(what: str, given: Iterable[str], known: Sequence[str]) -> None:
+    for name in given:
+        if name not in known:
+            near = difflib.get_close_matches(str(name), known, 1)
+            hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(dict.fromkeys(known)) or 'none'}"
+            raise ModelError(f"{what} {name!r} does not occur in the equation; {hint}")
+
+
+def available_threads() -> int:
+    """Cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS or Windows
+        return os.cpu_count() or 1
+
+
+def check_threads(threads: int | None) -> int:
+    """Threads to use: all cores by default.
+
+    Raises
+    ------
+    ModelError
+        Fewer than one or more than 1 024.
+    """
+    if threads is None:
+        return available_threads()
+    found = whole_number(threads)
+    if found is None or not 1 <= found <= 1024:
+        raise ModelError(f"threads = {threads!r} is outside [1, 1024]; leave it out to use all cores")
+    return found

@@ -1,0 +1,60 @@
+"""Noise, rest and whiteness of a series, and the quantiles that judge them."""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+
+#: A first value beyond this many noise standard deviations is not rest.
+REST_SIGMAS = 5.0
+#: ... nor one beyond this share of the signal's deviation, where there is no noise.
+REST_SHARE = 1e-3
+#: Median absolute deviation of a normal variable in units of its standard deviation.
+MAD = 0.6744897501960817
+
+
+def is_rest(samples: Floats) -> bool:
+    """Whether a signal starts at zero within its noise.
+
+    Only the first sample is judged: a machine at rest may answer within a few samples.
+    """
+    noise = noise_of(samples)
+    return bool(abs(samples[0]) <= REST_SIGMAS * noise + REST_SHARE * float(np.std(samples)))
+
+
+def noise_of(samples: Floats) -> float:
+    """Estimate the deviation of white noise on a smooth signal, from the median of its second differences."""
+    return float(np.median(np.abs(np.diff(samples, 2)))) / MAD / float(np.sqrt(6.0)) if samples.size > 2 else 0.0
+
+
+#: Half-width of a 95 % interval in standard errors.
+NORMAL_95 = 1.959963984540054
+
+
+def is_white(series: Floats, lags: int = 25) -> bool:
+    """Ljung-Box test at 1 %: whether autocorrelations up to ``lags`` could be those of white noise."""
+    e = series - np.mean(series)
+    power = float(e @ e)
+    if power == 0.0 or e.size <= lags + 1:
+        return True
+    correlations = np.array([float(e[k:] @ e[:-k]) / power for k in range(1, lags + 1)])
+    statistic = e.size * (e.size + 2) * float(np.sum(correlations**2 / (e.size - np.arange(1, lags + 1))))
+    # 99 % quantile of chi-squared by Wilson and Hilferty, good to 0.1 % at 25 degrees of freedom.
+    quantile = lags * (1 - 2 / (9 * lags) + 2.3263478740408408 * math.sqrt(2 / (9 * lags))) ** 3
+    return statistic <= quantile
+
+
+#: Share of true models that a test is allowed to refuse.
+LEVEL = 0.01
+#: Half-width of a 99 % band in standard deviations.
+NORMAL_99 = NormalDist().inv_cdf(1 - LEVEL / 2)
+
+
+def chi_squared_99(degrees: int) -> float:
+    """99 % quantile of chi-squared by Wilson and Hilferty, good to 0.3 % from five degrees of freedom."""
+    z = NormalDist().inv_cdf(1 - LEVEL)
+    return degrees * (1 - 2 / (9 * degrees) + z * math.sqrt(2 / (9 * degrees))) ** 3

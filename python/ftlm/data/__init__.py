@@ -1,0 +1,1 @@
+"""Records: orders, equations, structures, runs."""

@@ -1,0 +1,211 @@
+"""Equations in words: the parser, and the structure that a text makes."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+
+from ftlm.base.checks import check_known, real_number
+from ftlm.base.errors import ModelError
+from ftlm.data.equations import Equation, Term
+from ftlm.data.orders import Order, Values
+from ftlm.data.structures import SensorFilter, Structure, check_initial
+
+NAME = r"[^\W\d]\w*"
+
+
+def equation(
+    text: str,
+    *,
+    orders: Mapping[str, Values] | None = None,
+    fixed: Mapping[str, float] | None = None,
+    delay: Mapping[str, float | tuple[float, float]] | None = None,
+    initial: str | Iterable[float] = "auto",
+    sensor_filter: SensorFilter | None = None,
+) -> Structure:
+    """Any linear fractional equation, in words.
+
+    Parameters
+    ----------
+    text
+        Such as ``"D^2.2 y = a1 D^0.9 y + a0 y + b0 u"``. ``D^alpha`` names a free order, ``D^(alpha-mu)`` an order
+        law, ``D`` and ``D y`` the first derivative; a coefficient is a name, a number (fixed) or a number times a
+        name. Several equations are separated by ``;`` or by lines.
+    orders
+        Values of the free orders: a number fixes one, ``"0.5:1.5:0.05"`` or (low, high, step) gives its lattice.
+    fixed
+        Known coefficients, by name.
+    delay
+        Delay of inputs [s], by name, not negative: a number is known, (least, largest) is estimated by output error.
+    initial
+        Initial terms: ``"auto"`` (Caputo's if the record does not start at rest), ``"rest"``, ``"caputo"``, or the
+        exponents of t to use.
+    sensor_filter
+        Known filter that some outputs went through.
+
+    Returns
+    -------
+    Structure
+        To be identified, or a model's structure if nothing is free.
+
+    Raises
+    ------
+    ModelError
+        Text that is no such equation (with the place), a name that does not occur, orders out of range.
+    """
+    if not isinstance(text, str):
+        raise ModelError(f"the equation is {type(text).__name__}, not text; write it as in 'D^1.5 y = a0 y + b0 u'")
+    lines = [line for line in re.split(r"[;\n]", text) if line.strip()]
+    if not lines:
+        raise ModelError("the equation is empty; write it as in 'D^1.5 y = a0 y + b0 u'")
+    equations = [parse_equation(line) for line in lines]
+    fixed = dict(fixed or {})
+    check_known("fixed coefficient", fixed, [n for e in equations for n in e.coefficient_names])
+    for name, value in fixed.items():
+        if not math.isfinite(real_number(f"fixed coefficient {name}", value)):
+            raise ModelError(f"fixed coefficient {name} = {value} is not finite; give a number")
+    equations = [e.with_coefficients(fixed) for e in equations]
+    return (
+        Structure(equations=tuple(equations), initial=check_initial(initial), sensor_filter=sensor_filter)
+        .with_delays(delay or {})
+        .with_orders(orders or {})
+    )
+
+
+_TOKEN = re.compile(
+    rf"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>{NAME})|(?P<symbol>[-+*/^(){{}}=]))"
+)
+
+
+class _Words:
+    """Tokens of one equation, with the place of each for messages."""
+
+    def __init__(self, text: str) -> None:
+        self.text = text
+        self.tokens: list[tuple[str, str, int]] = []
+        at = 0
+        while text[at:].strip():
+            found = _TOKEN.match(text, at)
+            if found is None:
+                start = at + len(text[at:]) - len(text[at:].lstrip())
+                raise ModelError(f"equation {text!r}: {text[start]!r} at character {start + 1} has no meaning there")
+            kind = str(found.lastgroup)
+            self.tokens.append((kind, found[kind], found.start(kind)))
+            at = found.end()
+        self.position = 0
+
+    def peek(self, ahead: int = 0) -> tuple[str, str, int]:
+        index = self.position + ahead
+        return self.tokens[index] if index < len(self.tokens) else ("end", "the end", len(self.text))
+
+    def take(self) -> tuple[str, str, int]:
+        token = self.peek()
+        self.position += 1
+        return token
+
+    def order(self, text: str, at: int) -> Order:
+        try:
+            return Order.parse(text)
+        except ModelError as error:
+            raise ModelError(f"equation {self.text!r}: at character {at + 1}: {error}") from error
+
+    def fail(self, wanted: str) -> ModelError:
+        _, value, at = self.peek()
+        return ModelError(
+            f"equation {self.text!r}: expected {wanted} at character {at + 1}, found {value!r}; "
+            "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"
+        )
+
+
+def parse_equation(text: str) -> Equation:
+    """Read one equation; see :func:`equation`.
+
+    Raises
+    ------
+    ModelError
+        With the character at which the text stops being an equation.
+    """
+    words = _Words(text)
+    order, output = _parse_derivative(words)
+    if words.take()[1] != "=":
+        words.position -= 1
+        raise words.fail("'='")
+    if order is None:
+        raise ModelError(
+            f"equation {text!r}: its left-hand side has no derivative; write it as in 'D^1.5 {output} = …'"
+        )
+    terms = []
+    while True:
+        sign = 1.0
+        while words.peek()[1] in "+-" and words.peek()[0] == "symbol":
+            sign *= -1.0 if words.take()[1] == "-" else 1.0
+        terms.append(_parse_term(words, sign))
+        kind, value, _ = words.peek()
+        if kind == "end":
+            break
+        if not (kind == "symbol" and value in "+-"):
+            raise words.fail("'+', '-' or the end")
+    return Equation(output, order, tuple(terms))
+
+
+def _parse_derivative(words: _Words) -> tuple[Order | None, str]:
+    """``D^order signal`` or ``signal``."""
+    kind, value, _ = words.peek()
+    order: Order | None = None
+    if kind == "name" and value == "D":
+        words.take()
+        order = Order(1.0)
+        if words.peek()[1] == "^":
+            words.take()
+            order = _parse_order(words)
+    kind, value, _ = words.peek()
+    if kind != "name" or value == "D":
+        raise words.fail("the name of a signal")
+    words.take()
+    return order, value
+
+
+def _parse_order(words: _Words) -> Order:
+    kind, value, start = words.peek()
+    if value in "({" and kind == "symbol":
+        close = ")" if value == "(" else "}"
+        words.take()
+        depth, begin = 1, start + 1
+        while depth:
+            kind, token, at = words.take()
+            if kind == "end":
+                words.position -= 1
+                raise words.fail(f"'{close}'")
+            depth += token in "({" and kind == "symbol"
+            depth -= token in ")}" and kind == "symbol"
+        return words.order(words.text[begin:at], begin)
+    sign = ""
+    if value == "-" and kind == "symbol":
+        sign = words.take()[1]
+        kind, value, _ = words.peek()
+    if kind not in ("number", "name"):
+        raise words.fail("an order: a number, a name or (…)")
+    words.take()
+    return words.order(sign + value, start)
+
+
+def _parse_term(words: _Words, sign: float) -> Term:
+    factor = sign
+    if words.peek()[0] == "number":
+        factor *= float(words.take()[1])
+        if words.peek()[1] == "*":
+            words.take()
+    coefficient: str | float = 1.0
+    kind, value, _ = words.peek()
+    following = words.peek(1)
+    # A name is a coefficient if a signal or a derivative follows it.
+    if kind == "name" and value != "D" and (following[0] == "name" or following[1] == "*"):
+        coefficient = value
+        words.take()
+        if words.peek()[1] == "*":
+            words.take()
+    order, signal = _parse_derivative(words)
+    if coefficient == 1.0:
+        return Term(signal, order or Order(), factor, 1.0)
+    return Term(signal, order or Order(), coefficient, factor)

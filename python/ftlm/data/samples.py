@@ -1,0 +1,312 @@
+"""Samples checked once: numbers, lengths, a regular time, a window, another step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, TypeAlias, cast
+
+import numpy as np
+import numpy.typing as npt
+
+from ftlm.base.arrays import Floats
+from ftlm.base.checks import as_mapping, bad_rows, listed, nearest
+from ftlm.base.errors import DataError
+
+Intersample: TypeAlias = Literal["zoh", "foh"]
+# Values are squared by every estimator; beyond this the square leaves double precision.
+LARGEST = 1e150
+FEWEST_ROWS = 3
+_MOST_ROWS = 50_000_000
+_SMALLEST_STEP, _LARGEST_STEP = 1e-30, 1e30
+_JITTER = 0.02
+_JITTER_WORTH_SAYING = 1e-3
+_GAP = 1.5
+# A limit typed by a person (1.1 s) must catch the row it names although t - t0 is off by a rounding error.
+_EDGE = 1e-6
+HELD: Intersample = "zoh"
+
+
+def grid_of(rows: int, step: float) -> Floats:
+    return np.arange(rows, dtype=np.float64) * step
+
+
+def locked(values: Floats) -> Floats:
+    owner = np.ascontiguousarray(values)
+    if owner.flags.writeable:
+        owner.setflags(write=False)
+    # A view of a locked array cannot be unlocked by the one who holds it.
+    return owner.view()
+
+
+def is_constant(values: Floats) -> bool:
+    return bool((values == values[0]).all())
+
+
+def checked_intersample(given: Mapping[str, str] | None, inputs: tuple[str, ...]) -> dict[str, Intersample]:
+    checked: dict[str, Intersample] = {}
+    for signal, kind in as_mapping("intersample", {} if given is None else given).items():
+        if signal not in inputs:
+            raise DataError(
+                f"intersample=: {signal!r} is not an input{nearest(signal, inputs)}; the inputs are {listed(inputs)}"
+            )
+        if kind not in ("zoh", "foh"):
+            raise DataError(
+                f"intersample=: {kind!r} of input {signal!r} is unknown; use 'zoh' (held) or 'foh' (linear)"
+            )
+        checked[signal] = "zoh" if kind == "zoh" else "foh"
+    return checked
+
+
+def checked_step(step: object, argument: str) -> float:
+    value = as_number(step)
+    if value is None:
+        raise DataError(f"{argument}={step!r} is not a number; give the time between rows in s")
+    if not _SMALLEST_STEP <= value <= _LARGEST_STEP:
+        raise DataError(f"{argument}={value!r} is not a positive, finite time; give the time between rows in s")
+    return value
+
+
+def as_number(given: object) -> float | None:
+    if isinstance(given, bool) or not isinstance(given, (int, float, np.integer, np.floating)):
+        return None
+    try:
+        return float(given)
+    except OverflowError:
+        return math.inf
+
+
+def as_vector(given: object, thing: str) -> tuple[Floats, np.dtype[Any]]:
+    """Return a private float64 copy and the type the numbers came in."""
+    if np.ma.isMaskedArray(given):
+        mask = np.ma.getmaskarray(cast("Any", given))
+        if mask.any():
+            rows = np.flatnonzero(mask)
+            raise bad_rows(
+                thing, "masked (missing) value", int(rows[0]), rows.size, "remove or fill these rows yourself"
+            )
+    try:
+        array = np.asarray(given)
+        # pandas columns that allow missing values come as objects although they hold numbers.
+        if array.dtype.kind == "O" and getattr(getattr(given, "dtype", None), "kind", "O") in "biuf":
+            array = cast("Any", given).to_numpy(dtype=np.float64, na_value=np.nan)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise DataError(f"{thing}: not an array of numbers ({error}); pass one number per row") from None
+    if array.dtype.kind in "USTO" or (array.ndim == 1 and array.dtype.kind in "MmV"):
+        raise _not_numbers(given, array, thing)
+    if array.ndim != 1:
+        raise DataError(
+            f"{thing}: shape {array.shape}, not one-dimensional; pass one column at a time, such as x[:, 0]"
+        )
+    if array.size == 0:
+        raise DataError(f"{thing}: empty, 0 rows; {FEWEST_ROWS} are needed")
+    if array.dtype.kind == "c":
+        rows = np.flatnonzero(np.imag(array) != 0)
+        first, count = (int(rows[0]), rows.size) if rows.size else (0, array.size)
+        raise bad_rows(thing, f"complex number {array[first]}", first, count, "pass a real array, such as x.real")
+    if array.dtype.kind not in "biuf":
+        raise _not_numbers(given, array, thing)
+    with np.errstate(over="ignore"):
+        return np.array(array, dtype=np.float64, order="C"), array.dtype
+
+
+def _not_numbers(given: object, array: npt.NDArray[Any], thing: str) -> DataError:
+    way_out = "convert it to numbers first"
+    if array.dtype.kind in "Mm":
+        return bad_rows(thing, f"dates, not numbers ({array.dtype})", 0, array.size, "convert them to seconds first")
+    if array.ndim == 0:
+        return DataError(f"{thing}: {_short(array.item())} is not an array; pass one number per row")
+    # A list of numbers and words has become an array of words; the list still tells them apart.
+    flat = list(given) if isinstance(given, (list, tuple)) and array.ndim == 1 else array.ravel().tolist()
+    bad = [index for index, value in enumerate(flat) if not isinstance(value, (int, float, np.number, np.bool_))]
+    if not bad:
+        return bad_rows(
+            thing, f"objects, not numbers (dtype {array.dtype})", 0, len(flat), "use np.asarray(x, dtype=float)"
+        )
+    what = "missing value None" if flat[bad[0]] is None else f"{_short(flat[bad[0]])} is not a number"
+    return bad_rows(thing, what, bad[0], len(bad), way_out)
+
+
+def _short(value: object) -> str:
+    text = repr(value)
+    return text if len(text) <= 40 else text[:37] + "…" + text[-1]
+
+
+def check_lengths(lengths: Mapping[str, int]) -> None:
+    counts = list(lengths.values())
+    expected = max(set(counts), key=lambda count: (counts.count(count), count))
+    wrong = [(thing, count) for thing, count in lengths.items() if count != expected]
+    if wrong:
+        thing, count = wrong[0]
+        raise DataError(
+            f"{thing}: {count} rows where {expected} are expected, {len(wrong)} of {len(lengths)} columns differ; "
+            "give every column one number per row of the same record"
+        )
+
+
+def check_values(values: Floats, thing: str, offset: int) -> None:
+    with np.errstate(invalid="ignore"):
+        good = np.abs(values) <= LARGEST
+    if good.all():
+        return
+    rows = np.flatnonzero(~good)
+    value = float(values[rows[0]])
+    first, count = offset + int(rows[0]), rows.size
+    if math.isnan(value):
+        raise bad_rows(thing, "NaN", first, count, "remove or fill these rows yourself, or avoid them with slice=")
+    if math.isinf(value):
+        raise bad_rows(thing, f"infinity ({value})", first, count, "correct these rows, or avoid them with slice=")
+    raise bad_rows(
+        thing,
+        f"{value!r} is larger than {LARGEST:g} and its square overflows",
+        first,
+        count,
+        "correct these rows, scale the signal, or avoid them with slice=",
+    )
+
+
+def check_increasing(clock: Floats, thing: str, offset: int) -> None:
+    steps = np.diff(clock)
+    if (steps > 0).all():
+        return
+    first = int(np.flatnonzero(~(steps > 0))[0])
+    if steps[first] == 0:
+        raise bad_rows(
+            thing,
+            f"repeated time {float(clock[first + 1])!r} s",
+            offset + first + 1,
+            int((steps == 0).sum()),
+            "remove the repeated rows, or write the time with more digits",
+        )
+    raise bad_rows(
+        thing,
+        f"decreasing time, {float(clock[first + 1])!r} s after {float(clock[first])!r} s",
+        offset + first + 1,
+        int((steps < 0).sum()),
+        "sort the rows, or split the file where the clock starts again",
+    )
+
+
+def regular_step(
+    clock: Floats, thing: str, offset: int, resolution: float, known: float | None
+) -> tuple[float, tuple[str, ...]]:
+    count = clock.size - 1
+    since = clock - clock[0]
+    mean = float(since[-1]) / count
+    if not _SMALLEST_STEP <= mean <= _LARGEST_STEP:
+        raise DataError(f"{thing}: the mean step {mean!r} s cannot be used; check the unit of the time")
+    deviation = np.abs(since - grid_of(clock.size, mean))
+    worst = float(deviation.max())
+    if worst > _JITTER * mean:
+        steps = np.diff(clock)
+        usual = float(np.median(steps))
+        gaps = np.flatnonzero(steps > _GAP * usual)
+        if gaps.size:
+            first = int(gaps[0])
+            raise bad_rows(
+                thing,
+                f"gap of {steps[first]:.6g} s where {usual:.6g} s is usual",
+                offset + first + 1,
+                gaps.size,
+                "load the part before or after it with slice=, or interpolate over it with resample=STEP",
+            )
+        rows = np.flatnonzero(deviation > _JITTER * mean)
+        raise bad_rows(
+            thing,
+            f"jitter of up to {100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _JITTER:g} % allowed)",
+            offset + int(rows[0]),
+            rows.size,
+            "interpolate onto a regular grid with resample=STEP",
+        )
+    fact = (
+        (
+            f"time jitters by up to {100.0 * worst / mean:.2g} % of a step, the most at row "
+            f"{offset + int(deviation.argmax())}; it was taken as regular",
+        )
+        if worst > _JITTER_WORTH_SAYING * mean
+        else ()
+    )
+    if known is not None:
+        if not abs(known - mean) * count <= max(4.0 * resolution, 2.0 * worst, 1e-8 * mean):
+            raise DataError(
+                f"{thing}: the mean step is {mean!r} s where the file's header says {known!r} s; "
+                "correct the header, or remove its first line and name the columns"
+            )
+        return known, fact
+    return _short_decimal(mean, count, 4.0 * resolution, 2.0 * worst), fact
+
+
+def _short_decimal(mean: float, count: int, rounding: float, observed: float) -> float:
+    """Return the shortest decimal number that explains the times as well as their mean step does, or the mean step."""
+    for digits in range(12):
+        short = float(f"{mean:.{digits}e}")
+        drift = abs(short - mean) * count
+        if drift <= rounding or (drift <= observed and abs(short - mean) <= 1e-9 * mean):
+            return short
+    return mean
+
+
+def window_rows(clock: Floats, window: object, argument: str, thing: str = "time") -> tuple[int, int]:
+    """Return the first row and the row after the last one of start ≤ t < stop."""
+    if not isinstance(window, Sequence) or isinstance(window, str) or len(window) != 2:
+        raise DataError(f"{argument}={window!r} is not a pair (start, stop) of seconds; use None for an open end")
+    limits: list[float | None] = []
+    for limit in window:
+        value = as_number(limit)
+        if value is None and limit is not None:
+            raise DataError(f"{argument}: limit {limit!r} is not a number of seconds")
+        if value is not None and not math.isfinite(value):
+            raise DataError(f"{argument}: limit {value!r} is not finite; use None for an open end")
+        limits.append(value)
+    start, stop = limits
+    ends = clock[[0, -1]]
+    if not np.isfinite(ends).all():
+        raise bad_rows(
+            thing,
+            "the first or last time is not finite",
+            0 if not np.isfinite(ends[0]) else clock.size - 1,
+            int((~np.isfinite(clock)).sum()),
+            "remove these rows; slice= counts from the first time",
+        )
+    with np.errstate(over="ignore", invalid="ignore"):
+        since = clock - clock[0]
+        steps = np.diff(since)
+        # The median is the step although there may be a gap, a repeated or a missing time.
+        steps = steps[np.isfinite(steps) & (steps > 0)]
+        step = float(np.median(steps)) if steps.size else 0.0
+        whole = float(since[-1]) + step
+    way_out = f"the record has times from 0 to {whole:.12g} s since its first row"
+    for limit in (start, stop):
+        if limit is not None and not -_EDGE * step <= limit <= whole + _EDGE * step:
+            raise DataError(f"{argument}: limit {limit!r} s is out of range; {way_out}")
+    low = 0.0 if start is None else start
+    high = math.inf if stop is None else stop
+    if low >= high:
+        raise DataError(f"{argument}: the limits {start!r} and {stop!r} s do not increase; {way_out}")
+    with np.errstate(invalid="ignore"):
+        rows = np.flatnonzero((since >= low - _EDGE * step) & (since < high - _EDGE * step))
+    if rows.size == 0:
+        raise DataError(f"{argument}: no row lies between {start!r} and {stop!r} s; {way_out}")
+    return int(rows[0]), int(rows[-1]) + 1
+
+
+def interpolated(
+    since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
+) -> dict[str, Floats]:
+    spans = float(since[-1]) / step
+    if spans + 1 > _MOST_ROWS:
+        raise DataError(f"resample={step!r} gives more than {_MOST_ROWS} rows; use a larger step")
+    rows = math.floor(spans + _EDGE) + 1
+    if rows < FEWEST_ROWS:
+        raise DataError(f"resample={step!r} leaves {rows} rows, {FEWEST_ROWS} are needed; use a smaller step")
+    grid = grid_of(rows, step)
+    held = np.searchsorted(since, grid + _EDGE * step, side="right") - 1
+    return {
+        signal: values[held] if behaviour.get(signal) == "zoh" else np.interp(grid, since, values)
+        for signal, values in data.items()
+    }
+
+
+def how_interpolated(behaviour: Mapping[str, Intersample]) -> str:
+    held = [signal for signal, kind in behaviour.items() if kind == "zoh"]
+    return f"{'held: ' + ', '.join(held) + '; ' if held else ''}others linear; no anti-alias filter"

@@ -1,0 +1,90 @@
+"""Checked settings of an estimator and of an order search."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from ftlm.base.checks import check_threads, real_number, whole_number
+from ftlm.base.errors import ModelError
+
+Criterion = Literal["output-error", "equation-error"]
+Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
+#: Steps of refined instrumental variables a candidate; most stand still before.
+REFINEMENTS = 5
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Checked settings of a search."""
+
+    criterion: str
+    norm: str
+    coefficients: str
+    innovation_length: int
+    prior_covariance: float
+    rows: str
+    keep: int
+    threads: int
+    early_stopping: bool = True
+
+    @classmethod
+    def check(
+        cls,
+        criterion: str,
+        norm: str,
+        coefficients: str,
+        innovation_length: int,
+        prior_covariance: float,
+        rows: str,
+        keep: int,
+        threads: int | None,
+        early_stopping: bool = True,
+    ) -> Settings:
+        """Refuse words and numbers that mean nothing.
+
+        Raises
+        ------
+        ModelError
+            Naming the argument and what it may be.
+        """
+        for name, value, known in (
+            ("criterion", criterion, ("output-error", "equation-error")),
+            ("norm", norm, ("l1", "l2")),
+            ("coefficients", coefficients, ("multi-innovation", "least-squares", "instrumental-variables")),
+            ("rows", rows, ("haar", "time")),
+        ):
+            if value not in known:
+                raise ModelError(
+                    f"{name} = {value!r} is not known in this version; use {' or '.join(map(repr, known))}"
+                )
+        rows_kept, p = whole_number(keep), whole_number(innovation_length)
+        if rows_kept is None or not 1 <= rows_kept <= 100_000:
+            raise ModelError(f"keep = {keep!r} is outside [1, 100000]; keep as many rows as you will read")
+        if p is None or not 1 <= p < 1 << 62:
+            raise ModelError(f"innovation length p = {innovation_length!r} is no whole number from 1; the paper's is 7")
+        k0 = real_number("prior covariance K0", prior_covariance)
+        if not 0 < k0 < math.inf:
+            raise ModelError(f"prior covariance K0 = {prior_covariance!r} is not positive; a large one is a weak prior")
+        return cls(criterion, norm, coefficients, p, k0, rows, rows_kept, check_threads(threads), early_stopping)
+
+    @property
+    def needs_haar(self) -> bool:
+        """Whether m must be a power of two."""
+        return self.coefficients == "multi-innovation" and self.rows == "haar"
+
+    def core(self) -> tuple[str, str, int, float, bool, int, int, bool, int]:
+        """As the core takes them."""
+        p = self.innovation_length if self.coefficients == "multi-innovation" else 0
+        steps = REFINEMENTS if self.coefficients == "instrumental-variables" else 0
+        ranked = (self.criterion, self.norm, p, self.prior_covariance, self.rows == "haar")
+        return *ranked, self.keep, self.threads, self.early_stopping, steps
+
+    def to_dict(self) -> dict[str, Any]:
+        """For results and reports."""
+        out: dict[str, Any] = {"criterion": self.criterion, "norm": self.norm, "coefficients": self.coefficients}
+        if self.coefficients == "multi-innovation":
+            out |= {"innovation_length": self.innovation_length, "prior_covariance": self.prior_covariance}
+            out["rows"] = self.rows
+        return out

@@ -1,0 +1,99 @@
+"""The record of a model: a structure whose orders and coefficients are numbers, and how they were found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import msgspec
+
+from ftlm.base.checks import whole_number
+from ftlm.base.errors import ModelError
+from ftlm.data.equations import Equation
+from ftlm.data.structures import Structure
+
+
+class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is known about how a model was identified, kept with it so that a report needs no other file.
+
+    Parameters
+    ----------
+    method
+        Estimator.
+    runs
+        Names of the runs.
+    values, standard_errors
+        Orders and coefficients by name as they were estimated, and their standard errors where there are any.
+    covariance
+        Of every number of the model in the order of its equations (alpha, then order and coefficient of each term);
+        None where the estimator gives none. It may be singular: laws tie numbers.
+    fit
+        Fit of the free run on these runs in percent, by output.
+    information
+        Information criteria, where known.
+    warnings
+        What makes the model doubtful, in words.
+    """
+
+    method: str
+    runs: tuple[str, ...]
+    values: dict[str, float]
+    standard_errors: dict[str, float | None] = {}
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    fit: dict[str, float | None] = {}
+    information: dict[str, float | None] = {}
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Solved:
+    """A structure whose orders and coefficients are numbers; its fields are those of :class:`ftlm.Model`."""
+
+    structure: Structure
+    orders: Mapping[str, float] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
+    m: int | None = None
+    about: Mapping[str, str | float | int | bool | None] = field(default_factory=dict)
+    estimate: Estimate | None = None
+
+    def __post_init__(self) -> None:
+        if self.m is not None and not 1 <= (whole_number(self.m) or 0) < 1 << 62:
+            raise ModelError(f"m = {self.m!r} is no number of pulses; give a whole number, at least 1")
+        if self.structure.free_delays:
+            late = ", ".join(self.structure.free_delays)
+            raise ModelError(f"the delay of {late} is still free; identify it first, or set it by with_delays")
+        for item in self.structure.equations:
+            if not item.is_identified:
+                free = [*item.order_names, *item.coefficient_names]
+                raise ModelError(f"the equation of {item.output} still has free {', '.join(free)}; identify it first")
+            for k, term in enumerate(item.terms):
+                if not math.isfinite(float(term.coefficient)):
+                    raise ModelError(f"coefficient {k} of {item.output} is not finite; the model cannot be used")
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Coefficients by name."""
+        return {t.name: float(t.coefficient) for e in self.equations for t in e.terms if t.name is not None}
+
+    @property
+    def equations(self) -> tuple[Equation, ...]:
+        """The equations, all numbers."""
+        return self.structure.equations
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Modelled outputs."""
+        return self.structure.outputs
+
+
+def check_solved(model: object) -> None:
+    """Refuse what is no model.
+
+    Raises
+    ------
+    ModelError
+        Something else.
+    """
+    if not isinstance(model, Solved):
+        raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")

@@ -1,0 +1,341 @@
+"""Structures: equations over shared signals, with what is known about them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeAlias
+
+import msgspec
+
+from ftlm.base.checks import check_known, real_number
+from ftlm.base.errors import ModelError
+from ftlm.data.equations import Equation, Term
+from ftlm.data.orders import MAX_ORDER, Order, Values, parse_values
+
+Initial: TypeAlias = Literal["auto", "rest", "caputo"] | tuple[float, ...]
+
+
+class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A known rational filter that some measured outputs went through.
+
+    Parameters
+    ----------
+    outputs
+        Names of the outputs that are measured through it.
+    numerator, denominator
+        (coefficient, order) pairs of sums of coefficient * D^order.
+    """
+
+    outputs: tuple[str, ...]
+    numerator: tuple[tuple[float, float], ...]
+    denominator: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        """Refuse a filter that is none.
+
+        Raises
+        ------
+        ModelError
+            A number that is not finite, an order outside [0, 3], a denominator without a term, a numerator of a
+            higher order than the denominator.
+        """
+        for part, terms in (("numerator", self.numerator), ("denominator", self.denominator)):
+            for coefficient, order in terms:
+                if not (math.isfinite(coefficient) and 0 <= order <= MAX_ORDER):
+                    raise ModelError(
+                        f"sensor filter: {coefficient:g} D^{order:g} in its {part} is no term; give a finite "
+                        "coefficient and an order in [0, 3]"
+                    )
+        highest = max((order for coefficient, order in self.denominator if coefficient), default=None)
+        if highest is None:
+            raise ModelError("sensor filter: its denominator has no term; give at least one")
+        improper = next((order for _, order in self.numerator if order > highest), None)
+        if improper is not None:
+            raise ModelError(
+                f"sensor filter: order {improper:g} of its numerator is above {highest:g}, the highest of its "
+                "denominator; a filter that can be built is proper"
+            )
+
+    @classmethod
+    def low_pass(cls, outputs: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
+        """Second-order low-pass of ``frequency`` [Hz]; the default is that of the arm's stock real-time model."""
+        omega = 2 * math.pi * frequency
+        return cls(tuple(outputs), ((omega**2, 0.0),), ((1.0, 2.0), (2 * damping * omega, 1.0), (omega**2, 0.0)))
+
+
+def check_initial(initial: str | Iterable[float]) -> Initial:
+    """Refuse initial terms that are neither a known word nor exponents above -1.
+
+    Raises
+    ------
+    ModelError
+        With what is allowed.
+    """
+    if isinstance(initial, str):
+        if initial in ("auto", "rest", "caputo"):
+            return initial  # type: ignore[return-value]
+        raise ModelError(f"initial = {initial!r} is not known; use 'auto', 'rest', 'caputo' or exponents of t")
+    try:
+        exponents = tuple(real_number("exponent of an initial term", e) for e in initial)
+    except TypeError:
+        raise ModelError(
+            f"initial = {initial!r} is not known; use 'auto', 'rest', 'caputo' or exponents of t"
+        ) from None
+    bad = next((e for e in exponents if not (math.isfinite(e) and -1 < e <= 10)), None)
+    if bad is not None:
+        raise ModelError(f"exponent {bad:g} of an initial term is outside (-1, 10]; t to this power is of no use")
+    return exponents
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Equations over shared signals, with what is known about them; some orders or coefficients may be free.
+
+    Parameters
+    ----------
+    equations
+        One for each output that is modelled.
+    order_values
+        Lattice of free orders that have one: their values, ascending.
+    coupling
+        ``"measured"``: each equation is driven by the measured other outputs. ``"simulated"``: all outputs follow
+        together from the inputs alone.
+    delay
+        Known delay of inputs [s].
+    free_delays
+        Least and largest delay of inputs whose delay is to be estimated [s].
+    initial
+        Initial terms, see :func:`equation`.
+    sensor_filter
+        Known filter that some outputs were measured through.
+    coefficient_law
+        Optional law that ties the coefficients: (name, sign, factors) with coefficient = sign * product of factors.
+    reference
+        Coefficients by name as the maker of the machine states them, to be set beside estimates.
+    name
+        What this is.
+    """
+
+    equations: tuple[Equation, ...]
+    order_values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    coupling: Literal["measured", "simulated"] = "measured"
+    delay: Mapping[str, float] = field(default_factory=dict)
+    free_delays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    initial: Initial = "auto"
+    sensor_filter: SensorFilter | None = None
+    coefficient_law: tuple[tuple[str, float, tuple[str, ...]], ...] = ()
+    reference: Mapping[str, float] = field(default_factory=dict)
+    name: str = "equation"
+
+    def __post_init__(self) -> None:
+        if not self.equations:
+            raise ModelError("a model needs at least one equation")
+        outputs = [e.output for e in self.equations]
+        twice = next((o for i, o in enumerate(outputs) if o in outputs[:i]), None)
+        if twice is not None:
+            raise ModelError(f"two equations have the output {twice}; give each output one equation")
+        if self.coupling not in ("measured", "simulated"):
+            raise ModelError(f"coupling = {self.coupling!r} is not known; use 'measured' or 'simulated'")
+        names = [n for e in self.equations for n in e.coefficient_names]
+        twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
+        if twice is not None:
+            raise ModelError(f"coefficient {twice} stands in two equations; give each its own name")
+        external = [s for s in self.signals if s not in outputs]
+        check_known("delayed input", [*self.delay, *self.free_delays], external)
+        for name, delay in self.delay.items():
+            if not 0 <= real_number(f"delay of {name}", delay) < math.inf:
+                raise ModelError(f"delay of {name} = {delay} s is not a non-negative number; give seconds")
+        for name, (low, high) in self.free_delays.items():
+            numbers = real_number(f"least delay of {name}", low), real_number(f"largest delay of {name}", high)
+            if not 0 <= numbers[0] < numbers[1] < math.inf:
+                raise ModelError(f"delay of {name} from {low} to {high} s is no interval; give two rising times from 0")
+            if delay_name(name) in names or delay_name(name) in self.order_names:
+                raise ModelError(f"{delay_name(name)} is the delay of {name}; call the coefficient otherwise")
+        if self.sensor_filter is not None:
+            check_known("filtered output", self.sensor_filter.outputs, self.signals)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Modelled outputs, one an equation."""
+        return tuple(e.output for e in self.equations)
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Outputs first, then every other signal."""
+        return tuple(dict.fromkeys([e.output for e in self.equations] + [s for e in self.equations for s in e.signals]))
+
+    @property
+    def order_names(self) -> tuple[str, ...]:
+        """Free orders: those that stand alone in order of appearance, then those seen only through a law."""
+        orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms))]
+        alone = [o.names[0] for o in orders if o.is_single]
+        return tuple(dict.fromkeys([*alone, *(n for o in orders for n in o.names)]))
+
+    @property
+    def coefficient_names(self) -> tuple[str, ...]:
+        """Free coefficients."""
+        return tuple(n for e in self.equations for n in e.coefficient_names)
+
+    @property
+    def has_order_law(self) -> bool:
+        """Whether orders depend on one another: one is no plain name, or two are the same."""
+        orders = [o for e in self.equations for o in (e.order, *(t.order for t in e.terms)) if o.names]
+        names = [o.names[0] for o in orders]
+        return any(not o.is_single for o in orders) or len(set(names)) < len(names)
+
+    def parts(self) -> dict[str, Structure]:
+        """What an order search takes one by one: equations that share no free order do not wait for one another.
+
+        Equations that an order law ties stay together, as ``"stage"`` where that is all of the structure, else under
+        the names of their outputs; any other equation is by itself, with measured coupling. Equations without free
+        orders are left out.
+        """
+        groups: list[tuple[set[str], list[Equation]]] = []
+        for item in self.equations:
+            names, together = set(item.order_names), [item]
+            for group in [g for g in groups if g[0] & names]:
+                names |= group[0]
+                together = group[1] + together
+                groups.remove(group)
+            groups.append((names, together))
+        out = {}
+        for names, together in groups:
+            single = len(together) == 1
+            if not names:
+                continue
+            if single and not replace(self, equations=tuple(together), coefficient_law=()).has_order_law:
+                out[together[0].output] = self.equation(together[0].output)
+                continue
+            if len(together) == len(self.equations):
+                return {"stage": self}
+            kept = replace(
+                self,
+                equations=tuple(together),
+                order_values={n: v for n, v in self.order_values.items() if n in names},
+                delay={},
+                free_delays={},
+                sensor_filter=None,
+                coefficient_law=(),
+            )
+            out[", ".join(e.output for e in together)] = replace(
+                kept,
+                delay={n: v for n, v in self.delay.items() if n in kept.signals},
+                free_delays={n: v for n, v in self.free_delays.items() if n in kept.signals},
+                sensor_filter=narrowed(self.sensor_filter, kept.signals),
+                name=f"{self.name}, {', '.join(kept.outputs)}",
+            )
+        return out
+
+    def equation(self, output: str) -> Structure:
+        """One equation of this structure alone, with measured coupling and free of order laws.
+
+        An order that a law would give becomes a free order of its own, named after its term; the order of an input
+        becomes 0 unless it is a number already.
+
+        Raises
+        ------
+        ModelError
+            No such output.
+        """
+        check_known("output", [output], self.outputs)
+        found = next(e for e in self.equations if e.output == output)
+        modelled = [s for e in self.equations for s in e.signals if s in self.outputs]
+
+        def freed(k: int, term: Term) -> Term:
+            if term.order.is_single or not term.order.names:
+                return term
+            if term.signal not in modelled:
+                return replace(term, order=Order())
+            paper = ORDER_OF_COEFFICIENT.match(str(term.coefficient))
+            name = {"a": "beta", "b": "gamma", "d": "mu"}[paper[1]] + paper[2] if paper else f"nu_{output}_{k + 1}"
+            return replace(term, order=Order(0.0, ((name, 1.0),)))
+
+        single = replace(found, terms=tuple(freed(k, t) for k, t in enumerate(found.terms)))
+        return replace(
+            self,
+            equations=(single,),
+            order_values={n: v for n, v in self.order_values.items() if n in single.order_names},
+            coupling="measured",
+            delay={n: v for n, v in self.delay.items() if n in single.signals},
+            free_delays={n: v for n, v in self.free_delays.items() if n in single.signals},
+            sensor_filter=narrowed(self.sensor_filter, single.signals),
+            coefficient_law=(),
+            name=f"{self.name}, {output}",
+        )
+
+    def with_orders(self, orders: Mapping[str, Values]) -> Structure:
+        """Fix free orders (a number) or give them a lattice (see :func:`parse_values`).
+
+        Raises
+        ------
+        ModelError
+            A name that is no free order, or values out of range.
+        """
+        check_known("order", orders, self.order_names)
+        numbers: dict[str, float] = {}
+        lattices = dict(self.order_values)
+        for name, spec in orders.items():
+            values = parse_values(name, spec)
+            if isinstance(values, float):
+                numbers[name] = values
+            else:
+                lattices[name] = values
+        equations = tuple(e.with_orders(numbers) for e in self.equations)
+        return replace(self, equations=equations, order_values={n: v for n, v in lattices.items() if n not in numbers})
+
+    def with_coefficients(self, values: Mapping[str, float]) -> Structure:
+        """Fix free coefficients.
+
+        Raises
+        ------
+        ModelError
+            A name that is no free coefficient.
+        """
+        check_known("coefficient", values, self.coefficient_names)
+        return replace(self, equations=tuple(e.with_coefficients(values) for e in self.equations))
+
+    def with_delays(self, delays: Mapping[str, float | tuple[float, float]]) -> Structure:
+        """Set delays of inputs [s]: a number is known, (least, largest) is to be estimated.
+
+        Raises
+        ------
+        ModelError
+            A name that is no input, a delay that is negative, or no interval.
+        """
+        known, free = dict(self.delay), dict(self.free_delays)
+        for name, delay in delays.items():
+            known.pop(name, None)
+            free.pop(name, None)
+            if isinstance(delay, (tuple, list)):
+                if len(delay) != 2:
+                    raise ModelError(f"delay of {name} = {delay!r} is neither a number nor (least, largest) [s]")
+                free[name] = (delay[0], delay[1])
+            else:
+                known[name] = delay
+        return replace(self, delay=known, free_delays=free)
+
+    def __str__(self) -> str:
+        return "\n".join(str(e) for e in self.equations)
+
+    def _repr_html_(self) -> str:
+        from html import escape  # noqa: PLC0415 — only notebooks need it
+
+        return f"<pre>{escape(str(self))}</pre>"
+
+
+def delay_name(signal: str) -> str:
+    """Name under which the estimated delay of an input stands among the parameters."""
+    return f"delay_{signal}"
+
+
+ORDER_OF_COEFFICIENT = re.compile(r"^([abd])(\d+)$")
+
+
+def narrowed(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilter | None:
+    if sensor is None:
+        return None
+    outputs = tuple(o for o in sensor.outputs if o in signals)
+    return SensorFilter(outputs, sensor.numerator, sensor.denominator) if outputs else None

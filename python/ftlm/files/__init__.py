@@ -1,0 +1,1 @@
+"""Files read: text, .mat, parquet."""

@@ -1,0 +1,160 @@
+"""Columns of one or several files under the names that a person uses."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ftlm.base.checks import bad_rows, listed, nearest
+from ftlm.base.errors import DataError
+from ftlm.data.header import Header
+
+_TIME_NAMES = frozenset(("t", "time", "t_s", "time_s", "seconds", "time [s]"))
+_AGREE = 1e-9
+_MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of numbers, or the reason why it is not one."""
+
+    variable: str
+    name: str
+    source: Path
+    values: npt.NDArray[np.float64] | npt.NDArray[np.float32] | None
+    problem: DataError | None = None
+    matrix: str | None = None
+
+    def numbers(self) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
+        if self.problem is not None or self.values is None:
+            raise self.problem or DataError(f"column {self.name!r} holds no numbers; choose another column")
+        return self.values
+
+
+@dataclass(frozen=True)
+class FileTable:
+    """The columns of one file."""
+
+    path: Path
+    columns: list[Column]
+    text: bool
+    header: Header | None = None
+    skipped: dict[str, str] = field(default_factory=dict)
+
+
+class Pool:
+    """The columns of all files under the names a person uses."""
+
+    def __init__(self, tables: list[FileTable]) -> None:
+        self._tables = tables
+        owners: dict[str, set[Path]] = {}
+        for table in tables:
+            for column in table.columns:
+                owners.setdefault(column.variable, set()).add(table.path)
+        self._columns: dict[str, Column] = {}
+        for table in tables:
+            for column in table.columns:
+                shared = len(owners[column.variable]) > 1
+                prefix = f"{table.path.stem}/" if shared else ""
+                name = prefix + column.name
+                if name in self._columns and name:
+                    raise DataError(
+                        f"column {name!r} is in {str(self._columns[name].source)!r} and {str(table.path)!r}; "
+                        "rename one of the files"
+                    )
+                matrix = None if column.matrix is None else prefix + column.matrix
+                self._columns[name] = replace(column, name=name, matrix=matrix)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What can be asked for by name."""
+        return tuple(name for name in self._columns if name)
+
+    def described(self) -> str:
+        skipped = {name: why for table in self._tables for name, why in table.skipped.items()}
+        text = f"the columns are {listed(self.names)}"
+        if skipped:
+            text += "; not read: " + ", ".join(f"{name!r} ({why})" for name, why in list(skipped.items())[:10])
+        return text
+
+    def find(self, spec: object, thing: str) -> Column:
+        """Return the column that a person names."""
+        if isinstance(spec, int) and not isinstance(spec, bool):
+            return self._at(spec, thing)
+        if not isinstance(spec, str):
+            raise DataError(f"column {spec!r} ({thing}) is neither a name nor a position; give one of them")
+        name = spec
+        written = _MATLAB_COLUMN.fullmatch(spec)
+        if spec not in self._columns and written:
+            name = f"{written[1]}.{int(written[2])}" if len(written[2]) < 10 else spec
+        column = self._columns.get(name)
+        if column is None:
+            raise DataError(
+                f"column {spec!r} ({thing}) is not in {listed(table.path.name for table in self._tables)}"
+                f"{nearest(spec, self._columns)}; {self.described()}"
+            )
+        return column
+
+    def _at(self, position: int, thing: str) -> Column:
+        if len(self._tables) > 1 or not self._tables[0].text:
+            raise DataError(f"column {position} ({thing}): positions are for single text files; {self.described()}")
+        columns = self._tables[0].columns
+        if not 0 <= position < len(columns):
+            raise DataError(
+                f"column {position} ({thing}) is out of range, positions go from 0 to {len(columns) - 1}; "
+                f"{self.described()}"
+            )
+        return columns[position]
+
+    def time(self, spec: object, used: list[Column]) -> Column:
+        """Return the time: the column asked for, or the one that names or places itself."""
+        if spec is not None:
+            return self.find(spec, "time")
+        found = []
+        for table in self._tables:
+            named = [
+                column
+                for column in self._columns.values()
+                if column.source == table.path and column.matrix is None and column.variable.casefold() in _TIME_NAMES
+            ]
+            if len(named) > 1:
+                raise DataError(
+                    f"{table.path.name}: the columns {listed(column.name for column in named)} may all be the time; "
+                    "name one with time="
+                )
+            found += named
+        if not found:
+            matrices = dict.fromkeys(column.matrix for column in used if column.matrix is not None)
+            found = [self._columns[f"{matrix}.1"] for matrix in matrices]
+        if not found:
+            raise DataError(
+                "time: no column is called t, time, t_s, time_s, seconds or time [s]; "
+                f"name it with time=, or give the time between rows with step=; {self.described()}"
+            )
+        for other in found[1:]:
+            _check_agreement(found[0], other)
+        return found[0]
+
+
+def _check_agreement(one: Column, other: Column) -> None:
+    a, b = one.numbers(), other.numbers()
+    names = f"time: the columns {one.name!r} of {one.source.name} and {other.name!r} of {other.source.name}"
+    if a.size != b.size:
+        raise DataError(
+            f"{names} have {a.size} and {b.size} rows; give files of one record, or name the time with time="
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        same = np.abs(np.subtract(a, b, dtype=np.float64)) <= _AGREE * max(1.0, float(np.abs(a[[0, -1]]).max()))
+    rows = np.flatnonzero(~same & ~(np.isnan(a) & np.isnan(b)))
+    if rows.size:
+        raise bad_rows(
+            names,
+            f"differ, {float(a[rows[0]])!r} and {float(b[rows[0]])!r}",
+            int(rows[0]),
+            rows.size,
+            "give files of one record, or name the time to use with time=",
+        )

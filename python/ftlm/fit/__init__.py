@@ -1,0 +1,1 @@
+"""Estimators: from records to numbers with intervals."""

@@ -1,0 +1,383 @@
+"""The genetic baseline of the paper's Tables 6 and 7: orders and coefficients together, by PyGAD, on criterion (45)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ftlm import _core
+from ftlm.base.arrays import Floats
+from ftlm.base.checks import check_threads, whole_number
+from ftlm.base.errors import ModelError
+from ftlm.data.equations import Equation
+from ftlm.data.lattice import Lattice, axis_of
+from ftlm.data.orders import Order
+from ftlm.data.structures import Structure
+from ftlm.solve.records import Record, initial_tuple
+
+#: Orders are coded in steps of this, the digits that the paper prints and fewer; regressors are then shared.
+RESOLUTION = 0.001
+#: Bounds of a coefficient whose value the maker states: plus and minus this many times it.
+STATED_RANGE = 2.0
+#: Bounds of any other: this many times what would make its term alone, at the middle orders, as large as the output.
+SCALE_RANGE = 4.0
+#: A population keeps this share of itself, which are also the parents.
+PARENTS = 0.25
+#: Spread of simulated binary crossover and of polynomial mutation, and the share of children that are crossed: the
+#: values that Deb and Agrawal (Complex Systems 1995) and the libraries that follow them use.
+CROSSOVER_SPREAD, MUTATION_SPREAD, CROSSED = 15.0, 20.0, 0.9
+#: Copies of parents are not evaluated again, so it takes more generations to spend all evaluations: at most this
+#: many times as many.
+MOST_COPIES = 4
+#: Fitness of what diverges or has no chance of being a parent: PyGAD takes finite numbers only.
+HOPELESS = -1e300
+#: Most evaluations that are not asked for by number: the lattice of a stage under its law has millions.
+MOST_EVALUATIONS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Genetic:
+    """Settings of the genetic algorithm.
+
+    Parameters
+    ----------
+    seeds
+        One run of the algorithm a seed; the best of all is the result, and the errors of all are kept.
+    evaluations
+        Evaluations a seed, rounded up to a whole generation; by default as many as the lattice has candidates.
+    population
+        Candidates of one generation, at least 8.
+    bounds
+        (low, high) of coefficients by name. By default ±2 times the value that the maker states, or else ±4 times the
+        coefficient with which its term alone would be as large as the output, at the middle of the orders' intervals.
+    """
+
+    seeds: Sequence[int] = (0, 1, 2)
+    evaluations: int | None = None
+    population: int = 200
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        population = whole_number(self.population)
+        if population is None or not 8 <= population <= 100_000:
+            raise ModelError(f"population = {self.population!r} is outside [8, 100000]")
+        if self.evaluations is not None and (whole_number(self.evaluations) or 0) < 2 * self.population:
+            raise ModelError(
+                f"evaluations = {self.evaluations!r} is less than two generations of {self.population}; give more"
+            )
+        seeds = [whole_number(s) for s in self.seeds] if not isinstance(self.seeds, str) else [None]
+        if not seeds or any(s is None or not 0 <= s < 1 << 32 for s in seeds):
+            raise ModelError(f"seeds = {self.seeds!r}: give one or more whole numbers from 0 to 4294967295")
+        for name, pair in self.bounds.items():
+            if not (isinstance(pair, (tuple, list)) and len(pair) == 2 and -math.inf < pair[0] < pair[1] < math.inf):
+                raise ModelError(f"bounds of {name} = {pair!r} are no interval; write (low, high)")
+
+
+@dataclass(frozen=True)
+class GeneticRun:
+    """What the algorithm came to.
+
+    Parameters
+    ----------
+    orders, coefficients
+        Of the best candidate of all seeds, by name.
+    errors
+        Error of the best candidate of each seed: (45), or RMSE (46) for the norm ``"l2"``; under an order law the sum
+        of each output's divided by its spread.
+    evaluations
+        Candidates evaluated for each seed.
+    bounds
+        (low, high) of every order and coefficient.
+    """
+
+    orders: dict[str, float]
+    coefficients: dict[str, float]
+    errors: dict[int, float]
+    evaluations: dict[int, int]
+    bounds: dict[str, tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """One equation's candidates from genes: alpha, orders, coefficients = genes @ weights + constants."""
+
+    points: _core.Points
+    weights: Floats
+    constants: Floats
+    own: NDArray[np.bool_]
+    scale: float
+
+    def candidates(self, genes: Floats, *, repaired: bool) -> Floats:
+        """Rows for the core; repaired ones have no order above what alpha allows."""
+        rows = genes @ self.weights + self.constants
+        if repaired:
+            highest = rows[:, :1] - np.where(self.own, RESOLUTION, 0.0)
+            n = self.own.size
+            rows[:, 1 : 1 + n] = np.minimum(rows[:, 1 : 1 + n], highest)
+        return rows
+
+
+class _Problem:
+    """Genes and what they are worth."""
+
+    def __init__(
+        self, records: list[Record], structure: Structure, lattice: Lattice, settings: Genetic, norm: str, threads: int
+    ) -> None:
+        values = lattice.values(structure)
+        self.order_names, self.coefficient_names = structure.order_names, structure.coefficient_names
+        self.names = (*self.order_names, *self.coefficient_names)
+        self.law = structure.has_order_law
+        self.bounds: dict[str, tuple[float, float]] = {n: (v[0], v[-1]) for n, v in values.items()}
+        self.bounds |= {n: default_bounds(n, records, structure, values) for n in self.coefficient_names}
+        for name, pair in settings.bounds.items():
+            if name not in self.names:
+                raise ModelError(f"bounds of {name!r}: there is no such number; free are {', '.join(self.names)}")
+            self.bounds[name] = (float(pair[0]), float(pair[1]))
+        self.rows = [self._rows(e, records, norm) for e in structure.equations]
+        self.threads = threads
+        self.size = self._candidates(structure, records, values)
+
+    def _rows(self, item: Equation, records: list[Record], norm: str) -> _Rows:
+        signals, inputs = records[0].signals, list(records[0].inputs)
+        n = len(item.terms)
+        weights, constants = np.zeros((len(self.names), 1 + 2 * n)), np.zeros(1 + 2 * n)
+
+        def place(column: int, order: Order) -> None:
+            constants[column] = order.constant
+            for name, weight in order.weights:
+                weights[self.names.index(name), column] = weight
+
+        place(0, item.order)
+        for k, term in enumerate(item.terms):
+            place(1 + k, term.order)
+            if isinstance(term.coefficient, str):
+                weights[self.names.index(term.coefficient), 1 + n + k] = term.factor
+            else:
+                constants[1 + n + k] = term.factor * term.coefficient
+        points = _core.Points(
+            [r.core() for r in records], signals.index(item.output), [signals.index(t.signal) for t in item.terms],
+            inputs, norm == "l2",
+        )  # fmt: skip
+        own = np.array([t.signal == item.output for t in item.terms])
+        count = sum(r.m for r in records)
+        spread = math.sqrt(sum(float(np.var(r.of(item.output)) * r.m) for r in records) / count)
+        scale = 1.0 if not self.law else spread * count if norm == "l1" else spread
+        return _Rows(points, weights, constants, own, scale)
+
+    def _candidates(self, structure: Structure, records: list[Record], values: Mapping[str, tuple[float, ...]]) -> int:
+        """Size of the lattice; under a law an upper bound of it."""
+        if self.law:
+            return math.prod(len(v) for v in values.values())
+        item, first = structure.equations[0], records[0]
+        axes = [
+            (first.signals.index(t.signal), axis_of(t.order, values), bool(t.order.names) and t.fixed is None)
+            for t in item.terms
+        ]
+        orders = (first.signals.index(item.output), axis_of(item.order, values), axes)
+        return _core.lattice_size(orders, list(first.inputs))
+
+    def tidy(self, genes: Floats) -> Floats:
+        """Orders in whole steps."""
+        tidied = np.array(genes, dtype=np.float64)
+        n = len(self.order_names)
+        tidied[:, :n] = np.round(tidied[:, :n] / RESOLUTION) * RESOLUTION
+        return tidied
+
+    def errors(self, genes: Floats, limit: float) -> Floats:
+        """What each row of genes is worth; infinite above the limit."""
+        tidied, total = self.tidy(genes), np.zeros(genes.shape[0])
+        for part in self.rows:
+            rows = np.ascontiguousarray(part.candidates(tidied, repaired=not self.law))
+            total += part.points.scores(rows, limit * part.scale, self.threads) / part.scale
+        return np.where(total <= limit, total, np.inf)
+
+    def named(self, genes: Floats) -> tuple[dict[str, float], dict[str, float]]:
+        """Orders and coefficients by name."""
+        tidied = self.tidy(genes[None, :])
+        n = len(self.order_names)
+        found = dict(zip(self.names, tidied[0].tolist(), strict=True))
+        if not self.law:
+            part = self.rows[0]
+            row = part.candidates(tidied, repaired=True)[0]
+            for column, value in enumerate(row[: 1 + part.own.size].tolist()):
+                gene = np.flatnonzero(part.weights[:n, column])
+                if gene.size:
+                    found[self.names[int(gene[0])]] = value
+        orders = {name: round(found[name], 9) for name in self.order_names}
+        return orders, {name: found[name] for name in self.coefficient_names}
+
+
+def default_bounds(
+    name: str, records: Sequence[Record], structure: Structure, values: Mapping[str, tuple[float, ...]]
+) -> tuple[float, float]:
+    """Bounds of a coefficient, see :class:`Genetic`."""
+    stated = structure.reference.get(name, 0.0)
+    if stated:
+        return -STATED_RANGE * abs(stated), STATED_RANGE * abs(stated)
+    middle = {n: 0.5 * (v[0] + v[-1]) for n, v in values.items()}
+    item, term = next((e, t) for e in structure.equations for t in e.terms if t.coefficient == name)
+    eta = max(item.order.at(middle) - term.order.at(middle), 0.0)
+    largest = 0.0
+    for record in records:
+        kernel = _core.block_pulse_kernel(eta, record.m, record.step)
+        integral = _core.series_multiply(kernel, record.of(term.signal), record.m)
+        size = float(np.linalg.norm(integral))
+        largest = max(largest, float(np.linalg.norm(record.of(item.output))) / size if size else 0.0)
+    limit = SCALE_RANGE * (largest or 1.0) / abs(term.factor)
+    return -limit, limit
+
+
+def genetic_search(
+    records: list[Record],
+    structure: Structure,
+    lattice: Lattice,
+    settings: Genetic,
+    *,
+    norm: str = "l1",
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> GeneticRun:
+    """Minimise the error of the free run over orders and coefficients by a genetic algorithm.
+
+    Parameters
+    ----------
+    records
+        Pulse means, at rest.
+    structure
+        One equation, or several under an order law; other outputs act as measured.
+    lattice
+        Whose ends bound the orders, and whose size is the default number of evaluations.
+    settings
+        Seeds, evaluations, population, bounds.
+    norm
+        ``"l1"`` for (45), ``"l2"`` for (46).
+    threads, progress
+        See :func:`ftlm.search_orders`; progress counts evaluations over all seeds.
+
+    Returns
+    -------
+    GeneticRun
+        The best of all seeds, and what each came to. The same for any number of threads.
+
+    Raises
+    ------
+    ModelError
+        PyGAD is not installed, a record that does not start at rest, bounds of a number that is not free, a lattice
+        so large that the number of evaluations must be given.
+
+    Notes
+    -----
+    Real-coded: simulated binary crossover, polynomial mutation, truncation selection whose survivors are the next
+    generation's parents. A candidate that cannot be among those is left as soon as its partial error says so, which
+    changes no generation.
+    """
+    try:
+        import pygad  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this baseline needs it
+    except ImportError:
+        raise ModelError("the genetic baseline needs PyGAD; pip install 'ftlm[genetic]'") from None
+    if initial_tuple(records[0].initial) != (False, []):
+        raise ModelError(
+            "the genetic baseline knows no initial terms and needs runs that start at rest; "
+            "slice the runs, or give the structure initial='rest'"
+        )
+    problem = _Problem(records, structure, lattice, settings, norm, check_threads(threads))
+    wanted = settings.evaluations or problem.size
+    if settings.evaluations is None and wanted > MOST_EVALUATIONS:
+        raise ModelError(
+            f"the lattice has {wanted} candidates, too many to evaluate one by one; give Genetic(evaluations=…)"
+        )
+    wanted = max(wanted, 2 * settings.population)
+    parents = max(2, round(PARENTS * settings.population))
+    total = wanted * len(settings.seeds)
+    before = 0
+    best: tuple[float, Floats] = (math.inf, np.zeros(len(problem.names)))
+    errors: dict[int, float] = {}
+    evaluations: dict[int, int] = {}
+    for seed in settings.seeds:
+        kept = _Kept(parents)
+        low, high = np.array([problem.bounds[n] for n in problem.names]).T
+
+        def enough(_: Any, kept: _Kept = kept) -> str | None:
+            return "stop" if kept.count >= wanted else None
+
+        def crossover(chosen: Any, size: tuple[int, int], running: Any) -> Floats:
+            return simulated_binary(np.asarray(chosen, dtype=np.float64), size, running.numpy_random_generator)
+
+        def mutation(children: Any, running: Any, low: Floats = low, high: Floats = high) -> Floats:
+            return polynomial(np.asarray(children, dtype=np.float64), low, high, running.numpy_random_generator)
+
+        def fitness(_: Any, genes: Any, __: Any, kept: _Kept = kept, before: int = before) -> list[float]:
+            found = problem.errors(np.asarray(genes, dtype=np.float64), kept.limit)
+            kept.take(found, np.asarray(genes, dtype=np.float64))
+            if progress is not None:
+                progress(min(before + kept.count, total), total)
+            return np.where(np.isfinite(found), -found, HOPELESS).tolist()  # type: ignore[no-any-return]
+
+        algorithm = pygad.GA(
+            num_generations=MOST_COPIES * math.ceil(wanted / (settings.population - parents)),
+            on_generation=enough,
+            num_parents_mating=parents, keep_elitism=parents, sol_per_pop=settings.population,
+            num_genes=len(problem.names), fitness_func=fitness, fitness_batch_size=settings.population,
+            gene_space=[{"low": low, "high": high} for low, high in (problem.bounds[n] for n in problem.names)],
+            parent_selection_type="sss", crossover_type=crossover, mutation_type=mutation,
+            random_seed=int(seed), suppress_warnings=True, save_best_solutions=False,
+        )  # fmt: skip
+        algorithm.run()
+        errors[int(seed)], evaluations[int(seed)] = kept.best, kept.count
+        before += wanted
+        if kept.best < best[0]:
+            best = (kept.best, kept.genes)
+    if not math.isfinite(best[0]):
+        raise ModelError("no candidate of the genetic algorithm had a finite error; narrow its bounds")
+    orders, coefficients = problem.named(best[1])
+    return GeneticRun(orders, coefficients, errors, evaluations, problem.bounds)
+
+
+def simulated_binary(parents: Floats, size: tuple[int, int], random: Any) -> Floats:
+    """Children between and around pairs of parents, gene by gene (Deb and Agrawal, Complex Systems 9, 1995)."""
+    pairs = (size[0] + 1) // 2
+    first, second = (parents[random.randint(0, parents.shape[0], pairs)] for _ in range(2))
+    u = random.random_sample(first.shape)
+    with np.errstate(divide="ignore"):
+        spread = np.where(u <= 0.5, 2.0 * u, 0.5 / (1.0 - u)) ** (1.0 / (CROSSOVER_SPREAD + 1.0))
+    crossed = (random.random_sample(first.shape) < 0.5) & (random.random_sample((pairs, 1)) < CROSSED)
+    spread = np.where(crossed, spread, 1.0)
+    middle, half = 0.5 * (first + second), 0.5 * (first - second)
+    return np.concatenate([middle + spread * half, middle - spread * half])[: size[0]]
+
+
+def polynomial(children: Floats, low: Floats, high: Floats, random: Any) -> Floats:
+    """Children with one gene in their number moved, on average, and all within bounds (Deb and Goyal 1996)."""
+    u = random.random_sample(children.shape)
+    power = 1.0 / (MUTATION_SPREAD + 1.0)
+    move = np.where(u < 0.5, (2.0 * u) ** power - 1.0, 1.0 - (2.0 * (1.0 - u)) ** power)
+    moved = random.random_sample(children.shape) < 1.0 / children.shape[1]
+    return np.clip(children + np.where(moved, move * (high - low), 0.0), low, high)
+
+
+class _Kept:
+    """The smallest errors met so far, as many as there are parents: who exceeds the largest is no parent."""
+
+    def __init__(self, parents: int) -> None:
+        self._errors = np.full(parents, np.inf)
+        self.genes = np.zeros(0)
+        self.best = math.inf
+        self.count = 0
+
+    @property
+    def limit(self) -> float:
+        """The largest of them."""
+        return float(self._errors[-1])
+
+    def take(self, errors: Floats, genes: Floats) -> None:
+        """Learn of a generation."""
+        self.count += errors.size
+        first = int(np.argmin(errors))
+        if errors[first] < self.best:
+            self.best, self.genes = float(errors[first]), genes[first].copy()
+        self._errors = np.sort(np.concatenate([self._errors, errors]))[: self._errors.size]

@@ -1,0 +1,138 @@
+"""Simpler problems inside a joint fit's, whose optima it starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ftlm.base.errors import FtlmError
+from ftlm.data.orders import Order
+from ftlm.data.run import Run
+from ftlm.fit.problem import Attempt, FreeProblem
+
+#: A pole of this many radians a sample is faster than the samples see.
+FAST_POLE = 0.2
+
+
+@dataclass(frozen=True)
+class LowerOrder:
+    """A problem one of whose equations ends with its highest own term: what is left of it behind a fast pole.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    coefficient
+        Of the term that is now the highest, 1 there.
+    factor
+        Known factor of that term.
+    others
+        Coefficients of the equation's other terms.
+    fast
+        Size of the term's coefficient that makes the pole fast.
+    initial
+        Initial terms of the equation of lower order: a power of t that it integrates to would be a drive.
+    """
+
+    problem: FreeProblem
+    coefficient: str
+    factor: float
+    others: tuple[str, ...]
+    fast: float
+    initial: Any
+
+    def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
+        """The same dynamics in the whole problem, but for what is faster than the sampling."""
+        values = dict(zip(self.problem.coefficients, attempt.coefficients, strict=True))
+        values |= {n: self.fast * values[n] for n in self.others}
+        values[self.coefficient] = -self.fast / self.factor
+        known = dict(zip(self.problem.orders, attempt.orders, strict=True))
+        return replace(
+            attempt,
+            orders=[known[n] for n in whole.orders],
+            coefficients=[values[n] for n in whole.coefficients],
+            origin=f"{attempt.origin}, from the equation of lower order",
+        )
+
+
+def lower_orders(problem: FreeProblem, runs: Sequence[Run], initial: Any) -> list[LowerOrder]:
+    """The problem of lower order of one equation whose own orders are numbers; free orders get there by themselves."""
+    structure = problem.structure
+    if structure.has_order_law or problem.products or len(structure.equations) > 1:
+        return []
+    step = max(run.step for run in runs)
+    item = structure.equations[0]
+    own = [t for t in item.terms if t.signal == item.output]
+    if item.order.names or not own or any(t.order.names for t in own):
+        return []
+    highest = max(own, key=lambda t: t.order.constant)
+    rest = tuple(t for t in item.terms if t is not highest)
+    known = any(t.fixed is not None or t.coefficient == highest.coefficient for t in rest)
+    if not isinstance(highest.coefficient, str) or highest.order.constant <= 0 or known:
+        return []
+    if not isinstance(initial, str):
+        initial = tuple(e for e in initial if e < highest.order.constant)
+    try:
+        lower = replace(item, order=highest.order, terms=rest)
+        reduced = FreeProblem.of(replace(structure, equations=(lower,)))
+    except FtlmError:
+        # A term of another signal differentiates more often than the equation of lower order integrates.
+        return []
+    fast = (FAST_POLE / step) ** (item.order.constant - highest.order.constant)
+    names = tuple(t.coefficient for t in rest if isinstance(t.coefficient, str))
+    return [LowerOrder(reduced, highest.coefficient, highest.factor, names, fast, initial)]
+
+
+@dataclass(frozen=True)
+class Simpler:
+    """A problem with one own term less.
+
+    Parameters
+    ----------
+    problem
+        The problem.
+    coefficient
+        What is 0 in it.
+    order
+        Highest order of the equation that lacks the term.
+    initial
+        Initial terms.
+    """
+
+    problem: FreeProblem
+    coefficient: str
+    order: Order
+    initial: Any
+
+    def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
+        """The same point of the whole problem; the order of a term that is 0 may be any, so it is half the highest."""
+        known = dict(zip(self.problem.orders, attempt.orders, strict=True))
+        highest = self.order.constant + sum(w * known[n] for n, w in self.order.weights)
+        values = dict(zip(self.problem.coefficients, attempt.coefficients, strict=True))
+        return replace(
+            attempt,
+            orders=[known.get(n, 0.5 * highest) for n in whole.orders],
+            coefficients=[values.get(n, 0.0) for n in whole.coefficients],
+            origin=f"{attempt.origin}, from {self.coefficient} = 0",
+        )
+
+
+def simpler(problem: FreeProblem, initial: Any) -> list[Simpler]:
+    """Problems with one own term less; none under a law, where no coefficient can be 0 by itself."""
+    structure = problem.structure
+    if structure.has_order_law or problem.products:
+        return []
+    out = []
+    for place, item in enumerate(structure.equations):
+        own = [t for t in item.terms if t.signal == item.output]
+        for term in own if len(own) > 1 else []:
+            if not isinstance(term.coefficient, str):
+                continue
+            rest = replace(item, terms=tuple(t for t in item.terms if t is not term))
+            equations = (*structure.equations[:place], rest, *structure.equations[place + 1 :])
+            names = {n for e in equations for n in e.order_names}
+            values = {n: v for n, v in structure.order_values.items() if n in names}
+            reduced = replace(structure, equations=equations, order_values=values)
+            out.append(Simpler(FreeProblem.of(reduced), term.coefficient, item.order, initial))
+    return out

@@ -1,0 +1,349 @@
+"""The report of an identification: its tables and sections."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from markupsafe import Markup
+
+from ftlm.base.output import check_free
+from ftlm.data.run import Run
+from ftlm.data.several import as_runs
+from ftlm.fit.joint import JointFit
+from ftlm.fit.recursion import multi_innovation_trace, trace_chart
+from ftlm.identification.judged import Judged
+from ftlm.identification.landscape import output_error_landscape
+from ftlm.identification.warnings import validate
+from ftlm.judge.charts import comparison_charts, residual_charts
+from ftlm.judge.comparison import Comparison, errors_table, initial_terms_table, warned
+from ftlm.judge.criteria import InformationCriteria, information_table
+from ftlm.judge.residuals import Residuals, resid, residual_table
+from ftlm.model.charts import bode_charts, response_frequencies
+from ftlm.model.model import Model
+from ftlm.model.typesetting import equation_html, parameter_table
+from ftlm.paint.axes import POINTS
+from ftlm.paint.heat import heat_map
+from ftlm.paint.lines import Figure
+from ftlm.paint.page import Section, write_page
+from ftlm.paint.table import Table
+from ftlm.paint.text import Cell, Exact, number, symbol, symbol_html
+from ftlm.search.orders import landscape
+from ftlm.search.result import search_summary, search_top
+
+#: Charts of a page and points in all of them: at no more than 10 bytes a point the page stays below 2 MB.
+PAGE_CHARTS = 60
+PAGE_POINTS = 90_000
+#: Charts of residuals, and of the frequency response, on a page.
+SMALL_CHARTS = 24
+#: Lags of the residual tests.
+LAGS = 25
+#: Innovation lengths of the paper's tables, and points of a convergence curve.
+INNOVATION_LENGTHS = (1, 3, 5, 7)
+TRACE_POINTS = 64
+
+
+def identification_page(
+    result: Judged,
+    path: str | os.PathLike[str],
+    *,
+    validation: Run | Sequence[Run] | None = None,
+    force: bool = False,
+) -> Path:
+    """Write the report of one identification.
+
+    Parameters
+    ----------
+    result
+        From :func:`ftlm.identify`.
+    path
+        File to write.
+    validation
+        Runs that the model was not identified from.
+    force
+        Overwrite an existing file.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    DataError
+        A validation run that does not fit the model; the file exists and ``force`` is not set, or cannot be written.
+    """
+    check_free(path, force=force)
+    model = result.model
+    others = [] if validation is None else as_runs(validation)
+    validated = [validate(result, run) for run in others]
+    warnings = list(result.warnings)
+    undefined = [n for n, e in result.standard_errors.items() if not math.isfinite(e)]
+    if undefined:
+        warnings.append(
+            f"the standard errors of {', '.join(undefined)} are not defined: the fit's covariance is not finite; "
+            "nothing is known of how sure these numbers are"
+        )
+    for run, found in zip(others, validated, strict=True):
+        warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in found.warnings]
+        warnings += [f"validation run {run.name}: {w}" for w in run.warnings]
+    compared = [("estimation", result.comparison), *(("validation", c) for c in validated)]
+    tests = [] if result.residuals is None else [("estimation", result.residuals)]
+    tests += tests_on(model, others)
+    sections = first_sections(model, warnings, compared, bool(others), result.joint)
+    sections.append(residual_section(tests, result.information))
+    task = result.task
+    steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
+    sections.append(frequency_section(model, steps))
+    sections += _search_sections(result)
+    titled = ((f"Initial terms of the free runs, {label}", c) for label, c in compared)
+    initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
+    starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
+    sections.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
+    return write_page(path, title=model.structure.name, sections=sections, lead=lead_of(compared), force=force)
+
+
+def first_sections(
+    model: Model,
+    warnings: Sequence[str],
+    compared: Sequence[tuple[str, Comparison]],
+    validated: bool,
+    joint: JointFit | None,
+) -> list[Section]:
+    """Warnings, equations, errors, charts."""
+    units = model.units
+    words = [
+        "No check raised a warning. Checked: free run against equation error, orders close to one another or on the "
+        "edge of their interval, pull of the prior, coefficient law, residuals, stability of the discretisation, the "
+        "data."
+    ]
+    if not validated:
+        words.append("No validation run was given: how well the model predicts other data is not known.")
+    warned = list(dict.fromkeys(warnings))
+    charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
+    # Two lines a chart, drawn once wide and once narrow with half the points.
+    points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
+    drawn = [f for label, c in compared for f in comparison_charts(c, units=units, label=label, points=points)]
+    stable = model.stability()
+    sections = [
+        Section("Warnings", words[1:] if warned else words, warned),
+        Section(
+            "Equations",
+            [*(equation_html(e) for e in model.equations), f"As a whole, the model is {stable}."],
+            tables=[parameter_table(model, joint)],
+        ),
+    ]
+    if compared:
+        left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."
+        sections += [
+            Section("Errors", tables=[errors_table(compared, units=units)]),
+            Section(
+                "Measured and simulated",
+                left_out if charts > PAGE_CHARTS else (),
+                figures=drawn[:PAGE_CHARTS],
+            ),
+        ]
+    return sections
+
+
+def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
+    """Residual tests of each run that is long enough for them."""
+    return [("validation", resid(model, run)) for run in runs if run.length >= 2 * LAGS + 3]
+
+
+def residual_section(tests: Sequence[tuple[str, Residuals]], information: InformationCriteria | None) -> Section:
+    tables = [residual_table(t, title=f"{label}: {', '.join(t.runs)}") for label, t in tests]
+    if information is not None:
+        tables.append(information_table(information))
+    figures = [f for label, t in tests for f in residual_charts(t, label=label)]
+    words = () if tests else ("The runs are too short for residual tests.",)
+    return Section("Residuals", words, tables=tables, figures=figures[:SMALL_CHARTS], small=True)
+
+
+def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Section:
+    omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
+    words = "Exact, orders as they are; the equations together, from what is not modelled."
+    if model.estimate is None or model.estimate.covariance is None:
+        words += " This estimator gives no covariance, so there are no bands."
+    return Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)
+
+
+def _search_sections(result: Judged) -> list[Section]:
+    """Convergence of the recursion, and the order search with its landscape."""
+    sections = []
+    traces = _traces(result)
+    if traces:
+        words = (
+            "Error (45) of the free run after every step of the recursion, at the orders found. p weighs the data "
+            "against the prior; all lines end where the closed form is."
+        )
+        sections.append(Section("Convergence of the recursion", words, figures=traces))
+    if result.searches:
+        tops = [search_top(name, found) for name, found in result.searches.items()]
+        maps = []
+        if result.task is not None:
+            for name, found in result.searches.items():
+                part = result.task.structure if name == "stage" else result.task.structure.equation(name)
+                own = result.task.lattice_of(part)
+                axes = {n: v for n, v in own.values(part).items() if len(v) > 1}
+                if len(axes) >= 2:  # one order alone has no landscape; its table says all
+                    maps.append(heat_map(landscape(result.task.runs, part, found, own)))
+        sections.append(
+            Section("Order search", tables=[search_summary(result.searches), *tops], figures=maps, small=True)
+        )
+    around = output_error_landscape(result)
+    if around is not None:
+        first, second = map(symbol, around.names)
+        words = (
+            f"The two orders that these runs tell apart least are {first} and {second}: the correlation of their "
+            f"estimates is {number(around.correlation, 3)}. For white residuals the 95 % region of both ends at a "
+            "score of 7."
+        )
+        sections.append(Section("Order landscape", words, figures=[heat_map(around)], small=True))
+    return sections
+
+
+def _traces(result: Judged) -> list[Figure]:
+    """The recursion at the orders found, for the paper's p and the one used, where the first run starts at rest."""
+    if result.task is None or result.method != "multi-innovation" or result.settings["initial"] != "rest":
+        return []
+    run, used = result.task.runs[0], result.settings
+    lengths = sorted({*INNOVATION_LENGTHS, int(used["innovation_length"])})
+    figures = []
+    for item in result.task.structure.equations:
+        single = replace(result.task.structure.equation(item.output), coefficient_law=())
+        found = next(e for e in result.model.equations if e.output == item.output)
+        orders = {
+            o.names[0]: v.constant
+            for o, v in zip(
+                (single.equations[0].order, *(t.order for t in single.equations[0].terms)),
+                (found.order, *(t.order for t in found.terms)), strict=True,
+            )
+            if o.names
+        }  # fmt: skip
+        at = single.with_orders(orders)
+        if not at.coefficient_names:
+            continue
+        every = max(1, int(used["m"]) // TRACE_POINTS)
+        traces = [
+            (
+                f"p = {p}",
+                multi_innovation_trace(
+                    run, at, innovation_length=p, prior_covariance=used["prior_covariance"], rows=used["rows"],
+                    m=int(used["m"]), every=every,
+                ),
+            )
+            for p in lengths
+        ]  # fmt: skip
+        figures.append(trace_chart(traces, title=f"Error (45) of {symbol(item.output)}, run {run.name}"))
+    return figures
+
+
+def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
+    """Return the fits of the free runs, in a sentence a data set."""
+    sentences = []
+    for label, found in compared:
+        fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in found.fit_percent.items())
+        runs = ", ".join(name for name, _, _ in found.per_run)
+        sentences.append(f"Fit of the free run, {label} ({runs}): {fits}.")
+    return " ".join(sentences)
+
+
+def estimates_table(result: Judged | None, truth: Mapping[str, float] | None = None) -> Table:
+    """Orders and coefficients of a joint fit with intervals, beside their true values where those are known."""
+    rows: list[list[Cell]] = []
+    if result is not None and result.joint is not None:
+        for name, value in {**result.orders, **result.joint.coefficients}.items():
+            low, high = result.intervals[name]
+            known = [truth.get(name)] if truth else []
+            rows.append([symbol_html(name), value, result.standard_errors[name], low, high, *known])
+    columns, groups = ["parameter", "value", "standard error", "from", "to"], [("", 3), ("95 % interval", 2)]
+    if truth:
+        columns, groups = [*columns, "true value"], [*groups, ("", 1)]
+    return Table("Output error: orders and coefficients, with intervals", columns, rows, groups=groups)
+
+
+def grouped_warnings(results: Mapping[str, Judged | None]) -> list[str]:
+    """Warnings of several results by label, those that differ in numbers alone together."""
+    groups: dict[str, tuple[str, list[str]]] = {}
+    for label, result in results.items():
+        for warning in () if result is None else result.warnings:
+            # Digits of names stay: theta11 is not theta12.
+            key = re.sub(r"(?<![A-Za-z\d.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", warning)
+            groups.setdefault(key, (warning, []))[1].append(label)
+    found = []
+    for warning, labels in groups.values():
+        alike = "" if len(labels) == 1 else " (numbers of the first)"
+        found.append(f"{', '.join(dict.fromkeys(labels))}: {warning}{alike}")
+    return found
+
+
+def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic starts") -> Table:
+    """Return where the first fits began and how far each came on thinned samples, best first."""
+    kept = joint.starts[:rows]
+    cells: list[list[Cell]] = [[k + 1, origin, level] for k, (level, origin) in enumerate(kept)]
+    note = f"{joint.choice}. The best ones went on on all samples." if joint.starts else ""
+    return Table(title, ("rank", "start from", "cost per residual"), cells, note=note)
+
+
+def settings_table(result: Judged, *, title: str = "What the result depends on") -> Table:
+    """Return what the result depends on besides the data: estimator, criterion, M, p, K₀, initial terms, runs."""
+    used, structure = result.settings, result.model.structure
+    coordinates = {"haar": "Haar coordinates", "time": "order of time"}
+    initial = {"rest": "none, the records start at rest", "caputo": "Caputo's, estimated for each run"}
+    rows: list[list[Cell]] = [
+        ["structure", structure.name],
+        ["coupling in free runs", structure.coupling],
+        ["estimator", result.method],
+        ["block pulses a run, M", int(used["m"])],
+    ]
+    if "innovation_length" in used:
+        rows += [
+            ["innovation length, p", int(used["innovation_length"])],
+            [Markup("prior covariance, K<sub>0</sub>"), Exact(used["prior_covariance"])],
+            ["rows of the recursion", coordinates.get(used["rows"], used["rows"])],
+        ]  # fmt: skip
+    if "refinement" in used:
+        rows += [
+            ["pulses a sample interval", int(used["refinement"])],
+            ["automatic starts", int(used["starts"])],
+        ]
+        for name, level in used["noise"].items():
+            rows.append([f"noise found on {symbol(name)}", float(level)])
+    rows.append(["initial terms", initial.get(str(used["initial"]), str(used["initial"]))])
+    if result.searches:
+        norm = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}.get(used["norm"], used["norm"])
+        rows.append(["orders ranked by", f"{used['criterion']}, {norm}"])
+    rows += [[f"delay of {symbol(name)}", f"{delay:g} s"] for name, delay in structure.delay.items()]
+    if structure.sensor_filter is not None:
+        filtered = ", ".join(symbol(o) for o in structure.sensor_filter.outputs)
+        rows.append(["known sensor filter on", filtered])
+    found = result.comparison
+    rows += [
+        [Markup("run <q>{}</q>").format(name), f"{number(step * found.m)} s, pulses of {number(step * 1e3)} ms"]
+        for (name, _, _), step in zip(found.per_run, found.step, strict=True)
+    ]
+    return Table(title, ("setting", "used"), rows)
+
+
+def identification_html(result: Judged) -> str:
+    """Return warnings, equations, parameters with intervals, both errors and the residual verdicts."""
+    model = result.model
+    parts = [warned(result.warnings)]
+    parts += [Markup("<p>{}</p>").format(equation_html(e)) for e in model.equations]
+    parts.append(parameter_table(model, result.joint).to_html())
+    parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
+    if result.residuals is not None:
+        verdicts = [
+            Markup("{}: residuals {}, {} of the inputs").format(
+                symbol_html(o), "white" if white else "not white",
+                "independent" if result.residuals.independent[o] else "not independent",
+            )
+            for o, white in result.residuals.white.items()
+        ]  # fmt: skip
+        parts.append(Markup("<p>{} (99 %).</p>").format(Markup("; ").join(verdicts)))
+    return str(Markup("").join(parts))

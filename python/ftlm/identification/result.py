@@ -1,0 +1,219 @@
+"""The result of an identification, with everything that is known about it."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from ftlm.base.errors import ModelError
+from ftlm.base.output import to_frame
+from ftlm.data.equations import numeric
+from ftlm.data.run import Run
+from ftlm.identification.judged import Judged
+from ftlm.identification.page import identification_html, identification_page
+from ftlm.identification.physical import PhysicalParameter, physical_parameters
+from ftlm.identification.warnings import validate
+from ftlm.judge.comparison import Comparison
+from ftlm.judge.residuals import Residuals, resid
+
+
+class Identification(Judged):
+    """An identified model with everything that is known about it.
+
+    Parameters
+    ----------
+    model
+        The model.
+    method
+        Estimator of the coefficients.
+    comparison
+        Both errors on the runs it was identified from.
+    searches
+        The order searches that gave its orders: by output, or under ``"stage"`` for a search under the order law;
+        empty where all orders were given.
+    settings
+        Of the estimator.
+    warnings
+        What makes the model doubtful, in words.
+    joint
+        The optimum of the joint output error with its covariance; None for the equation-error methods.
+    residuals
+        Residual tests on the runs it was identified from; None where these are too short.
+    information
+        Information criteria, orders counted as parameters; None where there are no residuals.
+    task
+        The runs and the structure as they were given.
+    coefficient_errors
+        Standard errors of the coefficients at these orders, where the method gives no joint covariance.
+    """
+
+    def physical(self, **known: float) -> dict[str, PhysicalParameter]:
+        """Physical parameters of a flexible link once one of them is known; see :func:`ftlm.physical_parameters`.
+
+        Parameters
+        ----------
+        **known
+            One parameter a stage by name, such as ``J_12=0.1704``.
+
+        Returns
+        -------
+        dict
+            Every parameter of the stage by name, with standard error, interval and unit.
+
+        Raises
+        ------
+        ModelError
+            A model without coefficient law or intervals, or a name that is no parameter of it.
+        """
+        if self.joint is None:
+            raise ModelError(f"method {self.method!r} gives no joint covariance; identify by method='output-error'")
+        return physical_parameters(self.joint, known)
+
+    def resid(self, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
+        """Residual tests on other runs; see :func:`ftlm.resid`."""
+        return resid(self.model, runs, lags=lags)
+
+    def validate(self, runs: Run | Sequence[Run]) -> Comparison:
+        """Both errors on runs that the model was not identified from, with what they say against the model.
+
+        Parameters
+        ----------
+        runs
+            One run or several with the same names and units.
+
+        Returns
+        -------
+        Comparison
+            Its warnings name a fit that is lost, and runs that the model was identified from.
+
+        Raises
+        ------
+        DataError
+            Runs that do not fit the model.
+        """
+        return validate(self, runs)
+
+    def report(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        validation: Run | Sequence[Run] | None = None,
+        force: bool = False,
+    ) -> Path:
+        """Write everything about this result as one HTML file that opens offline.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        validation
+            Runs that the model was not identified from; without any, the page says that it was not validated.
+        force
+            Overwrite an existing file.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        DataError
+            A validation run that does not fit the model; the file exists and ``force`` is not set, or cannot be
+            written.
+        """
+        return identification_page(self, path, validation=validation, force=force)
+
+    def to_frame(self) -> Any:
+        """Orders and coefficients as a pandas frame: value, standard error, 95 % interval, stated value by name."""
+        values = {**self.orders, **self.joint_values, **self.coefficients}
+        errors, intervals = self.standard_errors, self.intervals
+        none = (math.nan, math.nan)
+        rows = [
+            {
+                "parameter": n, "value": v, "standard_error": errors.get(n, math.nan),
+                "low": intervals.get(n, none)[0], "high": intervals.get(n, none)[1],
+                "stated": self.model.structure.reference.get(n, math.nan),
+            }
+            for n, v in values.items()
+        ]  # fmt: skip
+        return to_frame(rows, ["parameter"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "method": self.method,
+            "settings": self.settings,
+            "equations": {e.output: numeric(e) for e in self.model.equations},
+            "orders": self.orders,
+            "coefficients": self.coefficients,
+            "delays": self.delays,
+            "standard_errors": self.standard_errors,
+            "intervals": {n: list(i) for n, i in self.intervals.items()},
+            **self.comparison.to_dict(),
+            "residuals": None if self.residuals is None else self.residuals.to_dict(),
+            "information": None if self.information is None else self.information.to_dict(),
+            "searches": {name: s.to_dict() for name, s in self.searches.items()},
+            "choice": None if self.joint is None else self.joint.choice,
+            "warnings": list(self.warnings),
+        }
+
+    def __str__(self) -> str:
+        lines = [f"{self.model.structure.name}: {self.method}, {_settings_in_words(self.settings)}"]
+        lines += [f"  {numeric(e)}" for e in self.model.equations]
+        reference = self.model.structure.reference
+        errors, shown = self.standard_errors, {**self.orders, **self.coefficients}
+        if self.joint is not None:
+            shown = {**self.orders, **self.joint_values, **self.coefficients}
+        for name, value in shown.items():
+            spread = f" ± {errors[name]:<10.3g}" if name in errors else ""
+            stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
+            lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
+        if self.joint is not None:
+            lines.append(f"  {self.joint.choice}")
+        if errors:
+            lines.append("  (value ± standard error; 95 % intervals are ± 1.96 of these)")
+        lines.append(str(replace(self.comparison, warnings=())))
+        if self.residuals is not None:
+            white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.white.items())
+            free = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.independent.items())
+            lines.append(f"residuals white: {white}; independent of the inputs: {free} (99 %)")
+        if self.information is not None:
+            lines.append(str(self.information))
+        for name, search in self.searches.items():
+            pruned = ", ".join(f"{count} {reason}" for reason, count in search.pruned.items() if count)
+            lines.append(f"order search ({name}): {search.candidates} candidates, {len(search.table)} kept, {pruned}")
+        initial = _initial_in_words(self.comparison)
+        lines += initial
+        lines += [f"warning: {w}" for w in self.warnings]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return identification_html(self)
+
+
+def _settings_in_words(settings: Mapping[str, Any]) -> str:
+    words = f"M = {settings['m']}"
+    if "refinement" in settings:
+        words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} starts"
+    if "seeds" in settings:
+        seeds = ", ".join(map(str, settings["seeds"]))
+        words += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
+    if "innovation_length" in settings:
+        words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
+        words += f", {settings['rows']} rows"
+    return f"{words}, initial terms: {settings['initial']}"
+
+
+def _initial_in_words(comparison: Comparison) -> list[str]:
+    lines = []
+    for (run, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True):
+        for output, terms in initial.items():
+            if terms:
+                listed = ", ".join(f"{v:.4g} t^{e:g}" for e, v in terms.items())
+                lines.append(f"initial terms of {output} in {run} (of that run alone): {listed}")
+    return lines

@@ -1,0 +1,1 @@
+"""Results held against measurements: both errors, residual tests, criteria."""

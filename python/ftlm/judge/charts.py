@@ -1,0 +1,131 @@
+"""Comparisons and residual tests as charts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import DataError
+from ftlm.judge.comparison import Comparison
+from ftlm.judge.residuals import Residuals
+from ftlm.paint.axes import POINTS
+from ftlm.paint.lines import SMALL, Figure, line_chart
+from ftlm.paint.text import number, symbol
+
+
+def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
+    """Return the middle of every block pulse of a run of a comparison [s], at which its means are drawn."""
+    return np.asarray((np.arange(comparison.m) + 0.5) * comparison.step[run], dtype=np.float64)
+
+
+def comparison_charts(
+    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = POINTS
+) -> list[Figure]:
+    """Measured and simulated output, a chart for every output of every run.
+
+    Parameters
+    ----------
+    comparison
+        From :func:`ftlm.compare` or an identification.
+    units
+        Units of the outputs.
+    label
+        What the data were to the model, such as "estimation".
+    points
+        Most points of a line.
+    """
+    figures = []
+    for k, (run, _, output_error) in enumerate(comparison.per_run):
+        for name, figures_of in output_error.items():
+            figures.append(
+                line_chart(
+                    pulse_times(comparison, k),
+                    [("measured", comparison.measured[name][k]), ("simulated", comparison.simulated[name][k])],
+                    title=f"{symbol(name)}, {f'{label}: ' if label else ''}{run}",
+                    x_label="time [s]",
+                    y_label=with_unit(symbol(name), units, name),
+                    caption=f"Free run: fit {number(figures_of.fit)}\u00a0%, NR {number(figures_of.nr)}.",
+                    points=points,
+                )
+            )
+    return figures
+
+
+def error_chart(
+    compared: Sequence[tuple[str, Comparison]],
+    output: str,
+    *,
+    run: int = 0,
+    title: str = "",
+    units: Mapping[str, str] | None = None,
+    points: int = POINTS,
+) -> Figure:
+    """Absolute error of the free runs of several models on one run, as in the paper's Figure 4(a).
+
+    Parameters
+    ----------
+    compared
+        (name of the model, its comparison); all on the same run with the same m.
+    output
+        Whose error.
+    run
+        Index of the run in the comparisons.
+    title
+        Default: says what is shown.
+    units
+        Units of the outputs.
+    points
+        Most points of a line.
+    """
+    if not compared:
+        raise DataError("an error chart needs at least one comparison; give (name, comparison) pairs")
+    errors = [(name, np.abs(c.measured[output][run] - c.simulated[output][run])) for name, c in compared]
+    return line_chart(
+        pulse_times(compared[0][1], run),
+        errors,
+        title=title or f"{symbol(output)}: absolute error of the free run",
+        x_label="time [s]",
+        y_label=with_unit("|error|", units, output),
+        points=points,
+    )
+
+
+def with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
+    unit = (units or {}).get(name, "")
+    return f"{text} [{unit}]" if unit else text
+
+
+def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
+    """Autocorrelation and cross-correlations of the residuals of every output, with their 99 % bands.
+
+    Parameters
+    ----------
+    tests
+        From :func:`ftlm.resid`.
+    label
+        What the data were to the model, such as "validation".
+    """
+    figures = []
+    suffix = f", {label}" if label else ""
+    for output, found in tests.outputs.items():
+        drawn = [("itself", found.whiteness), *found.inputs.items()]
+        for name, test in drawn:
+            own = name == "itself"
+            # Lag 0 of an autocorrelation is 1 and says nothing.
+            keep = test.lags != 0 if own else np.ones(test.lags.size, dtype=bool)
+            lags, values = test.lags[keep].astype(np.float64), test.values[keep]
+            band = np.full(lags.size, test.band)
+            words = "could be white noise" if own else f"could be independent of earlier {symbol(name)}"
+            words = words if test.passed else words.replace("could", "cannot")
+            other = "itself" if own else symbol(name)
+            figures.append(
+                line_chart(
+                    lags, [("", values)], stems=True, width=SMALL, height=190, bands=[(-band, band)],
+                    title=f"Residual of {symbol(output)} with {other}{suffix}",
+                    x_label="lag [samples]", y_label="correlation",
+                    caption=f"Shade: 99 % band. The residual {words} (99 %).",
+                )
+            )  # fmt: skip
+    return figures

@@ -1,0 +1,327 @@
+"""How good a model is on measured runs: equation error and output error, always side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from ftlm import _core
+from ftlm.base.arrays import Floats
+from ftlm.base.output import to_frame
+from ftlm.data.run import Run
+from ftlm.data.several import as_runs
+from ftlm.data.solved import Solved, check_solved
+from ftlm.data.structures import Structure
+from ftlm.judge.metrics import Metrics, pooled
+from ftlm.paint.table import Table
+from ftlm.paint.text import Cell, Exact, symbol_html
+from ftlm.solve.free_run import respond
+from ftlm.solve.records import check_m, default_m, equation_tuple, initial_tuple, record
+
+#: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
+NEAR_IDENTITY = 0.25
+#: A free run this many times worse than the equation error says that the equation error flatters.
+FLATTERED = 5.0
+#: Points of fit lost from estimation to validation beyond which the model describes its own data, not the machine.
+LOST = 20.0
+#: A free run with a normalised residual above this explains nothing.
+USELESS = 0.5
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A model beside measured runs.
+
+    Parameters
+    ----------
+    output_error, equation_error
+        Figures by output, over all runs: of the free run, and of the equation with measured signals on its right-hand
+        side.
+    per_run
+        The same for each run by name: (equation error, output error).
+    simulated, measured
+        Pulse means by output, one array a run.
+    step
+        Pulse width of each run [s].
+    m
+        Number of block pulses.
+    initial
+        Coefficients of the initial terms of the free run, one mapping a run: output -> exponent -> value. They belong
+        to that run alone.
+    warnings
+        What makes these figures doubtful, in words.
+    """
+
+    output_error: dict[str, Metrics]
+    equation_error: dict[str, Metrics]
+    per_run: list[tuple[str, dict[str, Metrics], dict[str, Metrics]]]
+    simulated: dict[str, list[Floats]]
+    measured: dict[str, list[Floats]]
+    step: list[float]
+    m: int
+    initial: list[dict[str, dict[float, float]]]
+    warnings: tuple[str, ...] = field(default=())
+
+    @property
+    def fit_percent(self) -> dict[str, float]:
+        """Fit of the free run in percent, by output."""
+        return {name: figures.fit for name, figures in self.output_error.items()}
+
+    def to_frame(self) -> Any:
+        """Both errors of every run as a pandas frame, by run, output and kind of error."""
+        rows = [
+            {"run": run, "output": name, "of": kind, "error": f.error, "rmse": f.rmse, "nr": f.nr, "fit": f.fit}
+            for run, equation, output in self.per_run
+            for kind, figures in (("equation error", equation), ("output error", output))
+            for name, f in figures.items()
+        ]
+        return to_frame(rows, ["run", "output", "of"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "m": self.m,
+            "output_error": {n: f.to_dict() for n, f in self.output_error.items()},
+            "equation_error": {n: f.to_dict() for n, f in self.equation_error.items()},
+            "runs": [
+                {
+                    "run": name,
+                    "equation_error": {n: f.to_dict() for n, f in equation.items()},
+                    "output_error": {n: f.to_dict() for n, f in output.items()},
+                }
+                for name, equation, output in self.per_run
+            ],
+            "warnings": list(self.warnings),
+        }
+
+    def __str__(self) -> str:
+        width = max(len(name) for name in self.output_error) + 2
+        lines = [f"{'output':<{max(width, 8)}}{'':<16}{'error':>12}{'RMSE':>12}{'NR':>10}{'fit %':>10}"]
+        for name in self.output_error:
+            both = (("equation error", self.equation_error[name]), ("output error", self.output_error[name]))
+            for label, f in both:
+                lines.append(
+                    f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>10.4g}"
+                )
+        lines.append(f"over {self.m} block pulses a run")
+        lines += [f"warning: {w}" for w in self.warnings]
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return comparison_html(self)
+
+
+def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
+    """Equation error and output error of a model on measured runs.
+
+    Parameters
+    ----------
+    model
+        The model.
+    runs
+        One run or several with the same names and units.
+    m
+        Number of block pulses a run; default that of the identification, or what the runs carry.
+
+    Returns
+    -------
+    Comparison
+        On the data that a model was identified from, its figures are those printed with it.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit, a signal that is not there, a constant output.
+    ModelError
+        An m that the runs do not carry.
+    """
+    check_solved(model)
+    found = as_runs(runs)
+    carried = min(run.length for run in found) - 1
+    chosen = min(model.m or default_m(found, power_of_two=False), carried) if m is None else m
+    m = check_m(chosen, found, power_of_two=False)
+    simulated: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    measured: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    own: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    per_run, initial, steps = [], [], []
+    for run in found:
+        run.require_outputs([o for o in model.outputs if o in run])
+        rec, responses, terms = respond(model, run, m)
+        full = rec if model.structure.coupling == "measured" else record(run, model.structure, m)
+        equation_figures, output_figures = {}, {}
+        for item in model.equations:
+            name = item.output
+            core_equation = equation_tuple(item, full.signals)
+            args = (core_equation, list(full.inputs), initial_tuple(full.initial))
+            residual = _core.equation_error(full.core(), *args)
+            y = rec.of(name)
+            simulated[name].append(responses[name])
+            measured[name].append(y)
+            own[name].append(full.of(name))
+            residuals[name].append(residual)
+            equation_figures[name] = Metrics(*_core.metrics(full.of(name), residual))
+            output_figures[name] = Metrics(*_core.metrics(y, y - responses[name]))
+        per_run.append((run.name, equation_figures, output_figures))
+        initial.append(terms)
+        steps.append(rec.step)
+    outputs = {
+        o: pooled(measured[o], [y - s for y, s in zip(measured[o], simulated[o], strict=True)]) for o in model.outputs
+    }
+    equations = {o: pooled(own[o], residuals[o]) for o in model.outputs}
+    warnings = near_identity(model.structure, equations, outputs)
+    return Comparison(outputs, equations, per_run, simulated, measured, steps, m, initial, tuple(warnings))
+
+
+def near_identity(
+    structure: Structure, equation_error: Mapping[str, Metrics], output_error: Mapping[str, Metrics]
+) -> list[str]:
+    """Warnings in words where the equation error flatters a model.
+
+    Own-output orders close to alpha reproduce any smooth output from itself; only the free run shows it.
+    """
+    warnings = []
+    for item in structure.equations:
+        name, alpha = item.output, item.order.constant
+        equation, output = equation_error[name], output_error[name]
+        close = [t.order.constant for t in item.terms if t.signal == name and alpha - t.order.constant < NEAR_IDENTITY]
+        # Negated so that a figure that is not a number counts as bad.
+        worse = not output.nr <= FLATTERED * equation.nr
+        useless = not output.nr <= USELESS
+        if close and worse:
+            listed = ", ".join(f"{order:g}" for order in close)
+            listed = f"orders {listed} are" if len(close) > 1 else f"order {listed} is"
+            warnings.append(
+                f"{name}: {listed} close to alpha = {alpha:g}, so the equation nearly says that {name} "
+                f"equals itself; its free run has NR {output.nr:.3g} against {equation.nr:.3g} for the equation error. "
+                "Do not use these orders"
+            )
+        elif worse and useless:
+            warnings.append(
+                f"{name}: the free run (NR {output.nr:.3g}) is far worse than the equation error ({equation.nr:.3g}); "
+                "the equation error flatters this model"
+            )
+        elif useless:
+            warnings.append(f"{name}: the free run explains little of the output (NR {output.nr:.3g})")
+    return warnings
+
+
+def validation_warnings(own: Comparison, found: Comparison) -> list[str]:
+    """Say what validation runs hold against a model, or against themselves.
+
+    Parameters
+    ----------
+    own
+        On the runs that the model was identified from.
+    found
+        On the validation runs.
+
+    Returns
+    -------
+    list of str
+        Runs that validate nothing, and outputs whose fit is lost.
+    """
+    warnings = []
+    for k, (name, _, _) in enumerate(own.per_run):
+        for j, (other, _, _) in enumerate(found.per_run):
+            if all(np.array_equal(own.measured[o][k], found.measured[o][j]) for o in own.measured):
+                warnings.append(
+                    f"{other}: its outputs are those of {name}, which the model was identified from; "
+                    "it validates nothing"
+                )
+    return warnings + lost_fits({n: f.fit for n, f in own.output_error.items()}, found)
+
+
+def lost_fits(before: Mapping[str, float], found: Comparison) -> list[str]:
+    """Name outputs whose fit on other runs is far below that on the estimation data."""
+    warnings = []
+    for other, _, figures in found.per_run:
+        for output, f in figures.items():
+            # Negated so that a fit that is not a number counts as lost.
+            if np.isfinite(before.get(output, np.nan)) and not f.fit >= before[output] - LOST:
+                warnings.append(
+                    f"{other}: the fit of {output} falls from {before[output]:.3g} % on the estimation data to "
+                    f"{f.fit:.3g} %; the model describes the data it was identified from better than the machine"
+                )
+    return warnings
+
+
+_FIGURES = ("error (45)", "RMSE", "NR", "fit %")
+
+
+def errors_table(
+    compared: Iterable[tuple[str, Comparison]], *, units: Mapping[str, str] | None = None, title: str = "Both errors"
+) -> Table:
+    """Return equation error and output error side by side, a row for each output of each comparison.
+
+    Parameters
+    ----------
+    compared
+        (what the data were to the model, comparison), such as ``("estimation", result.comparison)``. Where a comparison
+        holds several runs, each follows with its own rows.
+    units
+        Units of the outputs.
+    title
+        Caption.
+    """
+    rows: list[list[Cell]] = []
+    headings: dict[int, str] = {}
+
+    def add(heading: str, equation: Mapping[str, Metrics], output: Mapping[str, Metrics]) -> None:
+        headings[len(rows)] = heading
+        for name in output:
+            unit = (units or {}).get(name, "")
+            label = symbol_html(name) + (Markup(" [{}]").format(unit) if unit else Markup(""))
+            rows.append([label, *_four(equation[name]), *_four(output[name])])
+
+    for label, found in compared:
+        names = [name for name, _, _ in found.per_run]
+        if len(names) == 1:
+            add(f"{label}: {names[0]}", found.equation_error, found.output_error)
+            continue
+        add(f"{label}: {len(names)} runs together", found.equation_error, found.output_error)
+        for name, equation, output in found.per_run:
+            add(f"{label}: {name}", equation, output)
+    return Table(
+        title,
+        ("output", *_FIGURES, *_FIGURES),
+        rows,
+        groups=(("", 1), ("equation error", 4), ("output error (free run)", 4)),
+        headings=headings,
+        note="The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
+        "close to one another; only the free run shows what the model knows.",
+    )
+
+
+def _four(figures: Metrics) -> list[Cell]:
+    return [figures.error, figures.rmse, figures.nr, figures.fit]
+
+
+def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms of the free runs") -> Table | None:
+    """Return initial terms by run and output, or None where every run starts at rest."""
+    rows: list[list[Cell]] = [
+        [name, symbol_html(output), Exact(exponent), value]
+        for (name, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True)
+        for output, terms in initial.items()
+        for exponent, value in terms.items()
+    ]
+    if not rows:
+        return None
+    note = "They describe how that record starts and are never carried to another."
+    return Table(title, ("run", "output", "exponent of t", "coefficient"), rows, note=note)
+
+
+def warned(warnings: Sequence[str]) -> Markup:
+    if not warnings:
+        return Markup("")
+    items = Markup("").join(Markup("<li>{}</li>").format(w) for w in warnings)
+    return Markup("<p><strong>Warnings</strong></p><ul>{}</ul>").format(items)
+
+
+def comparison_html(found: Comparison) -> str:
+    """Return both errors of every run, warnings first."""
+    return str(warned(found.warnings) + errors_table([("compared", found)]).to_html())

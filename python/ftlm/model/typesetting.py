@@ -1,0 +1,145 @@
+"""A model typeset: equations as MathML, parameters as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from markupsafe import Markup
+
+from ftlm.base.statistics import NORMAL_95
+from ftlm.data.equations import Equation
+from ftlm.data.orders import Order
+from ftlm.data.solved import Solved
+from ftlm.data.structures import delay_name
+from ftlm.fit.joint import JointFit
+from ftlm.paint.table import Table
+from ftlm.paint.text import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_html
+
+#: Decimals of an order in an equation; the model's file has them all.
+ORDER_DECIMALS = 4
+THIN = Markup('<mspace width="0.17em"></mspace>')  # our constant
+_PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
+
+
+def equation_html(item: Equation) -> Markup:
+    """Return an identified equation typeset as MathML, a piece for each term so that it breaks between terms."""
+    parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
+    for k, term in enumerate(item.terms):
+        value = term.fixed or 0.0
+        sign = "−" if value < 0 else "" if k == 0 else "+"
+        # The first sign belongs to its number; the others stand between two terms.
+        lead = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
+        parts.append(_math(lead + _number_math(abs(value)) + THIN +
+                           _derivative_math(term.order, term.signal), "term"))  # fmt: skip
+    return Markup('<span class="equation">{}</span>').format(Markup(" ").join(parts))
+
+
+def _math(content: Markup, name: str = "") -> Markup:
+    kind = Markup(' class="{}"').format(name) if name else Markup("")
+    return Markup("<math{}><mrow>{}</mrow></math>").format(kind, content)
+
+
+def _number_math(value: float) -> Markup:
+    mantissa, times, power = number(value).partition("×10")
+    base = Markup("<mn>{}</mn>").format(mantissa)
+    if not times:
+        return base
+    exponent = power.translate(_PLAIN_DIGITS)
+    sign = Markup("<mo>−</mo>") if exponent.startswith("-") else Markup("")
+    raised = Markup("<mrow>{}<mn>{}</mn></mrow>").format(sign, exponent.lstrip("-"))
+    return Markup("{}<mo>×</mo><msup><mn>10</mn>{}</msup>").format(base, raised)
+
+
+def _symbol_math(name: str) -> Markup:
+    found = SYMBOL.fullmatch(name)
+    if not found:
+        return Markup("<mi>{}</mi>").format(name)
+    stem = Markup("<mi>{}</mi>").format(GREEK.get(found[1], found[1]))
+    return Markup("<msub>{}<mn>{}</mn></msub>").format(stem, found[2]) if found[2] else stem
+
+
+def _derivative_math(order: Order, signal: str) -> Markup:
+    if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
+        return _symbol_math(signal)
+    value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed(order.constant)
+    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN, _symbol_math(signal))
+
+
+def _signed(value: float) -> Markup:
+    value = round(value, ORDER_DECIMALS) + 0.0
+    text = number(Exact(abs(value)))
+    return Markup("<mrow><mo>−</mo><mn>{}</mn></mrow>" if value < 0 else "<mn>{}</mn>").format(text)
+
+
+def derivative_html(order: Order, signal: str) -> Markup:
+    if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
+        return symbol_html(signal)
+    text = str(order) if order.names else number(Exact(round(order.constant, ORDER_DECIMALS) + 0.0))
+    return Markup("D<sup>{}</sup> {}").format(text, symbol_html(signal))
+
+
+def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str = "Orders and coefficients") -> Table:
+    """Return orders and coefficients with the place of each, beside standard errors and the values the maker states.
+
+    Parameters
+    ----------
+    model
+        The model. What its ``estimate`` knows is used where there is no fit.
+    joint
+        The fit that it came from, where there is one: it knows the standard errors.
+    title
+        Caption.
+    """
+    reference = model.structure.reference
+    errors: Mapping[str, float | None] = {}
+    extra: Mapping[str, float] = {}
+    if joint is not None:
+        errors, extra = joint.standard_errors, joint.coefficients
+    elif model.estimate is not None:
+        errors, extra = model.estimate.standard_errors, model.estimate.values
+    known = any(e is not None for e in errors.values())
+
+    def row(name: str, value: float, stated: float | None, place: str) -> list[Cell]:
+        error = errors.get(name)
+        half = None if error is None else NORMAL_95 * error
+        ends: list[Cell] = [None, None] if half is None else [value - half, value + half]
+        return [symbol_html(name), value, error, *ends, stated, place]
+
+    rows = [row(n, v if known else Exact(v), None, "free order") for n, v in model.orders.items()]
+    shown = set(model.orders)
+    for item in model.equations:
+        for term in item.terms:
+            if term.name is None:
+                continue
+            place = Markup("of {} in the equation of {}").format(
+                derivative_html(term.order, term.signal), symbol_html(item.output)
+            )
+            stated = reference.get(term.name)
+            shown.add(term.name)
+            # + 0.0 makes the negative zero of a product of signs a plain zero.
+            rows.append(row(term.name, float(term.coefficient), None if stated is None else stated + 0.0, place))
+    delays = {delay_name(n): (n, v) for n, v in model.structure.delay.items() if delay_name(n) in errors}
+    rows += [
+        row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown and n not in delays
+    ]
+    rows += [row(n, v, None, f"delay of {symbol(signal)} in s") for n, (signal, v) in delays.items()]
+    columns = ["parameter", "value", "standard error", "from", "to", "stated", "what it is"]
+    if known:
+        note = "A coefficient without an interval follows from the law. Intervals hold as far as the model does."
+    else:
+        note = "No standard errors are given here: this table does not say how many of the digits mean something."
+    left_out = ([] if known else [2, 3, 4]) + ([] if reference else [5])
+    if reference:
+        note += " Stated values belong to the integer orders of the maker's model."
+    kept = [i for i in range(len(columns)) if i not in left_out]
+    groups = (("", 3), ("95 % interval", 2), ("", len(kept) - 5)) if known else ()
+    return Table(
+        title, tuple(columns[i] for i in kept), [[row[i] for i in kept] for row in rows], groups=groups, note=note
+    )
+
+
+def model_html(model: Solved) -> str:
+    """Return the equations of a model and its parameters."""
+    lines = Markup("").join(Markup("<p>{}</p>").format(equation_html(e)) for e in model.equations)
+    known = model.orders or any(t.name for e in model.equations for t in e.terms)
+    return str(lines + parameter_table(model).to_html() if known else lines)

@@ -1,0 +1,1 @@
+"""Drawing that knows no result: text, axes, lines, heat maps, tables, pages."""

@@ -1,0 +1,494 @@
+"""Line charts as inline SVG that need no script: for screens wide and narrow, light and dark, for print and by ear."""
+
+from __future__ import annotations
+
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import ArrayLike
+
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import DataError
+from ftlm.paint.axes import POINTS, STRAY, Ticks, decimate, limits, log_ticks, snapped, ticks
+from ftlm.paint.text import number
+
+#: Width of the drawing for telephones; its text stays as large as the wide one's.
+NARROW = 360
+#: Values beyond this are drawn as gaps: differences of two of them leave the range of double precision.
+HUGE = 1e300
+#: Coordinates inside the plot are whole tenths of a pixel.
+SUB = 10
+#: Width of charts that stand side by side.
+SMALL = 520
+#: Text at 12 px: width of a letter, height of a line.
+LETTER, LINE = 6.7, 15
+#: Letters of a label beside its line; the legend above the narrow chart has room for more.
+MOST_LETTERS = 22
+#: (light, dark, dashes). Vermilion, blue, green, purple after Okabe and Ito, darkened to a contrast of 3:1 on white and
+#: lightened for the dark; dashes tell lines apart without any colour. The first is the neutral line.
+LINES = (
+    ("#3d4650", "#7f8b97", ""),
+    ("#d1480a", "#ff8f45", ""),
+    ("#0a6cb0", "#5ab8f5", "8 3"),
+    ("#00855f", "#3fcfa3", "3 3"),
+    ("#9b3f83", "#e99ac8", "9 3 2 3"),
+    ("#7a6300", "#e6cb4f", "14 4"),
+)
+NEUTRAL = "measured"
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A chart of a report; `line_chart` makes them.
+
+    Parameters
+    ----------
+    title
+        What is shown.
+    svg
+        The drawing, trusted markup.
+    narrow
+        The same for narrow screens, or empty.
+    caption
+        What the eye cannot see in the drawing, such as values that are not finite.
+    """
+
+    title: str
+    svg: Markup
+    narrow: Markup = field(default_factory=Markup)
+    caption: str = ""
+
+    def _repr_html_(self) -> str:
+        return str(
+            Markup("<figure>{}<figcaption>{}. {}</figcaption></figure>").format(self.svg, self.title, self.caption)
+        )
+
+
+@dataclass(frozen=True)
+class _Plot:
+    """Place of the plot in the drawing [px], and the data at its edges."""
+
+    left: float
+    top: float
+    width: float
+    height: float
+    frame: tuple[float, float, float, float]
+
+    def across(self, x: Floats | float) -> Floats:
+        low, high, _, _ = self.frame
+        return np.asarray(self.left + self.width * (np.asarray(x) - low) / (high - low))
+
+    def down(self, y: Floats | float) -> Floats:
+        _, _, low, high = self.frame
+        return np.asarray(self.top + self.height * (high - np.asarray(y)) / (high - low))
+
+
+@dataclass(frozen=True)
+class _Words:
+    title: str
+    described: str
+    x_label: str
+    y_label: str
+
+
+@dataclass(frozen=True)
+class _Line:
+    name: str
+    style: int
+    x: Floats
+    y: Floats  # logarithms on a logarithmic axis; not a number where nothing can be drawn
+
+
+@dataclass(frozen=True)
+class _Shade:
+    style: int
+    x: Floats
+    low: Floats
+    high: Floats
+
+
+@dataclass(frozen=True)
+class _How:
+    log_x: bool
+    log_y: bool
+    stems: bool
+    shades: tuple[_Shade, ...]
+
+
+def line_chart(
+    x: ArrayLike,
+    lines: Sequence[tuple[str, ArrayLike]],
+    *,
+    title: str,
+    x_label: str,
+    y_label: str,
+    width: int = 720,
+    height: int = 260,
+    log_x: bool = False,
+    log_y: bool = False,
+    caption: str = "",
+    points: int = POINTS,
+    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (),
+    stems: bool = False,
+) -> Figure:
+    """Chart of one or several lines over a common axis.
+
+    Parameters
+    ----------
+    x
+        Shape (N,).
+    lines
+        (name, values of shape (N,)); a lone line may do without a name. A line whose name begins with "measured" is
+        neutral and lies beneath; the others are coloured and dashed in the order given.
+    title, x_label, y_label
+        Text, with units.
+    width, height
+        Of the wide drawing, in pixels; it scales.
+    log_x, log_y
+        Logarithmic axes.
+    caption
+        Sentence below; what could not be drawn is added to it.
+    points
+        Most points of a line.
+    bands
+        (low, high) of a shade behind the first lines, in their order; each of shape (N,).
+    stems
+        Draw every value as a stem from 0 instead of a line.
+
+    Returns
+    -------
+    Figure
+        With a second drawing for narrow screens.
+
+    Raises
+    ------
+    DataError
+        No line, or a line whose length is not that of x.
+    """
+    drawn, notes = _checked(x, lines, x_label, log_x, log_y)
+    x_low, x_high = limits([drawn[0].x[np.isfinite(drawn[0].x)]], 0.02 if stems else 0.0)
+    if not (log_x or stems):
+        x_low, x_high = snapped(x_low, x_high)
+    shades = [_shade(drawn[k], low, high, log_y) for k, (low, high) in enumerate(bands[: len(drawn)])]
+    around = [_Line("", 0, b.x, edge) for b in shades for edge in (b.low, b.high)]
+    y_low, y_high, strays = _y_limits(drawn if stems or not around else [*drawn, *_unnamed(around)])
+    if stems:
+        around_zero = [0.0, *(float(np.nanmax(b.high)) for b in shades), *(float(np.nanmin(b.low)) for b in shades)]
+        y_low, y_high = min(y_low, *(1.1 * v for v in around_zero)), max(y_high, *(1.1 * v for v in around_zero))
+    notes += [f"{name} leaves the axis ({place})." for name, place in _in_words(strays, log_y)]
+    about = f"{y_label} against {x_label}" + ("; logarithmic vertical axis" if log_y else "")
+    about += "; logarithmic horizontal axis" if log_x else ""
+    described = f"Line chart. {about}. " + " ".join(_described(line, log_y) for line in drawn)
+    frame = (x_low, x_high, y_low, y_high)
+    words = _Words(title, described, x_label, y_label)
+    how = _How(log_x, log_y, stems, tuple(shades))
+    wide = _drawing(drawn, frame, words, how, size=(width, height), points=points, narrow=False)
+    half = max(4, points // 2)
+    narrow = _drawing(drawn, frame, words, how, size=(NARROW, 240), points=half, narrow=True)
+    return Figure(title, wide, narrow, " ".join(([caption] if caption else []) + notes))
+
+
+def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
+    """Edges of a band behind a line; where an edge is not finite there is none."""
+    edges = []
+    for edge in (low, high):
+        values = np.array(edge, dtype=np.float64)
+        if values.shape != line.x.shape:
+            raise DataError(f"a band of {line.name!r} has shape {values.shape}, x {line.x.shape}; give one length")
+        if log_y:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                values = np.log10(values)
+        values[~(np.isfinite(values) & (np.abs(values) < HUGE))] = np.nan
+        edges.append(values)
+    return _Shade(line.style, line.x, *edges)
+
+
+def _unnamed(lines: list[_Line]) -> list[_Line]:
+    """Lines that widen an axis and are never told to have left it."""
+    return [_Line(line.name, 1, line.x, line.y) for line in lines if np.isfinite(line.y).any()]
+
+
+def _checked(
+    x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], x_label: str, log_x: bool, log_y: bool
+) -> tuple[list[_Line], list[str]]:
+    """Lines ready to draw, and in words what of them cannot be drawn."""
+    if not lines:
+        raise DataError("a chart needs at least one line; give (name, values) pairs")
+    across = np.array(x, dtype=np.float64)
+    if log_x:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            across = np.where(across > 0, np.log10(np.where(across > 0, across, 1.0)), np.nan)
+    drawn, notes, coloured = [], [], 0
+    for name, values in lines:
+        y = np.array(values, dtype=np.float64)
+        if y.ndim != 1 or y.shape != across.shape:
+            raise DataError(f"line {name!r} has shape {y.shape}, x {across.shape}; give arrays of one length")
+        bad = ~(np.isfinite(y) & np.isfinite(across)) | (np.abs(y) > HUGE)
+        if np.any(bad):
+            first = across[int(np.argmax(bad))]
+            where = f" (first at {x_label} = {first:.4g})" if np.isfinite(first) else ""
+            notes.append(f"{name}: {np.sum(bad)} of {y.size} values are not finite{where} and leave a gap.")
+        y[bad] = np.nan
+        if log_y:
+            below = ~bad & (y <= 0)
+            if np.any(below):
+                notes.append(f"{name}: {np.sum(below)} values of 0 or less have no place on a logarithmic axis.")
+            with np.errstate(divide="ignore", invalid="ignore"):
+                y = np.where(below, np.nan, np.log10(np.where(below, np.nan, y)))
+        neutral = name.startswith(NEUTRAL)
+        style = 0 if neutral else 1 + coloured % (len(LINES) - 1)
+        coloured += not neutral
+        drawn.append(_Line(name, style, across, y))
+    return drawn, notes
+
+
+def _y_limits(lines: list[_Line]) -> tuple[float, float, list[tuple[str, float]]]:
+    """Return ends of the vertical axis, and lines that leave it with their farthest values."""
+    every = [line.y[np.isfinite(line.y)] for line in lines]
+    low, high = limits(every, 0.05)
+    neutral = [y for y, line in zip(every, lines, strict=True) if line.style == 0 and y.size]
+    if not neutral:
+        return low, high, []
+    # A free run that runs away would flatten what it is to be compared with.
+    bottom, top = limits(neutral, 0.0)
+    reach = STRAY * (top - bottom)
+    floor, ceiling = bottom - reach, top + reach
+    strays = []
+    for y, line in zip(every, lines, strict=True):
+        if y.size and (np.min(y) < floor or np.max(y) > ceiling):
+            middle = (bottom + top) / 2
+            strays.append((line.name, float(y[np.argmax(np.abs(y - middle))])))
+    return max(low, floor), min(high, ceiling), strays
+
+
+def _in_words(strays: list[tuple[str, float]], log_y: bool) -> list[tuple[str, str]]:
+    return [(name, f"to {number(10.0**far if log_y else far, 3)}") for name, far in strays]
+
+
+def _described(line: _Line, log_y: bool) -> str:
+    finite = line.y[np.isfinite(line.y)]
+    if finite.size == 0:
+        return f"{line.name}: no value that can be drawn."
+    ends = [float(np.min(finite)), float(np.max(finite)), float(finite[-1])]
+    low, high, last = (number(10.0**v if log_y else v, 4) for v in ends)
+    return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
+
+
+def _text_width(text: str) -> float:
+    return LETTER * sum(2 if unicodedata.east_asian_width(c) in "WF" else 1 for c in text)
+
+
+def _short(name: str, most: int) -> str:
+    return name if len(name) <= most else name[: most - 1] + "…"
+
+
+def _drawing(
+    lines: list[_Line],
+    frame: tuple[float, float, float, float],
+    words: _Words,
+    how: _How,
+    *,
+    size: tuple[int, int],
+    points: int,
+    narrow: bool,
+) -> Markup:
+    width, height = size
+    x_low, x_high, y_low, y_high = frame
+    across = log_ticks(x_low, x_high, 4 if narrow else 9) if how.log_x else ticks(x_low, x_high, 4 if narrow else 9)
+    upward = log_ticks(y_low, y_high, 6) if how.log_y else ticks(y_low, y_high, 5)
+    legend = _legend([line for line in lines if line.name], width) if narrow else []
+    left = max(30.0, 10 + max(_text_width(t) for t in upward.labels))
+    named = [line for line in lines if line.name]
+    side = max((_text_width(_short(line.name, MOST_LETTERS)) for line in named), default=0.0)
+    # Beside the lines: a gap, a swatch, the label.
+    right = 14.0 if narrow or not named else 34 + side
+    top = 26.0 + (LINE * (legend[-1][2] + 1) + 5 if legend else 0)
+    bottom = 40.0
+    if narrow:
+        height += int(top - 26)
+    w, h = width - left - right, height - top - bottom
+    plot = _Plot(left, top, w, h, frame)
+
+    out = [
+        Markup('<svg class="chart {}" role="img" viewBox="0 0 {} {}" width="{}" height="{}"{}>').format(
+            "narrow" if narrow else "wide", width, height, width, height, _zoomable(plot, how, across, upward)
+        ),
+        Markup("<title>{}</title><desc>{}</desc>").format(words.title, words.described),
+        Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'),
+    ]
+    out += [Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>').format(left, float(plot.down(v)), w) for v in upward.values]
+    out += [Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>').format(float(plot.across(v)), top, h) for v in across.values]
+    out.append(Markup("</g>"))
+    axes = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}h{:.1f}"/>')
+    out.append(axes.format(left, top, h, w))
+    # The inner drawing cuts off what leaves the axes and has whole numbers for coordinates.
+    out.append(
+        Markup(
+            '<svg class="plot" preserveAspectRatio="none" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" '
+            'viewBox="0 0 {:.0f} {:.0f}">'
+        ).format(left, top, w, h, w * SUB, h * SUB)
+    )
+    for shade in how.shades:
+        d = _outline(shade, plot, points)
+        if d:
+            out.append(
+                Markup('<path class="shade{}" fill="{}" fill-opacity="0.2" d="{}"/>').format(
+                    shade.style, LINES[shade.style][0], d
+                )
+            )
+    if how.stems:
+        zero = float(plot.down(0.0) - plot.top) * SUB
+        out.append(
+            Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {:.0f}h{:.0f}"/>').format(
+                zero, w * SUB
+            )
+        )
+    for line in sorted(lines, key=lambda item: item.style != 0):
+        d = _stem_path(line, plot) if how.stems else _path(line, plot, points)
+        if d:
+            out.append(Markup('<path vector-effect="non-scaling-stroke" {} d="{}"/>').format(_stroke(line.style), d))
+    out.append(Markup("</svg>"))
+
+    out.append(Markup('<g font-size="12" fill="currentColor"><g class="ticks">'))
+    for v, label in zip(upward.values, upward.labels, strict=True):
+        out.append(svg_text(left - 6, float(plot.down(v)) + 4, label, "end"))
+    for v, label in zip(across.values, across.labels, strict=True):
+        out.append(svg_text(float(plot.across(v)), top + h + 16, label, "middle"))
+    out.append(Markup("</g>"))
+    room = int((width - 8) / LETTER)
+    y_text = f"{words.y_label} ({upward.factor})" if upward.factor else words.y_label
+    x_text = f"{words.x_label} ({across.factor})" if across.factor else words.x_label
+    out.append(svg_text(4, top - 12, _short(y_text, room), "start"))
+    out.append(svg_text(left + w, top + h + 34, _short(x_text, room), "end"))
+    if not any(np.isfinite(line.y).any() for line in lines):
+        out.append(svg_text(left + w / 2, top + h / 2, "no finite value to draw", "middle"))
+    if named:
+        out += _legend_marks(legend, named) if narrow else _end_labels(named, plot)
+    out.append(Markup("</g></svg>"))
+    return Markup("").join(out)
+
+
+def _zoomable(plot: _Plot, how: _How, across: Ticks, upward: Ticks) -> Markup:
+    """What the page's script needs to zoom: data at the edges, place of the plot, powers of ten left out of labels."""
+    if how.log_x or how.log_y or how.stems:
+        return Markup("")
+    frame = " ".join(repr(float(v)) for v in plot.frame)
+    place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
+    return Markup(' data-frame="{}" data-plot="{}" data-powers="{} {}"').format(
+        frame, place, across.power, upward.power
+    )
+
+
+def _outline(shade: _Shade, plot: _Plot, points: int) -> str:
+    """Closed path around a band where both its edges are finite."""
+    good = np.flatnonzero(np.isfinite(shade.low) & np.isfinite(shade.high) & np.isfinite(shade.x))
+    if good.size < 2:
+        return ""
+    good = good[:: max(1, good.size // points)]
+    xs = np.rint((plot.across(shade.x[good]) - plot.left) * SUB).astype(np.int64)
+    edges = [np.clip(plot.down(e[good]) - plot.top, -plot.height, 2 * plot.height) for e in (shade.high, shade.low)]
+    top, bottom = (np.rint(e * SUB).astype(np.int64) for e in edges)
+    there = [f"{x} {y}" for x, y in zip(xs.tolist(), top.tolist(), strict=True)]
+    back = [f"{x} {y}" for x, y in zip(xs[::-1].tolist(), bottom[::-1].tolist(), strict=True)]
+    return "M" + "L".join([*there, *back]) + "Z"
+
+
+def _stem_path(line: _Line, plot: _Plot) -> str:
+    kept = np.flatnonzero(np.isfinite(line.y) & np.isfinite(line.x))
+    xs = np.rint((plot.across(line.x[kept]) - plot.left) * SUB).astype(np.int64)
+    ys = np.rint((plot.down(line.y[kept]) - plot.top) * SUB).astype(np.int64)
+    zero = round(float(plot.down(0.0) - plot.top) * SUB)
+    return "".join(f"M{x} {zero}V{y}" for x, y in zip(xs.tolist(), ys.tolist(), strict=True))
+
+
+def _stroke(style: int) -> Markup:
+    light, _, dashes = LINES[style]
+    # The measured line is wide enough to show on both sides of one that follows it exactly.
+    thickness = 3.4 if style == 0 else 1.5
+    dashed = dashes
+    dash = Markup(' stroke-dasharray="{}"').format(dashed) if dashed else Markup("")
+    # The page's style sheet replaces the colour in the dark; the attribute serves wherever there is no page.
+    return Markup(
+        'class="line{}" fill="none" stroke="{}" stroke-width="{:g}" stroke-linejoin="round" stroke-linecap="{}"{}'
+    ).format(style, light, thickness, "butt" if dashed else "round", dash)
+
+
+def svg_text(x: float, y: float, text: str, anchor: str) -> Markup:
+    return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(x, y, anchor, text)
+
+
+def _path(line: _Line, plot: _Plot, points: int) -> str:
+    """Path data in whole tenths of a pixel, each point relative to the one before, a new start after every gap."""
+    kept = decimate(line.y, points)
+    if kept.size == 0:
+        return ""
+    # Far outside, a point's place no longer matters; the bound keeps the numbers short.
+    y = np.clip(plot.down(line.y[kept]) - plot.top, -plot.height, 2 * plot.height)
+    xs = np.rint((plot.across(line.x[kept]) - plot.left) * SUB).astype(np.int64)
+    ys = np.rint(y * SUB).astype(np.int64)
+    missing = np.cumsum(~np.isfinite(line.y))[kept]
+    parts: list[str] = []
+    for i in range(kept.size):
+        if i == 0 or missing[i] != missing[i - 1]:
+            # A line of no length: a lone point between gaps still shows, as a dot.
+            parts.append(f"M{xs[i]} {ys[i]}h0")
+        else:
+            parts.append(f"l{xs[i] - xs[i - 1]} {ys[i] - ys[i - 1]}")
+    return "".join(parts).replace(" -", "-")
+
+
+def _end_labels(lines: list[_Line], plot: _Plot) -> list[Markup]:
+    """Swatch and name beside the end of every line, moved apart where lines end together."""
+    x, top, bottom = plot.left + plot.width, plot.top, plot.top + plot.height
+    ends = []
+    for line in lines:
+        finite = line.y[np.isfinite(line.y)]
+        ends.append(float(np.clip(plot.down(finite[-1]), top, bottom)) if finite.size else (top + bottom) / 2)
+    # Lines that end together keep the order in which they were given.
+    order = sorted(range(len(lines)), key=lambda i: (round(ends[i] / LINE), i))
+    places = [ends[i] for i in order]
+    for k in range(1, len(places)):
+        places[k] = max(places[k], places[k - 1] + LINE)
+    if places[-1] > bottom:
+        places[-1] = bottom
+        for k in range(len(places) - 2, -1, -1):
+            places[k] = min(places[k], places[k + 1] - LINE)
+    out = []
+    for i, y in zip(order, places, strict=True):
+        out.append(Markup('<path {} d="M{:.1f} {:.1f}h16"/>').format(_stroke(lines[i].style), x + 8, y))
+        out.append(svg_text(x + 28, y + 4, _short(lines[i].name, MOST_LETTERS), "start"))
+    return out
+
+
+def _legend(lines: list[_Line], width: int) -> list[tuple[int, float, int]]:
+    """Place of every entry above a narrow chart: (line, x, row)."""
+    entries, x, row = [], 4.0, 0
+    for i, line in enumerate(lines):
+        needed = 26 + _text_width(_short(line.name, 2 * MOST_LETTERS)) + 14
+        if x > 4 and x + needed > width:
+            x, row = 4.0, row + 1
+        entries.append((i, x, row))
+        x += needed
+    return entries
+
+
+def _legend_marks(entries: list[tuple[int, float, int]], lines: list[_Line]) -> list[Markup]:
+    out = []
+    for i, x, row in entries:
+        y = 8.0 + LINE * row
+        out.append(Markup('<path {} d="M{:.1f} {:.1f}h20"/>').format(_stroke(lines[i].style), x, y))
+        out.append(svg_text(x + 26, y + 4, _short(lines[i].name, 2 * MOST_LETTERS), "start"))
+    return out
+
+
+def chart_css() -> Markup:
+    """Return the rules that give the lines their colours by the page's variables, light and dark."""
+    light = "".join(f"--line{i}:{c};" for i, (c, _, _) in enumerate(LINES))
+    dark = "".join(f"--line{i}:{c};" for i, (_, c, _) in enumerate(LINES))
+    rules = "".join(f".line{i}{{stroke:var(--line{i})}}.shade{i}{{fill:var(--line{i})}}" for i in range(len(LINES)))
+    return Markup(
+        f":root{{{light}}}@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}{rules}"  # our constants
+    )

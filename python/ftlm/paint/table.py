@@ -1,0 +1,118 @@
+"""A table: plain data first, and the HTML that is made of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from markupsafe import Markup, escape
+
+from ftlm.paint.text import Cell, number
+
+#: Columns from which a table is set smaller, so that the paper's fifteen fit a laptop's screen.
+DENSE = 12
+NOT_IN_MODEL = "–"
+
+
+def cell_html(value: Cell) -> Markup:
+    """Return a cell's content; a number carries its full precision for whoever reads the page by program."""
+    if value is None:
+        return Markup(NOT_IN_MODEL)
+    if isinstance(value, str):
+        return escape(value)
+    return Markup('<data value="{}">{}</data>').format(repr(float(value)), number(value))
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a report.
+
+    Parameters
+    ----------
+    title
+        Caption.
+    columns
+        Column heads. The first column names the row.
+    rows
+        Cells: text (escaped, unless it is ``Markup``), numbers (shown with five significant digits, kept in full), or
+        None for what a model does not have.
+    groups
+        Heads above the heads, as (text, number of columns) from left to right; an empty text heads nothing.
+    headings
+        Lines across the table, by the index of the row that they stand above.
+    note
+        Sentence below the table.
+    wrap
+        Whether text in cells breaks into lines; otherwise every row is one line.
+    """
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    groups: Sequence[tuple[str, int]] = ()
+    headings: Mapping[int, str] = field(default_factory=dict)
+    note: str = ""
+    wrap: bool = False
+
+    @property
+    def is_numeric(self) -> list[bool]:
+        """Which columns hold numbers, and are set flush right."""
+        columns = [[row[k] for row in self.rows] for k in range(len(self.columns))]
+        return [
+            bool(cells)
+            and all(c is None or not isinstance(c, str) for c in cells)
+            and any(c is not None for c in cells)
+            for cells in columns
+        ]
+
+    @property
+    def starts_group(self) -> list[bool]:
+        """Which columns begin a group, and are set apart."""
+        starts, at = [False] * len(self.columns), 0
+        for text, width in self.groups:
+            if text and at < len(starts):
+                starts[at] = True
+            at += width
+        return starts
+
+    def _classes(self) -> list[str]:
+        pairs = zip(self.is_numeric, self.starts_group, strict=True)
+        return [" ".join(w for w, on in (("n", numeric), ("g", group)) if on) for numeric, group in pairs]
+
+    def to_html(self) -> Markup:
+        """Return the table in a container that scrolls by itself on a narrow screen."""
+        classes = [Markup(' class="{}"').format(c) if c else Markup("") for c in self._classes()]
+        # The title stands outside of what scrolls, so that it wraps; the label tells it to those who listen.
+        dense = " dense" if len(self.columns) >= DENSE else " wrap" if self.wrap else ""
+        out = [Markup('<div class="table{}"><p class="title">{}</p>').format(dense, self.title)]
+        out.append(Markup('<div class="scroll" role="group" tabindex="0" aria-label="{}">').format(self.title))
+        out.append(Markup('<table aria-label="{}"><thead>').format(self.title))
+        if self.groups:
+            heads = Markup("").join(
+                Markup('<th scope="colgroup" colspan="{}" class="g">{}</th>').format(width, text)
+                if text
+                else Markup('<td colspan="{}"></td>').format(width)
+                for text, width in self.groups
+            )
+            out.append(Markup("<tr>{}</tr>").format(heads))
+        heads = Markup("").join(
+            Markup('<th scope="col"{}>{}</th>').format(c, head) for c, head in zip(classes, self.columns, strict=True)
+        )
+        out.append(Markup("<tr>{}</tr></thead><tbody>").format(heads))
+        for i, row in enumerate(self.rows):
+            if i in self.headings:
+                out.append(
+                    Markup('<tr class="heading"><th scope="rowgroup" colspan="{}"><span>{}</span></th></tr>').format(
+                        len(self.columns), self.headings[i]
+                    )
+                )
+            cells = [Markup('<th scope="row"{}>{}</th>').format(classes[0], cell_html(row[0]))]
+            cells += [
+                Markup("<td{}>{}</td>").format(c, cell_html(v)) for c, v in zip(classes[1:], row[1:], strict=True)
+            ]
+            out.append(Markup("<tr>{}</tr>").format(Markup("").join(cells)))
+        out.append(Markup("</tbody></table></div>"))
+        if self.note:
+            out.append(Markup('<p class="note">{}</p>').format(self.note))
+        out.append(Markup("</div>"))
+        return Markup("\n").join(out)

@@ -1,0 +1,60 @@
+"""Names and numbers as people write them: Greek letters, subscripts, significant digits."""
+
+from __future__ import annotations
+
+import math
+import re
+from numbers import Integral
+
+from markupsafe import Markup
+
+#: Significant digits of every estimated number: more than any estimate here deserves, enough to compare with the paper.
+DIGITS = 5
+DIVERGED = "diverged"
+GREEK = {
+    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "theta": "θ", "mu": "μ", "tau": "τ", "phi": "φ",
+    "omega": "ω",
+}  # fmt: skip
+_SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+SYMBOL = re.compile(rf"({'|'.join(GREEK)}|[A-Za-z])_?(\d*)", re.ASCII)
+
+
+def symbol(name: str) -> str:
+    """Return a signal's or parameter's name as it is written by hand: ``theta12`` becomes θ₁₂; any other name stays."""
+    found = SYMBOL.fullmatch(name)
+    if not found:
+        return name
+    return GREEK.get(found[1], found[1]) + found[2].translate(_SUBSCRIPTS)
+
+
+def symbol_html(name: str) -> Markup:
+    """Return the same as `symbol` with a real subscript, escaped."""
+    found = SYMBOL.fullmatch(name)
+    if not found:
+        return Markup("<i>{}</i>").format(name)
+    stem = Markup("<i>{}</i>").format(GREEK.get(found[1], found[1]))
+    return stem + Markup("<sub>{}</sub>").format(found[2]) if found[2] else stem
+
+
+class Exact(float):
+    """A number that was chosen, not estimated, such as an order on a lattice: printed as it is."""
+
+
+Cell = str | float | None
+
+
+def number(value: float, digits: int = DIGITS) -> str:
+    """Return a number with this many significant digits; infinity is ∞ with the word "diverged"."""
+    if isinstance(value, Integral):
+        return f"{value:,}".replace(",", "\u202f")
+    if math.isnan(value):
+        return "undefined"
+    if math.isinf(value):
+        return f"{'−' if value < 0 else ''}∞ {DIVERGED}"
+    if value == 0:
+        return "0"
+    text = f"{value:.10g}" if isinstance(value, Exact) else f"{value:#.{digits}g}"
+    mantissa, _, exponent = text.partition("e")
+    mantissa = mantissa.removesuffix(".").replace("-", "−")
+    return f"{mantissa}×10{str(int(exponent)).translate(SUPERSCRIPTS)}" if exponent else mantissa

@@ -1,0 +1,1 @@
+"""The paper's section 5 recomputed, and the demonstration that is a part of it."""

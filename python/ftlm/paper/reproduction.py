@@ -1,0 +1,240 @@
+"""Section 5 of the paper from end to end: its tables and figures recomputed, beside the printed ones, and judged."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from ftlm.base.errors import DataError, ModelError
+from ftlm.base.output import check_folder, write_atomically
+from ftlm.base.progress import Progress, Stoppable
+from ftlm.data.lattice import Lattice
+from ftlm.data.run import Run
+from ftlm.fit.genetic import Genetic
+from ftlm.model.model import Model
+from ftlm.paper.arm import demo_run
+from ftlm.paper.claims import Claim, claims
+from ftlm.paper.page import reproduction_page
+from ftlm.paper.stages import Recomputed, Stage, StageWork, stage_dict
+
+#: Seconds between two looks for Ctrl-C.
+LOOK = 0.1
+
+
+class Reproduction(Recomputed):
+    """Section 5 of the paper, recomputed.
+
+    Parameters
+    ----------
+    square, sine
+        The run that everything is identified from, and the other one (None where it is not given).
+    simulated
+        Whether they come from the virtual rig, whose truth is known.
+    stages
+        By number.
+    lattice
+        Of the order searches.
+    notes
+        What was left out and why.
+    """
+
+    @property
+    def claims(self) -> list[Claim]:
+        """What holds and what does not."""
+        return claims(self)
+
+    def page(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+        """Write everything as one HTML file that opens offline.
+
+        Raises
+        ------
+        DataError
+            The file exists and ``force`` is not set, or cannot be written.
+        """
+        return reproduction_page(self, path, force=force)
+
+    def save(self, folder: str | os.PathLike[str], *, force: bool = False) -> list[Path]:
+        """Write runs, models and all tables' numbers, from which each table can be computed again.
+
+        Parameters
+        ----------
+        folder
+            Made if it is not there: ``square.csv``, ``sine.csv``, a model file for every row, ``tables.json``.
+        force
+            Overwrite.
+
+        Returns
+        -------
+        list of pathlib.Path
+            The files.
+
+        Raises
+        ------
+        DataError
+            A file is there already, or the folder cannot be written.
+        """
+        where = Path(folder)
+        names = check_folder(where, self._models(), force=force)
+        written = []
+        for run, name in ((self.square, "square.csv"), (self.sine, "sine.csv")):
+            if run is not None:
+                run.to_csv(where / name, force=force)
+                written.append(where / name)
+        for name, model in names.items():
+            model.save(where / name, force=force)
+            written.append(where / name)
+        text = json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
+        write_atomically(where / "tables.json", text.encode(), force=force)
+        return [*written, where / "tables.json"]
+
+    def _models(self) -> dict[str, Model]:
+        found = {}
+        for number, stage in self.stages.items():
+            for label, candidate in stage.candidates.items():
+                found[f"stage{number}-{slug(label)}.json"] = candidate.model
+            for output, rival in stage.rivals.items():
+                found[f"{output}-genetic.json"] = rival.genetic.model
+                found[f"{output}-rival.json"] = rival.lattice.model
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: every number of every table, and the verdicts."""
+        return {
+            "runs": [r.name for r in (self.square, self.sine) if r is not None],
+            "simulated": self.simulated,
+            "lattice": {"step": self.lattice.step, "alpha": list(self.lattice.alpha)},
+            "claims": [{"claim": c.claim, "holds": c.holds, "evidence": c.evidence} for c in self.claims],
+            "stages": {str(n): stage_dict(s) for n, s in self.stages.items()},
+            "notes": list(self.notes),
+        }
+
+
+def slug(label: str) -> str:
+    """A label as part of a file's name."""
+    return "-".join("".join(c if c.isalnum() else " " for c in label).split())
+
+
+def reproduce(
+    square: Run | None = None,
+    sine: Run | None = None,
+    *,
+    step: float = 0.05,
+    noise: float = 1e-4,
+    seed: int = 1,
+    genetic: Genetic | None = None,
+    threads: int | None = None,
+    say: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Reproduction:
+    """Recompute section 5 of the paper, on the virtual rig or on runs of one's own.
+
+    Parameters
+    ----------
+    square
+        Run that everything is identified from: I1, theta11, theta12 and (or) I2, theta21, theta22, in A and rad. By
+        default both stages of the virtual rig under a square current of 0.3 A, period 2 s, for 10 s.
+    sine
+        Run that nothing is identified from. By default, with the default ``square`` only, 0.6 A at 6.3 rad/s.
+    step
+        Step of the order lattice; the paper's is 0.05.
+    noise, seed
+        Of the virtual rig's angles, see :func:`ftlm.demo.demo_run`.
+    genetic
+        Settings of the genetic algorithm; by default seeds 0, 1, 2, each with as many evaluations as the lattice that
+        it is compared with has candidates.
+    threads
+        Threads of each stage; both stages are computed at the same time unless this is 1.
+    say
+        Called with a line about what happens next, from the thread of a stage.
+    progress
+        See :func:`ftlm.search_orders`; called from the thread of a stage.
+
+    Returns
+    -------
+    Reproduction
+        With ``page`` and ``save``. Equal arguments give equal results.
+
+    Raises
+    ------
+    DataError
+        Runs without the signals of any stage, or a sine run that lacks some.
+    """
+    simulated = square is None
+    if square is None:
+        if sine is not None:
+            raise ModelError("a sine run is given without a square run; give both, or neither")
+        say("recording both stages on the virtual rig, under a square and a sine current")
+        square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
+    numbers = stages_of(square, sine)
+    lattice = Lattice(step=step)
+    works = {n: StageWork(n, square, sine, lattice, genetic, threads, say, progress, []) for n in numbers}
+    stages = {n: work.stage() for n, work in works.items()} if len(works) == 1 or threads == 1 else side_by_side(works)
+    notes = [note for work in works.values() for note in work.notes]
+    return Reproduction(square, sine, simulated, stages, lattice, tuple(dict.fromkeys(notes)))
+
+
+def side_by_side(works: Mapping[int, StageWork]) -> dict[int, Stage]:
+    """All stages at once: while one fits on one core, another uses the rest."""
+    stop = threading.Event()
+    with ExitStack() as stack:
+        for work in works.values():
+            told = work.progress
+            if isinstance(told, Progress):
+                told = stack.enter_context(told.beside())
+                work.say = _both(work.say, told.name)
+            work.progress = Stoppable(told, stop)
+        pool = stack.enter_context(ThreadPoolExecutor(len(works), thread_name_prefix="ftlm-stage"))
+        under_way = {n: pool.submit(work.stage) for n, work in works.items()}
+        try:
+            # A wait without an end would not be interrupted by Ctrl-C everywhere.
+            while wait(under_way.values(), timeout=LOOK, return_when=FIRST_EXCEPTION).not_done:
+                if any(f.done() and f.exception() is not None for f in under_way.values()):
+                    break
+        except BaseException:
+            stop.set()
+            raise
+        stop.set()
+        failed = [f.exception() for f in under_way.values() if f.done() and f.exception() is not None]
+        if failed and failed[0] is not None:
+            raise failed[0]
+        return {n: f.result() for n, f in under_way.items()}
+
+
+def _both(first: Callable[[str], None], second: Callable[[str], None]) -> Callable[[str], None]:
+    def told(line: str) -> None:
+        first(line)
+        second(line)
+
+    return told
+
+
+def stages_of(square: Run, sine: Run | None) -> list[int]:
+    """Stages whose signals a run has.
+
+    Raises
+    ------
+    DataError
+        No stage is whole, or the sine run lacks a signal of one.
+    """
+    wanted = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in (1, 2)}
+    found = [n for n, names in wanted.items() if all(s in square.signals for s in names)]
+    if not found:
+        listed = ", ".join(square.signals)
+        raise DataError(
+            f"run {square.name!r} has signals {listed}; a stage of the arm needs I1, theta11 and theta12, or I2, "
+            "theta21 and theta22: name its columns with --columns, or -u I1=COLUMN -y theta11=COLUMN"
+        )
+    if sine is not None:
+        lacking = [s for n in found for s in wanted[n] if s not in sine.signals]
+        if lacking:
+            raise DataError(
+                f"the sine run, {sine.name!r}, lacks {', '.join(lacking)}, which the square run, {square.name!r}, has; "
+                "both runs need the same names"
+            )
+    return found

@@ -1,0 +1,195 @@
+"""Inputs of an experiment: the current of both motors at every sample."""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import DataError, ModelError
+from ftlm.files.load import column_names, load
+from ftlm.rig.rig import COLUMNS, CURRENT_LIMIT, LONGEST
+
+SHAPES = ("square", "sine", "chirp", "multisine", "prbs", "doublet", "csv")
+INPUTS = ("I1", "I2")
+#: The paper's sine [rad/s].
+_SINE = 6.3
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """A current for both motors.
+
+    Parameters
+    ----------
+    shape
+        One of SHAPES. ``"square"``: duty one half. ``"sine"``. ``"chirp"``: a sine whose frequency rises exponentially
+        over the band. ``"multisine"``: every multiple of 1/period in the band, with equal amplitudes and random phases.
+        ``"prbs"``: at random plus or minus, decided anew every `period`. ``"doublet"``: half a period plus, half minus,
+        then nothing. ``"csv"``: columns I1 and I2 [A] of a file, held from row to row.
+    amplitude
+        Largest current [A], of both motors or (stage 1, stage 2).
+    period
+        [s]; default 2 for square, doublet and multisine (there 10), 2 pi/6.3 for sine, 0.1 for prbs.
+    band
+        Lowest and highest frequency of chirp and multisine [Hz].
+    ramp
+        Time over which the amplitude grows from zero [s].
+    seed
+        Of prbs and multisine; the motors get different ones.
+    file
+        Of csv.
+    """
+
+    shape: str = "square"
+    amplitude: float | tuple[float, float] = 0.3
+    period: float | None = None
+    band: tuple[float, float] = (0.1, 20.0)
+    ramp: float = 0.0
+    seed: int = 0
+    file: str | os.PathLike[str] | None = None
+
+    def commands(self, rate: float, duration: float) -> Floats:
+        """Currents [A], shape (round(duration·rate) + 1, 2); the last row is zero.
+
+        Raises
+        ------
+        ModelError
+            A shape, amplitude, period or band that cannot be used; an amplitude over the amplifiers' limit.
+        DataError
+            A file that cannot be used.
+        """
+        rows = round(duration * rate) + 1
+        t = np.arange(rows) / rate
+        if not (isinstance(self.ramp, (int, float)) and 0 <= self.ramp <= duration):
+            raise ModelError(f"ramp = {self.ramp!r} s is outside [0, {duration:g}] s, the length of the run")
+        if self.shape == "csv":
+            found = self._file(t, rate)
+        else:
+            found = self._shapes(t, rate, duration) * np.array(self._amplitudes())
+        if self.ramp > 0:
+            found = found * np.minimum(1.0, t / self.ramp)[:, None]
+        found[-1] = 0.0
+        for k, limit in enumerate(CURRENT_LIMIT):
+            over = np.flatnonzero(np.abs(found[:, k]) > limit * (1 + 1e-12))
+            if over.size:
+                raise ModelError(
+                    f"the current of motor {k + 1} is {found[over[0], k]:.4g} A at {t[over[0]]:.4g} s ({over.size} "
+                    f"samples in all), over the limit of {limit:g} A; use a smaller amplitude"
+                )
+        return found
+
+    def _amplitudes(self) -> tuple[float, float]:
+        given = self.amplitude if isinstance(self.amplitude, (tuple, list)) else (self.amplitude, self.amplitude)
+        if len(given) != 2 or not all(isinstance(a, (int, float)) and math.isfinite(a) and a >= 0 for a in given):
+            raise ModelError(f"amplitude = {self.amplitude!r} is not a current in A, or a pair of them")
+        for k, (value, limit) in enumerate(zip(given, CURRENT_LIMIT, strict=True)):
+            if value > limit:
+                raise ModelError(
+                    f"amplitude = {value:g} A of motor {k + 1} is over the limit of {limit:g} A; use a smaller one"
+                )
+        return float(given[0]), float(given[1])
+
+    def _period(self, rate: float) -> float:
+        usual = {"sine": 2 * math.pi / _SINE, "prbs": 0.1, "multisine": 10.0}.get(self.shape, 2.0)
+        period = usual if self.period is None else self.period
+        if not (isinstance(period, (int, float)) and math.isfinite(period) and period * rate >= 2):
+            raise ModelError(f"period = {self.period!r} s is not a time of at least two samples ({2 / rate:g} s)")
+        return float(period)
+
+    def _shapes(self, t: Floats, rate: float, duration: float) -> Floats:
+        period = self._period(rate)
+        # Half a sample of slack keeps rounding from moving an edge.
+        phase = ((t + 0.5 / rate) % period) / period
+        if self.shape == "square":
+            one = np.where(phase < 0.5, 1.0, -1.0)
+        elif self.shape == "sine":
+            one = np.sin(2 * math.pi * t / period)
+        elif self.shape == "doublet":
+            one = np.where(t + 0.5 / rate < period, np.where(phase < 0.5, 1.0, -1.0), 0.0)
+        elif self.shape == "chirp":
+            low, high = self._band(rate)
+            growth = math.log(high / low)
+            one = np.sin(2 * math.pi * low * duration / growth * np.expm1(growth * t / duration))
+        elif self.shape in ("prbs", "multisine"):
+            return np.column_stack([self._random(t, rate, period, motor) for motor in (0, 1)])
+        else:
+            raise ModelError(f"input = {self.shape!r} is not known; use one of {', '.join(SHAPES)}")
+        return np.column_stack([one, one])
+
+    def _random(self, t: Floats, rate: float, period: float, motor: int) -> Floats:
+        rng = np.random.default_rng([self.seed, motor])
+        if self.shape == "prbs":
+            held = np.floor((t + 0.5 / rate) / period).astype(np.int64)
+            return rng.choice([-1.0, 1.0], size=int(held[-1]) + 1)[held]
+        low, high = self._band(rate)
+        lines = np.arange(math.ceil(low * period - 1e-9), math.floor(high * period + 1e-9) + 1)
+        lines = lines[(lines > 0) & (2 * lines <= round(period * rate))]
+        if lines.size == 0:
+            raise ModelError(f"band = {self.band!r} Hz holds no multiple of 1/period = {1 / period:g} Hz; widen it")
+        phases = rng.uniform(0, 2 * math.pi, lines.size)
+        n = max(2, round(period * rate))
+        spectrum = np.zeros(n // 2 + 1, dtype=np.complex128)
+        spectrum[lines] = np.exp(1j * phases)
+        one: Floats = np.fft.irfft(spectrum, n)
+        one /= np.abs(one).max()
+        return one[np.arange(t.size) % n]
+
+    def _band(self, rate: float) -> tuple[float, float]:
+        band = self.band
+        good = isinstance(band, (tuple, list)) and len(band) == 2 and all(isinstance(b, (int, float)) for b in band)
+        if not good or not 0 < band[0] < band[1] <= rate / 2:
+            raise ModelError(f"band = {band!r} Hz is not two rising frequencies up to half the rate, {rate / 2:g} Hz")
+        return float(band[0]), float(band[1])
+
+    def _file(self, t: Floats, rate: float) -> Floats:
+        if self.file is None:
+            raise ModelError("input = 'csv' needs a file; give it as file= (--file)")
+        names = column_names(self.file)
+        currents = [name for name in INPUTS if names is not None and name in names]
+        # A run that ftlm wrote knows its signals; any other file is asked for the currents alone.
+        run = load(self.file) if names is None else load(self.file, outputs=currents) if currents else None
+        if run is None or not any(name in run for name in INPUTS):
+            raise DataError(f"{str(self.file)!r} has no column I1 or I2; name the currents [A] so")
+        rows = np.minimum(np.floor(t / run.step + 1e-6).astype(np.int64), run.length - 1)
+        past = t > run.duration + run.step * (1 - 1e-6)
+        given = {name: run[name] for name in INPUTS if name in run}
+        zero = np.zeros(run.length)
+        found = np.column_stack([given.get(name, zero)[rows] for name in INPUTS])
+        found[past] = 0.0
+        return found
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        told = asdict(self) | {"file": None if self.file is None else Path(self.file).name}
+        return {k: list(v) if isinstance(v, tuple) else v for k, v in told.items() if v is not None}
+
+
+def column_of(name: str) -> int:
+    if name not in COLUMNS:
+        raise ModelError(f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(COLUMNS)}")
+    return COLUMNS.index(name)
+
+
+def check_times(duration: float, limit: float, rate: float, seed: int) -> None:
+    def number(value: object) -> bool:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+    if not number(limit) or not 0 < limit <= LONGEST:
+        raise ModelError(f"limit = {limit!r} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
+    if not number(duration) or duration <= 0:
+        raise ModelError(f"duration = {duration!r} s is not a time above 0; give the length of the run")
+    if duration > limit:
+        way_out = "raise limit= (--limit)" if duration <= LONGEST else f"no run is longer than {LONGEST:g} s"
+        raise ModelError(f"duration = {duration:g} s is over the limit of {limit:g} s; {way_out}")
+    if not number(rate) or rate <= 0:
+        raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
+    if duration * rate < 2:
+        raise ModelError(f"duration = {duration:g} s holds fewer than three samples at {rate:g} Hz; make it longer")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ModelError(f"seed = {seed!r} is not a whole number from 0")

@@ -1,0 +1,145 @@
+"""The file that keeps what an experiment has recorded so far."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import DataError, RigFault
+from ftlm.data.run import Run
+from ftlm.rig.excitation import INPUTS
+from ftlm.rig.rig import COLUMNS
+
+UNITS = {name: "A" if name.startswith("I") else "rad" for name in COLUMNS}
+
+
+def partial_of(target: Path) -> Path:
+    """Where the rows of a run are until it has ended."""
+    return target.with_name(target.stem + ".csv.partial")
+
+
+class Partial:
+    """Rows on disk while they come: a csv file beside the one asked for, which loads should the program die.
+
+    Parameters
+    ----------
+    target
+        The file asked for; None keeps nothing on disk.
+    name, step, about
+        Of the run.
+    """
+
+    def __init__(self, target: Path | None, name: str, step: float, about: dict[str, Any]) -> None:
+        self.path = None if target is None else partial_of(target)
+        self._step, self._rows = step, 0
+        self._descriptor: int | None = None
+        if self.path is None:
+            return
+        header = {
+            "name": name, "step": step, "start": 0.0, "inputs": list(INPUTS), "outputs": list(COLUMNS[2:]),
+            "units": UNITS, "intersample": dict.fromkeys(INPUTS, "zoh"),
+            "warnings": ["the recording did not end: the program died, or the disk was full"],
+            "about": about | {"faults": ["the recording did not end"]},
+        }  # fmt: skip
+        lines = f"# ftlm-run 1 {json.dumps(header, ensure_ascii=False)}\n{','.join(['t_s', *COLUMNS])}\n"
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
+        try:
+            self._descriptor = os.open(self.path, flags, 0o666)
+            self._append(lines.encode())
+        except OSError as error:
+            self.close()
+            reason = error.strerror or error
+            raise DataError(
+                f"{str(self.path)!r} cannot be written ({reason}); check the folder and the space left"
+            ) from None
+
+    def write(self, rows: Floats) -> None:
+        """Appends rows, shape (n, 9).
+
+        Raises
+        ------
+        RigFault
+            They cannot be written; whole rows stay.
+        """
+        if self._descriptor is None or len(rows) == 0:
+            self._rows += len(rows)
+            return
+        t = np.round((self._rows + np.arange(len(rows))) * self._step, 9)
+        columns = [map(repr, t.tolist()), *(map(repr, rows[:, k].tolist()) for k in range(len(COLUMNS)))]
+        text = "\n".join(map(",".join, zip(*columns, strict=True))) + "\n"
+        self._rows += len(rows)
+        try:
+            self._append(text.encode())
+        except OSError as error:
+            raise RigFault(f"the recording cannot be written to disk ({error.strerror or error}); make space") from None
+
+    def _append(self, content: bytes) -> None:
+        if self._descriptor is None:
+            return
+        whole = os.lseek(self._descriptor, 0, os.SEEK_END)
+        try:
+            while content:
+                content = content[os.write(self._descriptor, content) :]
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._descriptor, whole)
+            raise
+
+    def close(self) -> None:
+        """Closes the file."""
+        if self._descriptor is not None:
+            with contextlib.suppress(OSError):
+                os.close(self._descriptor)
+            self._descriptor = None
+
+    def remove(self) -> None:
+        """Closes and removes it: the run is in its own file."""
+        self.close()
+        if self.path is not None:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+
+
+def saved(
+    run: Run | None,
+    target: Path | None,
+    partial: Partial,
+    *,
+    force: bool,
+    ended: BaseException | None,
+    faults: list[str],
+) -> Run:
+    """Write the run, and raise what ended it."""
+    place = "nothing was recorded until then"
+    if run is not None:
+        place = f"{run.length} rows were recorded until then"
+        if target is not None:
+            try:
+                save = run.to_csv if target.suffix.lower() == ".csv" else run.to_parquet
+                save(target, force=force)
+                partial.remove()
+                place += f" and are in {target}"
+            except DataError as error:
+                partial.close()
+                fault = RigFault(f"{error}; what was recorded is in {partial.path}")
+                if ended is not None:
+                    fault = RigFault(f"{'; '.join(faults)}; {place}, in {partial.path}")
+                fault.run = run
+                raise fault from None
+    else:
+        partial.remove()
+    if isinstance(ended, RigFault) or (ended is None and (faults or run is None)):
+        fault = RigFault(f"{'; '.join(faults) or 'no sample was read'}; {place}")
+        fault.run = run
+        raise fault from None
+    if ended is not None:
+        raise ended
+    if run is None:
+        raise RigFault("no sample was read")
+    return run

@@ -1,0 +1,1 @@
+"""Order searches: rounds, stores, executors, tables."""

@@ -1,0 +1,255 @@
+"""Ranked tables of order searches, and how far one is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from ftlm.base.output import to_frame
+from ftlm.model.model import Model
+from ftlm.paint.table import Table
+from ftlm.paint.text import Cell, Exact, number, symbol, symbol_html
+
+
+@dataclass(frozen=True)
+class SearchRow:
+    """One kept candidate.
+
+    Parameters
+    ----------
+    rank
+        From 1.
+    index
+        Index of the candidate in the lattice, by which ties are broken.
+    score
+        Its score: error (45) for norm l1, RMSE for l2; for a stage the sum of the equations' scores, each divided by
+        its scale.
+    orders
+        Free orders by name.
+    coefficients
+        Coefficients by name.
+    """
+
+    rank: int
+    index: int
+    score: float
+    orders: dict[str, float]
+    coefficients: dict[str, float]
+
+
+@dataclass(frozen=True)
+class SearchResult:
+    """A ranked table, the best model and what became of every candidate.
+
+    Parameters
+    ----------
+    table
+        Kept rows, best first.
+    model
+        Model of the first row.
+    candidates
+        Number of candidates.
+    pruned
+        Candidates not in the table, by reason: "beaten" (run to the end), "bound" (excluded by a lower bound of their
+        score), "stopped early" (left at a partial sum), "singular", "diverged". Kept rows and these are all candidates.
+        One that was excluded or left early might have diverged had it been run.
+    failures
+        The first candidates without a score: (orders by name, reason).
+    m
+        Block pulses a run.
+    settings
+        Criterion, norm, coefficients, innovation length, prior covariance, rows, initial terms.
+    edges
+        Orders of the first row that stand on the edge of their interval, by name with the edge.
+    """
+
+    table: list[SearchRow]
+    model: Model
+    candidates: int
+    pruned: dict[str, int]
+    failures: list[tuple[dict[str, float], str]]
+    m: int
+    settings: dict[str, Any]
+    edges: dict[str, float]
+
+    @property
+    def orders(self) -> dict[str, float]:
+        """Free orders of the best model."""
+        return self.table[0].orders
+
+    @property
+    def coefficients(self) -> dict[str, float]:
+        """Coefficients of the best model."""
+        return self.table[0].coefficients
+
+    @property
+    def score(self) -> float:
+        """Score of the best model."""
+        return self.table[0].score
+
+    def _repr_html_(self) -> str:
+        return search_html(self)
+
+    def to_frame(self) -> Any:
+        """The ranked table as a pandas frame, by rank."""
+        rows = [{"rank": r.rank, "score": r.score, **r.orders, **r.coefficients} for r in self.table]
+        return to_frame(rows, ["rank"])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "candidates": self.candidates,
+            "pruned": self.pruned,
+            "m": self.m,
+            "settings": self.settings,
+            "table": [
+                {
+                    "rank": r.rank,
+                    "index": r.index,
+                    "score": r.score,
+                    "orders": r.orders,
+                    "coefficients": r.coefficients,
+                }
+                for r in self.table
+            ],
+            "failures": [{"orders": o, "reason": reason} for o, reason in self.failures],
+            "edges": self.edges,
+        }
+
+    def __str__(self) -> str:
+        names, coefficients = list(self.orders), list(self.coefficients)
+        what = "error" if self.settings["norm"] == "l1" else "RMSE"
+        head = f"{'rank':>4}{what:>12}" + "".join(f"{n:>9}" for n in names) + "".join(f"{n:>12}" for n in coefficients)
+        lines = [head]
+        for row in self.table:
+            orders = "".join(f"{row.orders[n]:>9.5g}" for n in names)
+            values = "".join(f"{row.coefficients[n]:>12.5g}" for n in coefficients)
+            lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}")
+        pruned = ", ".join(f"{count} {reason}" for reason, count in self.pruned.items() if count)
+        lines.append(f"{self.candidates} candidates: {len(self.table)} kept" + (f", {pruned}" if pruned else ""))
+        lines += [f"warning: order {n} = {v:g} is on the edge of its interval; widen it" for n, v in self.edges.items()]
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class StoreStatus:
+    """How far a search in a store is.
+
+    Parameters
+    ----------
+    name
+        Output that was searched, or ``"stage"``.
+    candidates
+        Candidates in all. Under an order law those of the equations one by one, as far as is known: one that was left
+        early may have to be followed further.
+    done
+        Candidates dealt with.
+    best
+        Best score so far: error (45) for norm l1, RMSE for l2; None before the first.
+    settings
+        Criterion, norm, coefficients.
+    runs
+        Names of the runs.
+    version
+        Version of ftlm that began the store.
+    torn
+        Bytes of an unfinished write at its end.
+    damage
+        What is damaged, with its offset, or None.
+    """
+
+    name: str
+    candidates: int
+    done: int
+    best: float | None
+    settings: dict[str, Any]
+    runs: tuple[str, ...]
+    version: str
+    torn: int
+    damage: str | None
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing is left to do."""
+        return self.done == self.candidates
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {**asdict(self), "complete": self.complete}
+
+    def __str__(self) -> str:
+        share = 100 * self.done / self.candidates
+        text = f"{self.name}: {self.done} of {self.candidates} candidates done ({share:.1f} %)"
+        text += "" if self.best is None else f", best score {self.best:.6g}"
+        text += f", runs {', '.join(self.runs)}"
+        if self.torn:
+            text += f"\n{self.torn} bytes of an unfinished write at its end: being written now, or dropped on resuming"
+        if self.damage is not None:
+            text += f"\ndamaged: {self.damage}; resume with --salvage to keep what stands before"
+        return text
+
+
+def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What became of the candidates") -> Table:
+    """Return what became of every candidate: kept, or left out for a reason; kept and left out are all candidates."""
+    reasons = list(dict.fromkeys(reason for s in searches.values() for reason in s.pruned))
+    rows: list[list[Cell]] = [
+        [
+            _search_name(name), s.settings["criterion"], s.candidates, len(s.table),
+            *(s.pruned.get(reason, 0) for reason in reasons),
+        ]
+        for name, s in searches.items()
+    ]  # fmt: skip
+    return Table(
+        title,
+        ("search", "ranked by", "candidates", "kept", *reasons),
+        rows,
+        groups=(("", 4), ("left out", len(reasons))) if reasons else (),
+        note="Every candidate of the lattice is kept or counted under a reason. “beaten” and “stopped early” were "
+        "worse than the last row kept.",
+    )
+
+
+def search_top(name: str, search: SearchResult, *, rows: int = 10, title: str = "") -> Table:
+    """Return the first rows of an order search.
+
+    Parameters
+    ----------
+    name
+        Output searched, or ``"stage"``.
+    search
+        The search.
+    rows
+        Most rows.
+    title
+        Caption; by default it names the search.
+    """
+    law = len(search.model.equations) > 1
+    score = {"l1": "error (45)", "l2": "RMSE"}.get(search.settings["norm"], "score")
+    orders, coefficients = list(search.orders), list(search.coefficients)
+    kept = search.table[:rows]
+    return Table(
+        title or f"Best {len(kept)} of {number(search.candidates)} candidates: {_search_name(name)}",
+        ("rank", "score" if law else score, *map(symbol_html, orders), *map(symbol_html, coefficients)),
+        [
+            [r.rank, r.score, *(Exact(r.orders[n]) for n in orders), *(r.coefficients[n] for n in coefficients)]
+            for r in kept
+        ],
+        groups=(("", 2), ("orders", len(orders)), ("coefficients", len(coefficients))),
+        note=f"The score is the sum over the equations of each one's {score}, divided by the spread of its output."
+        if law
+        else "",
+    )
+
+
+def _search_name(name: str) -> str:
+    return "whole stage, under its order law" if name == "stage" else symbol(name)
+
+
+def search_html(found: SearchResult) -> str:
+    """Return the best rows of an order search and what became of the rest."""
+    rows: list[list[Cell]] = [["kept", len(found.table)]]
+    rows += [[reason, count] for reason, count in found.pruned.items()]
+    name = found.model.outputs[0] if len(found.model.outputs) == 1 else "stage"
+    rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows)
+    return str(search_top(name, found).to_html() + rest.to_html())

@@ -1,0 +1,1 @@
+"""Equations solved: records, free runs, frequency response, stability, other forms."""

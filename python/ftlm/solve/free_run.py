@@ -1,0 +1,267 @@
+"""Free runs: a model's outputs from a run's inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.base.arrays import Floats
+from ftlm.base.checks import real_number
+from ftlm.base.errors import ConvergenceError, DataError, ModelError
+from ftlm.data.run import Run
+from ftlm.data.solved import Solved, check_solved
+from ftlm.data.structures import check_initial
+from ftlm.solve.records import MAX_M, Record, equation_tuple, initial_tuple, record, sensor_series
+
+#: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
+#: least from which a sample follows that no jump of a held input at its instant has reached.
+FIRST_REFINEMENT = 2
+
+
+def respond(model: Solved, run: Run, m: int) -> tuple[Record, dict[str, Floats], dict[str, dict[float, float]]]:
+    """Pulse means of the model's outputs beside the record that they are to be compared with.
+
+    With simulated coupling all outputs follow together from the inputs, then pass the sensor filter; with measured
+    coupling each equation is driven by the other measured signals, in which the filter is already. Initial terms are
+    those that bring the response closest to the measured outputs of this run.
+
+    Returns
+    -------
+    record, responses, initial
+        The record (whose outputs are the measured ones, filtered alike), pulse means by output, and the coefficients
+        of the initial terms by output and exponent.
+
+    Raises
+    ------
+    DataError
+        A signal that the run does not have.
+    ModelError
+        An equation that cannot be solved for its output.
+    """
+    structure = model.structure
+    coupled = structure.coupling == "simulated"
+    rec = record(run, structure, m, filtered=not coupled)
+    terms = initial_tuple(rec.initial)
+    inputs = list(rec.inputs)
+    equations = [equation_tuple(e, rec.signals) for e in model.equations]
+    responses: dict[str, Floats] = {}
+    initial: dict[str, dict[float, float]] = {}
+
+    def keep(names: tuple[str, ...], found: tuple[Floats, list[list[float]], list[list[float]]]) -> None:
+        outputs, exponents, values = found
+        for i, name in enumerate(names):
+            responses[name] = outputs[i]
+            initial[name] = dict(zip(exponents[i], values[i], strict=True))
+
+    if coupled:
+        sensor = None
+        series = sensor_series(structure, m, rec.step)
+        if series is not None and structure.sensor_filter is not None:
+            sensor = (series, [o in structure.sensor_filter.outputs for o in model.outputs])
+        keep(model.outputs, _core.respond_with_initial(rec.core(), equations, inputs, terms, sensor))
+    else:
+        for name, item in zip(model.outputs, equations, strict=True):
+            keep((name,), _core.respond_with_initial(rec.core(), [item], inputs, terms, None))
+    return rec, responses, initial
+
+
+def simulate(
+    model: Solved,
+    run: Run,
+    *,
+    tolerance: float = 1e-6,
+    initial: Mapping[str, Mapping[float, float]] | None = None,
+    largest_m: int = 1 << 21,
+) -> Run:
+    """Point samples of a model's outputs on a run's inputs, at the run's instants.
+
+    The grid is the record's own, refined under the inputs' inter-sample behaviour (a held command stays exact) and
+    extrapolated in the step (second order), until halving the step moves no output by more than ``tolerance`` of its
+    largest value. A sample is read before the input of its row acts, so that a run at rest starts with zeros.
+
+    Parameters
+    ----------
+    model
+        The model. With measured coupling the run must hold the measured other outputs.
+    run
+        The run; measured values of the modelled outputs are not used.
+    tolerance
+        Relative change at which refinement ends.
+    initial
+        Coefficients of initial terms, by output and exponent; default at rest. Those of another record mean nothing.
+    largest_m
+        Most pulses; beyond it the change that is left is an error.
+
+    Returns
+    -------
+    Run
+        The inputs as they are and the simulated outputs, with the run's step and length.
+
+    Raises
+    ------
+    DataError
+        A signal that the run does not have.
+    ModelError
+        An equation that cannot be solved for its output, or a tolerance that is not positive.
+    ConvergenceError
+        An unstable model (with the first index that is not finite), or a response that still moves at ``largest_m``.
+    """
+    check_solved(model)
+    if not isinstance(run, Run):
+        raise DataError(f"run is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
+    for name, terms in (initial or {}).items():
+        if name not in model.outputs:
+            raise ModelError(f"initial terms of {name!r}, which is no output of the model: {', '.join(model.outputs)}")
+        check_initial(terms)
+    if not real_number("tolerance", tolerance) > 0:
+        raise ModelError(f"tolerance = {tolerance} is not positive; the default is 1e-6")
+    own = run.length - 1
+    largest_m = min(largest_m, MAX_M)
+    if own > largest_m:
+        raise ModelError(f"run {run.name!r} has {own} intervals, more than {largest_m}; slice it")
+    refinement = FIRST_REFINEMENT
+    coarse = _samples(model, run, own * refinement, initial)
+    extrapolated: Floats | None = None
+    while True:
+        refinement *= 2
+        if own * refinement > largest_m:
+            raise ConvergenceError(
+                f"the response of {', '.join(model.outputs)} still moves by more than {tolerance:g} of its size at "
+                f"{own * refinement // 2} pulses; raise tolerance or largest_m, or check that the model is stable"
+            )
+        fine = _samples(model, run, own * refinement, initial)
+        best = (4.0 * fine - coarse) / 3.0
+        if extrapolated is not None:
+            change = np.max(np.abs(best - extrapolated), axis=1)
+            if np.all(change <= tolerance * np.max(np.abs(best), axis=1)):
+                break
+        extrapolated, coarse = best, fine
+    return Run.from_arrays(
+        step=run.step,
+        inputs={n: run[n] for n in run.inputs},
+        outputs={n: best[i] for i, n in enumerate(model.outputs)},
+        units={n: u for n, u in _units(model, run).items() if u},
+        intersample=run.intersample,
+        name=f"{run.name}, simulated",
+    )
+
+
+def _units(model: Solved, run: Run) -> dict[str, str]:
+    """Units of inputs and simulated outputs; where the run or the model does not say, the other may."""
+    inputs = {n: run.units[n] or model.units.get(n, "") for n in run.inputs}
+    return inputs | {n: model.units.get(n, "") or run.units.get(n, "") for n in model.outputs}
+
+
+def _samples(model: Solved, run: Run, m: int, initial: Mapping[str, Mapping[float, float]] | None) -> Floats:
+    """Point samples at the run's instants from a simulation on m pulses."""
+    structure = model.structure
+    coupled = structure.coupling == "simulated"
+    given = {s: run[s] for s in run.signals}
+    # A signal that is simulated need not be there; the core never reads it.
+    missing = [o for o in model.outputs if o not in given]
+    read = {s: e.output for e in model.equations for s in e.signals if s != e.output}
+    lacking = next((o for o in missing if o in read), None)
+    if lacking is not None and not coupled:
+        raise DataError(
+            f"run {run.name!r} has no signal {lacking!r}, which the equation of {read[lacking]} reads as measured; "
+            "give it, or use coupling='simulated'"
+        )
+    if missing:
+        run = Run.from_arrays(
+            step=run.step,
+            inputs={n: run[n] for n in run.inputs},
+            outputs={**{n: run[n] for n in run.outputs}, **{n: np.zeros(run.length) for n in missing}},
+            intersample=run.intersample,
+            name=run.name,
+        )
+    rec = record(run, structure, m, filtered=not coupled)
+    equations = [equation_tuple(e, rec.signals) for e in model.equations]
+    terms = [sorted((initial or {}).get(o, {}).items()) for o in model.outputs]
+    inputs = list(rec.inputs)
+    if coupled:
+        means = _core.respond(rec.core(), equations, inputs, terms)
+        series = sensor_series(structure, m, rec.step)
+        if series is not None and structure.sensor_filter is not None:
+            for i, name in enumerate(model.outputs):
+                if name in structure.sensor_filter.outputs and np.all(np.isfinite(means[i])):
+                    means[i] = _core.series_multiply(series, means[i], m)
+    else:
+        means = np.concatenate(
+            [_core.respond(rec.core(), [e], inputs, [t]) for e, t in zip(equations, terms, strict=True)]
+        )
+    for i, name in enumerate(model.outputs):
+        if not np.all(np.isfinite(means[i])):
+            at = int(np.argmax(~np.isfinite(means[i]))) * run.duration / m
+            raise ConvergenceError(
+                f"the free run of {name} leaves the range of numbers {at:.4g} s into run {run.name!r}; "
+                "the model is unstable: check its orders and coefficients"
+            )
+    # The last two pulses before each instant, extended to it: a command that changes there has not acted yet, so the
+    # extrapolation crosses none of the kinks t^alpha that jumps of a held input leave.
+    every = m // (run.length - 1)
+    samples = 1.5 * means[:, every - 1 :: every] - 0.5 * means[:, every - 2 :: every]
+    return np.concatenate([_first(model, run, initial)[:, None], samples], axis=1)
+
+
+def _first(model: Solved, run: Run, initial: Mapping[str, Mapping[float, float]] | None) -> Floats:
+    """Return the outputs at the first instant, before a held input acts: initial terms and direct feed-through."""
+    structure, names = model.structure, model.outputs
+    coupled, sensor = structure.coupling == "simulated", structure.sensor_filter
+    gain = 1.0
+    if sensor is not None:
+        highest = max(order for coefficient, order in sensor.denominator if coefficient)
+        top = [sum(c for c, order in part if order == highest) for part in (sensor.numerator, sensor.denominator)]
+        gain = top[0] / top[1]
+    system, known = np.eye(len(names)), np.zeros(len(names))
+    for i, item in enumerate(model.equations):
+        known[i] = (initial or {}).get(item.output, {}).get(0.0, 0.0)
+        for term in item.terms:
+            signal, factor = term.signal, float(term.fixed or 0.0)
+            if term.order.constant != item.order.constant or signal not in (*names, *run.signals):
+                continue
+            if coupled and signal in names:
+                system[i, names.index(signal)] -= factor
+            elif run.intersample.get(signal) != "zoh" and not structure.delay.get(signal):
+                through = sensor is not None and not coupled and signal not in sensor.outputs
+                known[i] += factor * float(run[signal][0]) * (gain if through else 1.0)
+    first: Floats = np.asarray(np.linalg.lstsq(system, known, rcond=None)[0], dtype=np.float64)
+    for i, name in enumerate(names):
+        if coupled and sensor is not None and name in sensor.outputs:
+            first[i] *= gain
+    return first
+
+
+def explicit_euler(model: Solved, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
+    """Integer-order model stepped by explicit Euler at the run's step from rest, as the paper ran its baseline.
+
+    Parameters
+    ----------
+    model
+        All orders whole; see :func:`ftlm.link_model` for the manual's.
+    run
+        Its inputs drive the model; the paper's step is 0.002 s.
+    step
+        Only the record's own.
+
+    Returns
+    -------
+    dict
+        Point samples by output. Not finite where Euler's step is unstable, which for the second stage's hub pole
+        (-500 1/s) at 2 ms is nearly the case.
+
+    Raises
+    ------
+    ModelError
+        An order that is not whole.
+    """
+    if step != "record":
+        raise ModelError(f"step = {step!r} is not known; Euler steps at the record's own step: resample the run")
+    signals = model.structure.signals
+    rows = [run[s] if s not in model.outputs else np.zeros(run.length) for s in signals]
+    equations = [equation_tuple(e, signals) for e in model.equations]
+    inputs = [s not in model.outputs for s in signals]
+    outputs = _core.explicit_euler(np.stack(rows), run.step, equations, inputs)
+    return dict(zip(model.outputs, outputs, strict=True))

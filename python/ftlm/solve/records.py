@@ -1,0 +1,255 @@
+"""A run and a structure become the record that the core computes on: pulse means of every signal."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.base.arrays import Floats
+from ftlm.base.checks import nearest, whole_number
+from ftlm.base.errors import DataError, ModelError
+from ftlm.base.statistics import is_rest
+from ftlm.data.equations import Equation
+from ftlm.data.run import Run
+from ftlm.data.structures import Initial, Structure
+
+#: The paper's number of block pulses, used where the record carries as many.
+PAPER_M = 2048
+#: Most pulses in one record: 2^24 of one signal are 128 MB.
+MAX_M = 1 << 24
+#: A signal that stays below this loses digits of its squares to the end of the range of numbers.
+SMALLEST = 1e-140
+COULOMB = "coulomb_"
+
+
+@dataclass(frozen=True)
+class Record:
+    """Pulse means of the signals of a structure on one run.
+
+    Parameters
+    ----------
+    signals
+        Names, in the order of the rows.
+    step
+        Pulse width [s].
+    means
+        Rows of pulse means.
+    inputs
+        Which signals are inputs of the run.
+    sensor
+        Series of the sensor filter, applied to every signal not measured through it, or None.
+    initial
+        Initial terms, decided.
+    """
+
+    signals: tuple[str, ...]
+    step: float
+    means: Floats
+    inputs: tuple[bool, ...]
+    sensor: Floats | None
+    initial: Initial
+
+    @property
+    def m(self) -> int:
+        """Number of pulses."""
+        return int(self.means.shape[1])
+
+    def core(self) -> tuple[float, Floats, Floats | None]:
+        """Return the record as the core takes it."""
+        return self.step, self.means, self.sensor
+
+    def of(self, name: str) -> Floats:
+        """Return the pulse means of a signal."""
+        row: Floats = self.means[self.signals.index(name)]
+        return row
+
+
+def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
+    """Return the paper's 2 048 pulses, or as many as the shortest run carries (a power of two for Haar coordinates)."""
+    carried = min(run.length for run in runs) - 1
+    m = min(PAPER_M, carried)
+    return 1 << (m.bit_length() - 1) if power_of_two and m > 0 else m
+
+
+def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
+    """Refuse an m that is no number of pulses, that a run does not carry, or that Haar coordinates cannot take.
+
+    Raises
+    ------
+    ModelError
+        Naming the run, what it carries and what to choose.
+    """
+    pulses = whole_number(m)
+    if pulses is None or pulses < 1:
+        raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
+    m = pulses
+    for run in runs:
+        carried = run.length - 1
+        if m > carried:
+            raise ModelError(
+                f"m = {m} is more than run {run.name!r} carries: {run.length} rows are {carried} pulses; "
+                f"take m = {carried} or less"
+            )
+    if power_of_two and m & (m - 1):
+        below = 1 << (m.bit_length() - 1)
+        raise ModelError(
+            f"m = {m} is no power of two, which Haar rows need; take m = {below} or {2 * below}, or rows='time'"
+        )
+    return m
+
+
+def starts_at_rest(run: Run, structure: Structure) -> bool:
+    """Whether all outputs of a structure start at zero within their noise."""
+    return all(is_rest(run[name]) for name in structure.signals if name in run.outputs)
+
+
+def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> Record:
+    """Pulse means of every signal of a structure, delays and sensor filter honoured.
+
+    Outputs are point samples taken as linear in between; inputs hold or are linear as the run says; m may exceed the
+    run's own grid only where nothing is measured against it.
+
+    Parameters
+    ----------
+    run
+        The run.
+    structure
+        Whose signals are wanted.
+    m
+        Number of pulses.
+    filtered
+        Whether to put signals that were not measured through the sensor filter through it (equation error), or to
+        leave them (coupled free run).
+
+    Raises
+    ------
+    DataError
+        A signal that the run does not have, or one so small that its squares vanish.
+    ModelError
+        A delay of a signal that is no input, or a free delay.
+    """
+    initial = structure.initial
+    if initial == "auto":
+        initial = "rest" if starts_at_rest(run, structure) else "caputo"
+    sensor = None
+    if filtered and structure.sensor_filter is not None:
+        sensor = sensor_series(structure, m, run.duration / m)
+    rows = []
+    for name in structure.signals:
+        means = _means(run, structure, name, m, at_rest=initial == "rest")
+        if sensor is not None and structure.sensor_filter is not None and name not in structure.sensor_filter.outputs:
+            means = _core.series_multiply(sensor, means, m)
+        peak = float(np.max(np.abs(means), initial=0.0))
+        if 0 < peak < SMALLEST:
+            raise DataError(
+                f"signal {name!r} of run {run.name!r}: no mean is larger than {peak:.3g}, and squares below "
+                f"{SMALLEST:g} lose their digits; scale the signal"
+            )
+        rows.append(means)
+    return Record(
+        structure.signals,
+        run.duration / m,
+        np.ascontiguousarray(np.stack(rows)),
+        tuple(s in run.inputs for s in structure.signals),
+        sensor,
+        initial,
+    )
+
+
+def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
+    """Return the structure's sensor filter as a series, or None."""
+    sensor = structure.sensor_filter
+    return None if sensor is None else _core.filter_series(list(sensor.numerator), list(sensor.denominator), m, step)
+
+
+def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) -> Floats:
+    if name not in run and name.startswith(COULOMB) and name.removeprefix(COULOMB) in run:
+        # The sign of the measured rate over each interval; the last row repeats so that rows match.
+        rate = np.sign(np.diff(run[name.removeprefix(COULOMB)]))
+        return _core.pulse_means(np.append(rate, rate[-1]), m, True)
+    if name not in run:
+        raise DataError(
+            f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
+            f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs= (commands: -u and -y)"
+        )
+    samples = run[name]
+    if name in structure.free_delays:
+        raise ModelError(
+            f"the delay of {name} is free: only method='output-error' estimates delays; give its value in seconds"
+        )
+    delay = structure.delay.get(name, 0.0)
+    if name not in run.inputs:
+        if delay:
+            raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
+        return _core.pulse_means(samples, m, False)
+    held = run.intersample[name] == "zoh"
+    if delay:
+        intervals = run.length - 1
+        # On a finer grid the delayed command switches within an interval, so it is held on that grid before the delay.
+        every = m // intervals if held and m % intervals == 0 else 1
+        samples = np.repeat(samples, every)[: intervals * every + 1]
+        samples = _core.delayed(samples, delay / run.step * every, 0.0 if at_rest else float(samples[0]))
+    return _core.pulse_means(samples, m, held)
+
+
+def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
+    """Output, alpha and (signal, order) pairs of an equation whose orders are numbers."""
+    index = {name: i for i, name in enumerate(signals)}
+    terms = [(index[t.signal], t.order.constant) for t in item.terms]
+    return index[item.output], item.order.constant, terms
+
+
+def equation_tuple(
+    item: Equation, signals: Sequence[str]
+) -> tuple[tuple[int, float, list[tuple[int, float]]], list[float]]:
+    """Return an identified equation: its structure and its coefficients."""
+    return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
+
+
+def initial_tuple(initial: Initial) -> tuple[bool, list[float]]:
+    """Return decided initial terms: whether Caputo's, else their exponents."""
+    if initial == "caputo":
+        return True, []
+    return False, [] if isinstance(initial, str) else list(initial)
+
+
+def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
+    """The core knows signals by number; people know them by name."""
+    return ModelError(re.sub(r"signal (\d+)", lambda m: f"signal {signals[int(m[1])]!r}", str(error)))
+
+
+def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_of_two: bool) -> list[Record]:
+    """Make the records of runs for an estimator on the equation error.
+
+    Raises
+    ------
+    DataError
+        A signal that a run lacks, a constant output, or a signal with a free coefficient that is 0 in all runs.
+    ModelError
+        An m that the runs do not carry.
+    """
+    chosen = default_m(runs, power_of_two=power_of_two) if m is None else m
+    m = check_m(chosen, runs, power_of_two=power_of_two)
+    for run in runs:
+        run.require_outputs([o for o in structure.outputs if o in run])
+    records = [record(run, structure, m) for run in runs]
+    if any(r.initial == "caputo" for r in records):
+        # One rule for all runs of a fit: initial terms that a run at rest does not need are estimated as zero.
+        records = [record(run, replace(structure, initial="caputo"), m) for run in runs]
+    for item in structure.equations:
+        for term in item.terms:
+            if term.fixed is None and term.signal != item.output and not any(r.of(term.signal).any() for r in records):
+                raise DataError(
+                    f"{term.signal} is 0 throughout, so its coefficient in the equation of {item.output} cannot be "
+                    "identified; leave the term out, fix its coefficient, or add a run in which it moves"
+                )
+    return records
+
+
+def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:
+    """Free coefficients by name from the core's products of factor and coefficient."""
+    return {t.coefficient: c / t.factor for t, c in zip(item.terms, raw, strict=True) if isinstance(t.coefficient, str)}
