@@ -20,6 +20,14 @@ def whole_number(value: object) -> int | None:
         return None
 
 
+def check_pulses(m: object, below: float = 1 << 62) -> int:
+    """Return a number of block pulses, of which the core counts fewer than 2^62."""
+    pulses = whole_number(m)
+    if pulses is None or not 1 <= pulses < below:
+        raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
+    return pulses
+
+
 def real_number(name: str, value: object) -> float:
     """Return a real number as a float; it may be infinite or not a number, which is for the caller to judge.
 
@@ -50,8 +58,8 @@ def nearest(word: object, names: Iterable[object]) -> str:
     """Return " (did you mean …?)" for the closest of names, or an empty string."""
     options = [str(name) for name in names]
     begun = [option for option in options if len(option) > 1 and str(word).casefold().startswith(option.casefold())]
-    found = [max(begun, key=len)] if begun else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
-    return f" (did you mean {found[0]!r}?)" if found else ""
+    close = [max(begun, key=len)] if begun else difflib.get_close_matches(str(word), options, n=1, cutoff=0.5)
+    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 def bad_rows(thing: str, what: str, first: int, count: int, way_out: str) -> DataError:
@@ -78,13 +86,15 @@ def names_to_columns(argument: str, given: object) -> dict[str, Hashable]:
     return {name: name for name in names}
 
 
-def as_mapping(argument: str, given: object) -> Mapping[str, object]:
+def as_mapping(argument: str, given: object, of: str = "array") -> Mapping[str, object]:
+    """Return a mapping by name as it is, and refuse anything else."""
     if not isinstance(given, Mapping):
-        raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: array")
+        raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: {of}")
     return given
 
 
 def check_known(what: str, given: Iterable[str], known: Sequence[str]) -> None:
+    """Refuse a name that does not occur in an equation."""
     for name in given:
         if name not in known:
             near = difflib.get_close_matches(str(name), known, 1)
@@ -110,7 +120,7 @@ def check_threads(threads: int | None) -> int:
     """
     if threads is None:
         return available_threads()
-    found = whole_number(threads)
-    if found is None or not 1 <= found <= 1024:
+    count = whole_number(threads)
+    if count is None or not 1 <= count <= 1024:
         raise ModelError(f"threads = {threads!r} is outside [1, 1024]; leave it out to use all cores")
-    return found
+    return count

@@ -3,146 +3,123 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
-import tempfile
-from collections.abc import Mapping, Sequence
+import secrets
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from ftlm.base.errors import DataError, ModelError
+from ftlm.base.errors import DataError
+
+#: Systems that tell text from bytes are to write bytes.
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
 
 
-def write_atomically(path: str | os.PathLike[str], data: bytes, *, force: bool) -> Path:
-    """Write beside, flush to disk, rename: a reader sees the old file or the new one.
+@dataclass(frozen=True)
+class Words:
+    """How errors speak of a file that cannot be written, which depends on who asked for it.
 
-    Raises
-    ------
-    DataError
-        The file exists and ``force`` is not set, or the folder cannot be written.
+    Parameters
+    ----------
+    quoted
+        Whether its name stands in quotes.
+    folder
+        What to do where a folder has that name; nothing where that counts as a file that exists.
+    overwrite
+        How to overwrite a file that exists.
+    failed
+        What is said of a failure, with its reason.
     """
+
+    quoted: bool = False
+    folder: str = ""
+    overwrite: str = "force=True (--force)"
+    failed: str = "cannot be written: {}; choose another folder"
+
+    def shown(self, path: Path) -> str:
+        """Write a path."""
+        return repr(str(path)) if self.quoted else str(path)
+
+
+#: Models, pages and tables; runs; what a command was told to write.
+PLAIN = Words()
+RUN = Words(
+    quoted=True,
+    folder="give the name of a file in it",
+    failed="cannot be written ({}); check the folder and the space left",
+)
+COMMAND = Words(folder="name a file in it", overwrite="--force")
+
+
+def check_new(path: str | os.PathLike[str], *, force: bool, words: Words = PLAIN) -> Path:
+    """Refuse the name of a folder, and that of a file that must not be overwritten."""
     file = Path(path)
-    if os.path.lexists(file) and not force:
-        raise DataError(f"{file} exists; choose another name, or overwrite it with force=True (--force)")
-    try:
-        handle, beside = tempfile.mkstemp(prefix=f".{file.name}.", dir=file.parent or Path())
-        try:
-            with os.fdopen(handle, "wb") as out:
-                out.write(data)
-                out.flush()
-                os.fsync(out.fileno())
-            umask = os.umask(0)
-            os.umask(umask)
-            Path(beside).chmod(0o666 & ~umask)
-            Path(beside).replace(file)
-        except BaseException:
-            Path(beside).unlink(missing_ok=True)
-            raise
-    except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else None
-        raise DataError(f"{file} cannot be written: {why or error}; choose another folder") from error
+    if words.folder and file.is_dir():
+        raise DataError(f"{words.shown(file)} is a folder; {words.folder}")
+    # A dangling link is a file that someone meant to be there.
+    if not force and os.path.lexists(file):
+        raise DataError(f"{words.shown(file)} exists; choose another name, or overwrite it with {words.overwrite}")
     return file
 
 
-def new_file(path: str | os.PathLike[str], *, force: bool) -> Path:
-    target = Path(path)
-    if target.is_dir():
-        raise DataError(f"{str(target)!r} is a folder; give the name of a file in it")
-    if not force and os.path.lexists(target):
-        raise DataError(f"{str(target)!r} exists; choose another name, or overwrite it with force=True (--force)")
-    return target
+def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: Words = PLAIN) -> None:
+    """Refuse before any work what could not be written after it; no path is no file to write."""
+    for path in paths:
+        if path is None:
+            continue
+        file = check_new(path, force=force, words=words)
+        folder = file.absolute().parent
+        if not folder.is_dir():
+            raise DataError(f"{words.shown(file.parent)} is no folder; make it first")
+        if not os.access(folder, os.W_OK):
+            raise DataError(
+                f"{words.shown(file)} cannot be written: {words.shown(file.parent)} is read-only; choose another folder"
+            )
 
 
-def write_bytes_atomically(target: Path, content: bytes) -> None:
-    beside = target.with_name(f".{target.name}.{os.urandom(6).hex()}.tmp")
-    try:
-        try:
-            descriptor = os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
-            with os.fdopen(descriptor, "wb") as stream:
-                stream.write(content)
-                stream.flush()
-                os.fsync(stream.fileno())
-            os.replace(beside, target)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                beside.unlink(missing_ok=True)
-            raise
-    except OSError as error:
-        reason = error.strerror or type(error).__name__
-        raise DataError(f"{str(target)!r} cannot be written ({reason}); check the folder and the space left") from None
-    # The rename itself survives a power cut only when the folder is on disk too; not every system can do that.
-    with contextlib.suppress(OSError):
-        folder = os.open(target.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
-
-
-def check_free(path: str | os.PathLike[str], *, force: bool) -> None:
-    """Refuse before any work what could not be written after it.
-
-    Raises
-    ------
-    DataError
-        The file exists and ``force`` is not set, or its folder is not there or cannot be written.
-    """
-    file = Path(path)
-    if os.path.lexists(file) and not force:
-        raise DataError(f"{file} exists; choose another name, or overwrite it with force=True (--force)")
-    if not file.absolute().parent.is_dir():
-        raise DataError(f"{file.parent} is no folder; make it first")
-    if not os.access(file.absolute().parent, os.W_OK):
-        raise DataError(f"{file} cannot be written: {file.parent} is read-only; choose another folder")
-
-
-def check_folder(folder: Path, names: Mapping[str, Any], *, force: bool) -> dict[str, Any]:
-    """Make a folder and refuse before any work what could not be written after it.
-
-    Raises
-    ------
-    DataError
-        A file that exists, or a folder that cannot be made.
-    """
+def check_folder(folder: Path, names: Iterable[str], *, force: bool) -> None:
+    """Make a folder and refuse before any work those of its files that could not be written after it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{folder} cannot be made: {error.strerror or error}; choose another folder") from error
-    there = [n for n in ("square.csv", "sine.csv", "tables.json", *names) if (folder / n).exists()]
+    there = [name for name in names if os.path.lexists(folder / name)]
     if there and not force:
         raise DataError(f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or --force")
-    return dict(names)
 
 
-def to_frame(rows: Sequence[Mapping[str, Any]], index: Sequence[str]) -> Any:
-    """Rows as a pandas frame.
-
-    Raises
-    ------
-    ModelError
-        pandas is not installed.
-    """
-    try:
-        pandas = importlib.import_module("pandas")
-    except ImportError:
-        raise ModelError("pandas is not installed; pip install pandas") from None
-    return pandas.DataFrame.from_records(list(rows)).set_index(list(index))
-
-
-def check_writable(paths: list[str | None], *, force: bool) -> None:
-    """Refuse before any work what could not be written after it.
+def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: bool, words: Words = PLAIN) -> Path:
+    """Write beside, flush to disk, rename: a reader sees the old file or the new one, whole.
 
     Raises
     ------
     DataError
-        A file that exists, or a folder that does not.
+        The file exists and ``force`` is not set, or it cannot be written.
     """
-    for path in paths:
-        if path is None:
-            continue
-        if Path(path).is_dir():
-            raise DataError(f"{path} is a folder; name a file in it")
-        if Path(path).exists() and not force:
-            raise DataError(f"{path} exists; choose another name, or overwrite it with --force")
-        if not Path(path).resolve().parent.is_dir():
-            raise DataError(f"{Path(path).parent} is no folder; make it first")
+    file = check_new(path, force=force, words=words)
+    try:
+        # In its folder, since no rename crosses disks; short, so that long names have room.
+        beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
+        # Never through a link that another program left, and with the permissions that a new file has here.
+        descriptor = os.open(beside, _NEW, 0o666)
+        try:
+            with os.fdopen(descriptor, "wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(beside, file)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                beside.unlink()
+            raise
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else None
+        raise DataError(f"{words.shown(file)} {words.failed.format(why or error)}") from error
+    # The rename itself survives a power cut only when the folder is on disk too; not every system can do that.
+    with contextlib.suppress(OSError):
+        descriptor = os.open(file.parent, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    return file

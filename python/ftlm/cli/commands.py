@@ -18,7 +18,7 @@ import ftlm
 from ftlm import _core
 from ftlm.base.checks import available_threads
 from ftlm.base.errors import ModelError
-from ftlm.base.output import check_folder, check_free, check_writable, write_atomically
+from ftlm.base.output import COMMAND, check_folder, check_free, write_atomically
 from ftlm.base.progress import Progress
 from ftlm.cli.options import (
     EXIT_INTERRUPTED,
@@ -88,6 +88,7 @@ from ftlm.data.inspection import inspect_run
 from ftlm.paper.demo import run_demo
 from ftlm.paper.demo_page import demo_page, demo_text
 from ftlm.paper.page import reproduction_text
+from ftlm.paper.reproduction import SAVED
 from ftlm.report import plots
 from ftlm.report.model_page import model_page
 from ftlm.rig.quanser import driver_state
@@ -216,7 +217,7 @@ def identify(
     as_json: Json = False,
 ) -> None:
     """Identify a model: orders on a lattice, coefficients, both errors, warnings in words."""
-    check_writable([out, report], force=force)
+    check_free(out, report, force=force, words=COMMAND)
     wanted = structure_of(
         structure, only=only, coupling=coupling, cross_stage=cross_stage, friction=friction, laws=laws,
         input_order=input_order, stock_filter=stock_filter, orders=orders, fixed=fixed, delay=delay, initial=initial,
@@ -462,7 +463,7 @@ def simulate(
     as_json: Json = False,
 ) -> None:
     """Free run of a saved model on a run's inputs, written as csv."""
-    check_writable([out], force=force)
+    check_free(out, force=force, words=COMMAND)
     loaded = ftlm.load_model(model)
     options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
     (run,) = load_runs([file], sliced, **options)
@@ -495,7 +496,7 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Write the report of a saved model, with validation runs: one page that opens offline."""
-    check_writable([out], force=force)
+    check_free(out, force=force, words=COMMAND)
     loaded = ftlm.load_model(model)
     options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
     runs = load_runs(validation, sliced, **options) if validation else None
@@ -533,10 +534,9 @@ def reproduce(
     as_json: Json = False,
 ) -> None:
     """Recompute the tables and figures of the paper, on the virtual rig or on measured runs, as one page."""
-    check_writable([out], force=force)
-    check_free(out, force=force)
+    check_free(out, force=force, words=COMMAND)
     if save is not None:
-        check_folder(Path(save), {}, force=force)
+        check_folder(Path(save), SAVED, force=force)
     if sine is not None and square is None:
         raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
     options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)
@@ -578,7 +578,7 @@ def plot(
     """Draw a saved model for a paper: its fit or residual tests on runs, or its Bode plot."""
     import io  # noqa: PLC0415
 
-    check_writable([out], force=force)
+    check_free(out, force=force, words=COMMAND)
     suffix = Path(out).suffix.removeprefix(".").lower()
     if suffix not in ("png", "pdf", "svg"):
         raise ModelError(f"{out} ends in {suffix or 'nothing'!r}; write .png, .pdf or .svg")
@@ -613,7 +613,7 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write a saved model for another tool, to a file or to standard output."""
-    check_writable([out], force=force)
+    check_free(out, force=force, words=COMMAND)
     limits = None
     if band is not None:
         low, high = interval(band, "--band", "0.1:100") or (None, None)

@@ -3,43 +3,29 @@
 from __future__ import annotations
 
 import html
-import importlib
-import io
 import os
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import fields
-from functools import partial
 from typing import Any, NoReturn, cast
 
-import numpy as np
-
-from ftlm.base.arrays import Floats
 from ftlm.base.checks import as_mapping, bad_rows, listed, names_to_columns, nearest
 from ftlm.base.errors import DataError
-from ftlm.base.output import new_file, write_bytes_atomically
 from ftlm.data.advice import Advice, advise
-from ftlm.data.header import CSV_MARK, header_text, written_time
+from ftlm.data.asked import Asked
 from ftlm.data.measured import Measured
-from ftlm.data.names import CSV_TIME, check_run_name, check_signal_name
+from ftlm.data.names import check_signal_name
 from ftlm.data.samples import (
     FEWEST_ROWS,
-    HELD,
-    Intersample,
-    as_vector,
-    check_increasing,
-    check_lengths,
-    check_values,
     checked_intersample,
     checked_step,
     grid_of,
     how_interpolated,
     interpolated,
     is_constant,
-    regular_step,
     window_rows,
 )
 from ftlm.data.structures import Structure
-from ftlm.data.units import TIME_UNITS, checked_units
+from ftlm.data.written import write_csv, write_parquet
 
 
 class Run(Measured):
@@ -64,7 +50,7 @@ class Run(Measured):
         raise AttributeError(f"a Run never changes; {name!r} cannot be deleted")
 
     def __reduce__(self) -> tuple[object, ...]:
-        return partial(_of, **self._known()), ()
+        return run_of, (Measured(**self._fields()),)
 
     @classmethod
     def from_arrays(
@@ -119,20 +105,12 @@ class Run(Measured):
             large; if lengths differ; if a name, unit or behaviour is unknown or used twice; if time is not finite,
             repeated, decreasing, jittered or has a gap; if `step` is not positive.
         """
-        given_inputs = as_mapping("inputs", {} if inputs is None else inputs)
-        given_outputs = as_mapping("outputs", outputs)
-        return build(
-            step=step,
-            time=time,
-            inputs=given_inputs,
-            outputs=given_outputs,
-            units=units,
-            intersample=intersample,
-            name=name,
-            resample=resample,
-            window=slice,
-            time_unit=time_unit,
-        )
+        return built(
+            Asked(
+                as_mapping("inputs", {} if inputs is None else inputs), as_mapping("outputs", outputs), step, time,
+                units, intersample, name, resample, slice, time_unit,
+            )
+        )  # fmt: skip
 
     @classmethod
     def from_frame(
@@ -175,40 +153,28 @@ class Run(Measured):
             If a column is unknown or there more than once, and for everything `Run.from_arrays` refuses.
         """
         columns = _frame_columns(frame)
-        labels: dict[str, str] = {}
 
         def pick(column: Hashable, thing: str) -> object:
-            found = columns.count(column)
-            if found == 0:
+            count = columns.count(column)
+            if count == 0:
                 raise DataError(
                     f"column {column!r} ({thing}) is not in the frame{nearest(column, columns)}; "
                     f"the columns are {listed(columns)}; for the index of a pandas frame use frame.reset_index()"
                 )
-            if found > 1:
-                raise DataError(f"column {column!r} ({thing}) is there {found} times; rename all but one")
+            if count > 1:
+                raise DataError(f"column {column!r} ({thing}) is there {count} times; rename all but one")
             return cast("Mapping[Any, object]", frame)[column]
 
-        def gather(argument: str, given: object) -> dict[str, object]:
-            picked: dict[str, object] = {}
-            for signal, column in names_to_columns(argument, given).items():
-                labels[signal] = _label(signal, column)
-                picked[signal] = pick(column, f"signal {signal!r}")
-            return picked
-
-        return build(
-            step=step,
-            time=None if time is None else pick(time, "time"),
-            inputs=gather("inputs", inputs),
-            outputs=gather("outputs", outputs),
-            units=units,
-            intersample=intersample,
-            name=name,
-            resample=resample,
-            window=slice,
-            time_unit=time_unit,
-            labels=labels,
-            time_label="time" if time is None else f"time (column {time!r})",
-        )
+        clock = None if time is None else pick(time, "time")
+        wanted = [names_to_columns(argument, given) for argument, given in (("inputs", inputs), ("outputs", outputs))]
+        labels = {s: f"signal {s!r} (column {column!r})" for part in wanted for s, column in part.items()}
+        given_inputs, given_outputs = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in wanted)
+        return built(
+            Asked(
+                given_inputs, given_outputs, step, clock, units, intersample, name, resample, slice, time_unit,
+                labels, "time" if time is None else f"time (column {time!r})",
+            )
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         lines = [self._headline()]
@@ -443,15 +409,7 @@ class Run(Measured):
         DataError
             If the file exists and `force` is not set, or it cannot be written.
         """
-        target = new_file(path, force=force)
-        columns = [written_time(self), *(self._data[name] for name in self.signals)]
-        lines = [
-            f"{CSV_MARK}{header_text(self)}",
-            ",".join([CSV_TIME, *self.signals]),
-            *map(",".join, zip(*(map(repr, column.tolist()) for column in columns), strict=True)),
-            "",
-        ]
-        write_bytes_atomically(target, "\n".join(lines).encode())
+        write_csv(self, path, force=force)
 
     def to_parquet(self, path: str | os.PathLike[str], *, force: bool = False) -> None:
         """Write this run to a parquet file that `ftlm.load` reads back bit for bit; needs pyarrow.
@@ -470,24 +428,13 @@ class Run(Measured):
         DataError
             If pyarrow is not installed, the file exists and `force` is not set, or it cannot be written.
         """
-        target = new_file(path, force=force)
-        try:
-            pyarrow = importlib.import_module("pyarrow")
-            parquet = importlib.import_module("pyarrow.parquet")
-        except ImportError:
-            raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'") from None
-        columns = {CSV_TIME: written_time(self)} | {name: self._data[name] for name in self.signals}
-        table = pyarrow.table(columns).replace_schema_metadata({"ftlm-run": header_text(self)})
-        content = io.BytesIO()
-        # Checksums, so that a flipped byte is no other answer.
-        parquet.write_table(table, content, write_page_checksum=True)
-        write_bytes_atomically(target, content.getvalue())
+        write_parquet(self, path, force=force)
 
-    def _known(self) -> dict[str, Any]:
+    def _fields(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(Measured)}
 
     def _with(self, **changes: Any) -> Run:
-        return _of(**{**self._known(), **changes})
+        return run_of(Measured(**{**self._fields(), **changes}))
 
     def _headline(self) -> str:
         return (
@@ -500,119 +447,16 @@ class Run(Measured):
         return name + unit + (f" {self._intersample[name]}" if name in self._intersample else "")
 
 
-def build(
-    *,
-    step: float | None,
-    time: object,
-    inputs: Mapping[str, object],
-    outputs: Mapping[str, object],
-    units: Mapping[str, str] | None,
-    intersample: Mapping[str, str] | None,
-    name: str,
-    resample: float | None,
-    window: Sequence[float | None] | None,
-    time_unit: str = "s",
-    labels: Mapping[str, str] | None = None,
-    time_label: str = "time",
-    known_step: float | None = None,
-    facts: tuple[str, ...] = (),
-    about: Mapping[str, Any] | None = None,
-) -> Run:
-    """Check everything and make the run; `labels` says what errors call a signal, `known_step` what the file stated."""
-    check_run_name(name)
-    for signal in (*inputs, *outputs):
-        check_signal_name(signal)
-    both = [signal for signal in inputs if signal in outputs]
-    if both:
-        raise DataError(f"signal {both[0]!r} is both an input and an output, {len(both)} in all; give it two names")
-    if not outputs:
-        raise DataError("outputs=: there is none; name at least one output")
-    if (step is None) == (time is None):
-        given = "neither is given" if step is None else "both are given"
-        raise DataError(f"step= and time=: {given}; pass exactly one of them")
-    order = (*inputs, *outputs)
-    scales = checked_units(units, order)
-    behaviour: dict[str, Intersample] = {
-        **dict.fromkeys(inputs, HELD),
-        **checked_intersample(intersample, tuple(inputs)),
-    }
-    new_step = None if resample is None else checked_step(resample, "resample")
-
-    things = {signal: (labels or {}).get(signal, f"signal {signal!r}") for signal in order}
-    vectors = {signal: as_vector({**inputs, **outputs}[signal], things[signal])[0] for signal in order}
-    lengths = {things[signal]: vector.size for signal, vector in vectors.items()}
-    if time is None:
-        if time_unit != "s":
-            raise DataError(f"time_unit={time_unit!r} is the unit of time=, which is not given; step= is in s")
-        fixed = checked_step(step, "step")
-        rows = min(lengths.values())
-        clock, resolution = grid_of(rows, fixed), 0.0
-    else:
-        fixed = None
-        if not isinstance(time_unit, str) or time_unit not in TIME_UNITS:
-            raise DataError(f"time_unit={time_unit!r} is unknown; the known ones are {listed(TIME_UNITS)}")
-        clock, dtype = as_vector(time, time_label)
-        lengths = {time_label: clock.size, **lengths}
-        clock = clock * TIME_UNITS[time_unit]
-        precision = np.finfo(dtype).eps if dtype.kind == "f" and dtype.itemsize < 8 else np.finfo(np.float64).eps
-        resolution = float(precision) * float(np.abs(clock).max())
-    check_lengths(lengths)
-
-    first = 0
-    if window is not None:
-        first, last = window_rows(clock, window, "slice", time_label)
-        clock = clock[first:last]
-        vectors = {signal: vector[first:last] for signal, vector in vectors.items()}
-    if clock.size < FEWEST_ROWS:
-        raise DataError(
-            f"{next(iter(lengths))}: {clock.size} rows{' in the slice' if window is not None else ''}, "
-            f"{FEWEST_ROWS} are needed; use a longer record"
-        )
-
-    data: dict[str, Floats] = {}
-    for signal, vector in vectors.items():
-        check_values(vector, things[signal], first)
-        with np.errstate(over="ignore"):
-            data[signal] = vector * scales[signal][1] if scales[signal][1] != 1.0 else vector
-        check_values(data[signal], f"{things[signal]} in {scales[signal][0]}", first)
-
-    if fixed is not None:
-        spacing = fixed
-        begin = float(f"{first * fixed:.12g}")
-    else:
-        check_values(clock, time_label, first)
-        check_increasing(clock, time_label, first)
-        begin = float(clock[0])
-        if new_step is None:
-            spacing, fact = regular_step(clock, time_label, first, resolution, known_step)
-            facts += fact
-        else:
-            spacing = new_step
-    if new_step is not None:
-        since = clock - clock[0]
-        data = interpolated(since, data, behaviour, new_step)
-        widest = int(np.diff(since).argmax())
-        facts += (
-            f"resampled to {new_step:.12g} s from intervals of {np.diff(since).min():.6g} to {np.diff(since).max():.6g}"
-            f" s, the widest after row {first + widest} ({how_interpolated(behaviour)})",
-        )
-        spacing = new_step
-    return _of(
-        name=name, step=spacing, start=begin, inputs=tuple(inputs), outputs=tuple(outputs), _data=data,
-        _units={s: scales[s][0] for s in order}, _intersample=behaviour, facts=tuple(dict.fromkeys(facts)),
-        _about=dict(about or {}),
-    )  # fmt: skip
+def built(asked: Asked) -> Run:
+    """Check all that is asked of a run, and make it."""
+    return run_of(asked.measured())
 
 
-def _of(**known: Any) -> Run:
-    """A run of checked samples."""
+def run_of(record: Measured) -> Run:
+    """Return a record of checked samples as what people hold."""
     run = object.__new__(Run)
-    Measured.__init__(run, **known)
+    Measured.__init__(run, **{f.name: getattr(record, f.name) for f in fields(Measured)})
     return run
-
-
-def _label(signal: str, column: object) -> str:
-    return f"signal {signal!r} (column {column!r})"
 
 
 def _frame_columns(frame: object) -> list[Hashable]:

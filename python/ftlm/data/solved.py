@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from ftlm.base.checks import whole_number
+from ftlm.base.checks import check_pulses
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
 from ftlm.data.structures import Structure
@@ -58,8 +58,8 @@ class Solved:
     estimate: Estimate | None = None
 
     def __post_init__(self) -> None:
-        if self.m is not None and not 1 <= (whole_number(self.m) or 0) < 1 << 62:
-            raise ModelError(f"m = {self.m!r} is no number of pulses; give a whole number, at least 1")
+        if self.m is not None:
+            check_pulses(self.m)
         if self.structure.free_delays:
             late = ", ".join(self.structure.free_delays)
             raise ModelError(f"the delay of {late} is still free; identify it first, or set it by with_delays")

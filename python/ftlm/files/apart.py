@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ftlm.base.errors import DataError
-from ftlm.data.header import header_of
+from ftlm.data.header import Header
 from ftlm.files.columns import Column, FileTable
 
 _READER = Path(__file__).with_name("mat_reader.py")
@@ -168,5 +168,5 @@ class _Answers:
             why = ", ".join(f"{name!r} ({reason})" for name, reason in list(skipped.items())[:10]) or "it is empty"
             raise DataError(f"{str(path)!r} holds no real numeric matrix: {why}; save the samples as matrices")
         told = header.get("ftlm-run")
-        own = header_of(path, "its metadata", told) if isinstance(told, str) else None
+        own = Header.read(path, "its metadata", told) if isinstance(told, str) else None
         return FileTable(path=path, columns=columns, text=header.get("text") is True, header=own, skipped=skipped)

@@ -6,15 +6,16 @@ import os
 import stat
 import tomllib
 from collections.abc import Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias, cast
 
-from ftlm.base.checks import listed, names_to_columns, nearest
+from ftlm.base.checks import as_mapping, listed, names_to_columns, nearest
 from ftlm.base.errors import DataError
+from ftlm.data.asked import Asked
 from ftlm.data.header import Header
-from ftlm.data.names import is_run_name
-from ftlm.data.run import Run, build
+from ftlm.data.names import CSV_TIME, is_run_name
+from ftlm.data.run import Run, built
 from ftlm.files.apart import MATLAB, PARQUET, read_apart
 from ftlm.files.columns import Column, FileTable, Pool
 from ftlm.files.text import LONGEST_HEADER, read_text
@@ -25,8 +26,8 @@ _COLUMN_KEYS = ("time", "step", "inputs", "outputs", "units", "intersample")
 
 
 @dataclass
-class _Asked:
-    """What the caller wants, from the arguments, the columns file and ftlm's own header."""
+class _Wanted:
+    """Which columns the caller wants, from the arguments, the columns file and ftlm's own header."""
 
     time: Hashable | None
     step: float | None
@@ -103,23 +104,15 @@ def load(
     ...            units={"theta11": "deg"})  # doctest: +SKIP
     """
     paths = _paths(path)
-    asked = _asked(
-        time=time,
-        step=step,
-        inputs=inputs,
-        outputs=outputs,
-        units=units,
-        intersample=intersample,
-        columns=columns,
-    )
+    wanted = _wanted(_columns_file(columns), time, step, inputs, outputs, units, intersample)
     tables = _tables(paths)
     header = tables[0].header
     if header is not None and len(tables) > 1:
         raise DataError(f"{str(paths[0])!r} is a whole run of its own; load it alone")
     if header is not None:
-        _take_header(asked, header)
+        _take_header(wanted, header)
     pool = Pool(tables)
-    if not asked.outputs:
+    if not wanted.outputs:
         raise DataError(
             f"no output is named; name the signals with inputs={{name: column}} and outputs={{name: column}}, "
             f"or in a columns file (commands: -u NAME=COLUMN -y NAME=COLUMN, or --columns FILE); {pool.described()}"
@@ -127,37 +120,29 @@ def load(
     labels: dict[str, str] = {}
     used: list[Column] = []
 
-    def gather(wanted: Mapping[str, Hashable]) -> dict[str, object]:
+    def gather(columns: Mapping[str, Hashable]) -> dict[str, object]:
         picked: dict[str, object] = {}
-        for signal_name, spec in wanted.items():
-            column = pool.find(spec, f"signal {signal_name!r}")
-            labels[signal_name] = f"{column.source.name}: column {column.name!r} (signal {signal_name!r})"
+        for signal, spec in columns.items():
+            column = pool.find(spec, f"signal {signal!r}")
+            labels[signal] = f"{column.source.name}: column {column.name!r} (signal {signal!r})"
             used.append(column)
-            picked[signal_name] = column.numbers()
+            picked[signal] = column.numbers()
         return picked
 
-    given_inputs, given_outputs = gather(asked.inputs), gather(asked.outputs)
-    clock = pool.time(asked.time, used) if asked.step is None else None
-    stem = paths[0].stem
+    given_inputs, given_outputs = gather(wanted.inputs), gather(wanted.outputs)
+    clock = pool.time(wanted.time, used) if wanted.step is None else None
     if name is None:
+        stem = paths[0].stem
         name = header.name if header is not None else stem if is_run_name(stem) else "run"
-    return build(
-        step=asked.step,
-        time=None if clock is None else clock.numbers(),
-        inputs=given_inputs,
-        outputs=given_outputs,
-        units=asked.units,
-        intersample=asked.intersample,
-        name=name,
-        resample=resample,
-        window=slice,
-        time_unit=time_unit,
-        labels=labels,
-        time_label="time" if clock is None else f"{clock.source.name}: column {clock.name!r} (time)",
-        known_step=header.step if header is not None and clock is not None and clock.name == "t_s" else None,
-        facts=() if header is None else header.warnings,
-        about={} if header is None else header.about,
-    )
+    known = Asked(
+        given_inputs, given_outputs, wanted.step, None if clock is None else clock.numbers(), wanted.units,
+        wanted.intersample, name, resample, slice, time_unit, labels,
+        "time" if clock is None else f"{clock.source.name}: column {clock.name!r} (time)",
+    )  # fmt: skip
+    if header is not None:
+        stated = header.step if clock is not None and clock.name == CSV_TIME else None
+        known = replace(known, known_step=stated, facts=header.warnings, about=header.about)
+    return built(known)
 
 
 def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:
@@ -217,39 +202,28 @@ def column_names(path: PathLike) -> tuple[str, ...] | None:
     return None if table.header is not None else Pool([table]).names
 
 
-def _asked(
-    *,
-    time: Hashable | None,
-    step: object,
-    inputs: object,
-    outputs: object,
-    units: object,
+def _wanted(
+    told: Mapping[str, object], time: Hashable | None, step: object, inputs: object, outputs: object, units: object,
     intersample: object,
-    columns: object,
-) -> _Asked:
-    told = _columns_file(columns)
+) -> _Wanted:  # fmt: skip
     if time is not None and step is not None:
         raise DataError("time= and step=: both are given; pass one of them")
     if time is None and step is None:
         time, step = told.get("time"), told.get("step")
         if time is not None and step is not None:
             raise DataError("columns=: both time and step are given; keep one of them")
-    return _Asked(
-        time=time,
-        step=cast("float | None", step),
-        inputs={**names_to_columns("inputs", told.get("inputs")), **names_to_columns("inputs", inputs)},
-        outputs={**names_to_columns("outputs", told.get("outputs")), **names_to_columns("outputs", outputs)},
-        units={**_words("units", told.get("units")), **_words("units", units)},
-        intersample={**_words("intersample", told.get("intersample")), **_words("intersample", intersample)},
+    return _Wanted(
+        time,
+        cast("float | None", step),
+        names_to_columns("inputs", told.get("inputs")) | names_to_columns("inputs", inputs),
+        names_to_columns("outputs", told.get("outputs")) | names_to_columns("outputs", outputs),
+        _words("units", told.get("units")) | _words("units", units),
+        _words("intersample", told.get("intersample")) | _words("intersample", intersample),
     )
 
 
 def _words(argument: str, given: object) -> dict[str, str]:
-    if given is None:
-        return {}
-    if not isinstance(given, Mapping):
-        raise DataError(f"{argument}= is a {type(given).__name__}; pass a dict of name: word")
-    return dict(given)
+    return {} if given is None else dict(cast("Mapping[str, str]", as_mapping(argument, given, "word")))
 
 
 def _columns_file(columns: object) -> Mapping[str, object]:
@@ -281,26 +255,26 @@ def _columns_file(columns: object) -> Mapping[str, object]:
     return told
 
 
-def _take_header(asked: _Asked, header: Header) -> None:
+def _take_header(wanted: _Wanted, header: Header) -> None:
     """Fill in what was not asked for from ftlm's own header."""
-    if asked.time is None and asked.step is None:
-        asked.time = "t_s"
-    if not asked.inputs and not asked.outputs:
-        asked.inputs = {name: name for name in header.inputs}
-        asked.outputs = {name: name for name in header.outputs}
-    elif not asked.outputs:
-        asked.outputs = {name: name for name in header.outputs if name not in asked.inputs}
-    elif not asked.inputs:
-        asked.inputs = {name: name for name in header.inputs if name not in asked.outputs}
-    for name, column in (asked.inputs | asked.outputs).items():
+    if wanted.time is None and wanted.step is None:
+        wanted.time = CSV_TIME
+    if not wanted.inputs and not wanted.outputs:
+        wanted.inputs = {name: name for name in header.inputs}
+        wanted.outputs = {name: name for name in header.outputs}
+    elif not wanted.outputs:
+        wanted.outputs = {name: name for name in header.outputs if name not in wanted.inputs}
+    elif not wanted.inputs:
+        wanted.inputs = {name: name for name in header.inputs if name not in wanted.outputs}
+    for name, column in (wanted.inputs | wanted.outputs).items():
         stated = header.units.get(str(column))
-        told = asked.units.get(name)
+        told = wanted.units.get(name)
         if stated and told and told != stated:
             raise DataError(
                 f"units=: {told!r} is asked for signal {name!r}, and the file itself says {stated!r}; "
                 "leave the unit out for a file written by ftlm"
             )
         if stated and not told:
-            asked.units[name] = stated
-        if name in asked.inputs and str(column) in header.intersample:
-            asked.intersample.setdefault(name, header.intersample[str(column)])
+            wanted.units[name] = stated
+        if name in wanted.inputs and str(column) in header.intersample:
+            wanted.intersample.setdefault(name, header.intersample[str(column)])

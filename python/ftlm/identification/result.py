@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ftlm.base.errors import ModelError
-from ftlm.base.output import to_frame
+from ftlm.base.frames import to_frame
 from ftlm.data.equations import numeric
 from ftlm.data.run import Run
 from ftlm.identification.judged import Judged

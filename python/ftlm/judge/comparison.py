@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
-from ftlm.base.output import to_frame
+from ftlm.base.frames import to_frame
 from ftlm.data.run import Run
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Solved, check_solved

@@ -16,7 +16,7 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import whole_number
 from ftlm.base.errors import DataError, ModelError
-from ftlm.base.statistics import LEVEL, NORMAL_99, chi_squared_99
+from ftlm.base.statistics import LEVEL, NORMAL_99, chi_squared_99, ljung_box
 from ftlm.data.run import Run
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Solved, check_solved
@@ -296,7 +296,7 @@ def _tested(series: list[Floats], signals: Mapping[str, list[Floats]], lags: int
     count = everything.size
     own, _, _ = _core.correlation(series, series, lags)
     own = own[lags:]
-    statistic = count * (count + 2) * float(np.sum(own[1:] ** 2 / (count - behind[1:])))
+    statistic = ljung_box(own[1:], count)
     limit = chi_squared_99(lags)
     whiteness = CorrelationTest(behind, own, NORMAL_99 / math.sqrt(count), statistic, limit, passed=statistic <= limit)
     inputs, feedback = {}, []

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from ftlm.arm.link import flexible_link, link_model
-from ftlm.base.errors import DataError
+from ftlm.base.output import check_folder
 from ftlm.data.equations import Equation
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
@@ -185,14 +185,8 @@ def run_demo(
     DataError
         A file is there already and ``force`` is not set, or the folder cannot be written.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"{folder} cannot be made: {error.strerror or error}; choose another folder") from error
-    wanted = ["square.csv", "sine.csv", *(f"stage{s}-{n}.json" for s in (1, 2) for n in ("paper", "output-error"))]
-    there = [n for n in (*wanted, "demo.html") if (folder / n).exists()]
-    if there and not force:
-        raise DataError(f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or --force")
+    models = [f"stage{s}-{n}.json" for s in (1, 2) for n in ("paper", "output-error")]
+    check_folder(folder, ("square.csv", "sine.csv", *models, "demo.html"), force=force)
     say("recording both stages on the virtual rig, under a square and a sine current")
     square = demo_run("square", noise=noise, seed=seed)
     sine = demo_run("sine", noise=noise, seed=seed)

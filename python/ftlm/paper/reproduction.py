@@ -23,6 +23,8 @@ from ftlm.paper.claims import Claim, claims
 from ftlm.paper.page import reproduction_page
 from ftlm.paper.stages import Recomputed, Stage, StageWork, stage_dict
 
+#: Files of :meth:`Reproduction.save` beside the models.
+SAVED = ("square.csv", "sine.csv", "tables.json")
 #: Seconds between two looks for Ctrl-C.
 LOOK = 0.1
 
@@ -80,13 +82,14 @@ class Reproduction(Recomputed):
             A file is there already, or the folder cannot be written.
         """
         where = Path(folder)
-        names = check_folder(where, self._models(), force=force)
+        models = self._models()
+        check_folder(where, (*SAVED, *models), force=force)
         written = []
         for run, name in ((self.square, "square.csv"), (self.sine, "sine.csv")):
             if run is not None:
                 run.to_csv(where / name, force=force)
                 written.append(where / name)
-        for name, model in names.items():
+        for name, model in models.items():
             model.save(where / name, force=force)
             written.append(where / name)
         text = json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)

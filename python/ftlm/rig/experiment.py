@@ -14,8 +14,10 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError, FtlmError, ModelError, RigFault
+from ftlm.base.output import RUN, check_free
+from ftlm.data.asked import Asked
 from ftlm.data.names import is_run_name
-from ftlm.data.run import Run, build
+from ftlm.data.run import Run, built
 from ftlm.fit.streaming import Streaming
 from ftlm.rig.excitation import INPUTS, Excitation, check_times, column_of
 from ftlm.rig.quanser import QuanserBoard
@@ -230,10 +232,8 @@ class _Recorder:
             return None
         data = {column: rows[:, k] for k, column in enumerate(COLUMNS)}
         facts = tuple(f"the rig stopped the run after {(len(rows) - 1) * step:.6g} s: {f}" for f in faults)
-        return build(
-            step=step, time=None, inputs={n: data[n] for n in INPUTS}, outputs={n: data[n] for n in COLUMNS[2:]},
-            units=UNITS, intersample=None, name=name, resample=None, window=None, facts=facts, about=about,
-        )  # fmt: skip
+        signals = {n: data[n] for n in INPUTS}, {n: data[n] for n in COLUMNS[2:]}
+        return built(Asked(*signals, step=step, units=UNITS, name=name, facts=facts, about=about))
 
 
 def _board(
@@ -258,10 +258,7 @@ def _check_target(target: Path, *, force: bool) -> None:
         raise DataError(f"{str(target)!r} ends with neither .csv nor .parquet; runs are written as one of them")
     if target.suffix.lower() == ".parquet" and importlib.util.find_spec("pyarrow") is None:
         raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'")
-    if target.exists() and not force:
-        raise DataError(f"{str(target)!r} exists; choose another name, or overwrite it with force=True (--force)")
-    if not target.resolve().parent.is_dir():
-        raise DataError(f"{str(target.parent)!r} is no folder; make it first")
+    check_free(target, force=force, words=RUN)
     left = partial_of(target)
     if left.exists() and not force:
         raise DataError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,8 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError, RigFault
+from ftlm.data.header import CSV_MARK, Header
+from ftlm.data.names import CSV_TIME
 from ftlm.data.run import Run
 from ftlm.rig.excitation import INPUTS
 from ftlm.rig.rig import COLUMNS
@@ -41,13 +42,12 @@ class Partial:
         self._descriptor: int | None = None
         if self.path is None:
             return
-        header = {
-            "name": name, "step": step, "start": 0.0, "inputs": list(INPUTS), "outputs": list(COLUMNS[2:]),
-            "units": UNITS, "intersample": dict.fromkeys(INPUTS, "zoh"),
-            "warnings": ["the recording did not end: the program died, or the disk was full"],
-            "about": about | {"faults": ["the recording did not end"]},
-        }  # fmt: skip
-        lines = f"# ftlm-run 1 {json.dumps(header, ensure_ascii=False)}\n{','.join(['t_s', *COLUMNS])}\n"
+        header = Header(
+            name, step, 0.0, tuple(INPUTS), tuple(COLUMNS[2:]), UNITS, dict.fromkeys(INPUTS, "zoh"),
+            ("the recording did not end: the program died, or the disk was full",),
+            about | {"faults": ["the recording did not end"]},
+        )  # fmt: skip
+        lines = f"{CSV_MARK}{header.text()}\n{','.join([CSV_TIME, *COLUMNS])}\n"
         flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
         try:
             self._descriptor = os.open(self.path, flags, 0o666)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from ftlm.base.output import to_frame
+from ftlm.base.frames import to_frame
 from ftlm.model.model import Model
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, number, symbol, symbol_html

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftlm import _core
 from ftlm.base.arrays import along, as_floats
-from ftlm.base.checks import real_number, whole_number
+from ftlm.base.checks import check_pulses, real_number
 from ftlm.base.errors import ModelError
 
 
@@ -165,13 +165,6 @@ def haar_inverse(x: ArrayLike, *, axis: int = -1) -> NDArray[np.float64]:
     return along("x", x, axis, _core.haar_inverse)
 
 
-def _pulses(m: int) -> int:
-    pulses = whole_number(m)
-    if pulses is None or not 1 <= pulses < 1 << 62:
-        raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
-    return pulses
-
-
 def _step(m: int, duration: float) -> float:
     length = real_number("duration", duration)
     if not (math.isfinite(length) and length > 0):
@@ -197,7 +190,7 @@ def haar_matrix(m: int) -> NDArray[np.float64]:
     ModelError
         Another m.
     """
-    return _core.haar_matrix(_pulses(m))
+    return _core.haar_matrix(check_pulses(m))
 
 
 def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.float64]:
@@ -224,7 +217,7 @@ def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
     ModelError
         An order, m or duration out of range.
     """
-    m = _pulses(m)
+    m = check_pulses(m)
     return _core.block_pulse_matrix(real_number("order", order), m, _step(m, duration))
 
 
@@ -250,5 +243,5 @@ def operational_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
     ModelError
         An order, m or duration out of range.
     """
-    m = _pulses(m)
+    m = check_pulses(m)
     return _core.operational_matrix(real_number("order", order), m, _step(m, duration))

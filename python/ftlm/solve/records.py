@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import nearest, whole_number
+from ftlm.base.checks import check_pulses, nearest
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.statistics import is_rest
 from ftlm.data.equations import Equation
@@ -83,10 +84,7 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
     ModelError
         Naming the run, what it carries and what to choose.
     """
-    pulses = whole_number(m)
-    if pulses is None or pulses < 1:
-        raise ModelError(f"m = {m!r} is no number of pulses; give a whole number, at least 1")
-    m = pulses
+    m = check_pulses(m, math.inf)
     for run in runs:
         carried = run.length - 1
         if m > carried:

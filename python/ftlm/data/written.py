@@ -1,0 +1,58 @@
+"""A run as a csv or a parquet file."""
+
+from __future__ import annotations
+
+import importlib
+import io
+import math
+import os
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import DataError
+from ftlm.base.output import RUN, check_new, write_atomically
+from ftlm.data.header import CSV_MARK, Header
+from ftlm.data.measured import Measured
+from ftlm.data.names import CSV_TIME
+from ftlm.data.samples import grid_of
+
+
+def write_csv(run: Measured, path: str | os.PathLike[str], *, force: bool) -> None:
+    """Write a run as text; see :meth:`ftlm.Run.to_csv`."""
+    check_new(path, force=force, words=RUN)
+    columns = _columns(run)
+    rows = map(",".join, zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True))
+    text = "\n".join([f"{CSV_MARK}{Header.of(run).text()}", ",".join(columns), *rows, ""])
+    write_atomically(path, text.encode(), force=force, words=RUN)
+
+
+def write_parquet(run: Measured, path: str | os.PathLike[str], *, force: bool) -> None:
+    """Write a run as a parquet file; see :meth:`ftlm.Run.to_parquet`."""
+    target = check_new(path, force=force, words=RUN)
+    try:
+        pyarrow = importlib.import_module("pyarrow")
+        parquet = importlib.import_module("pyarrow.parquet")
+    except ImportError:
+        raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'") from None
+    table = pyarrow.table(_columns(run)).replace_schema_metadata({"ftlm-run": Header.of(run).text()})
+    content = io.BytesIO()
+    # Checksums, so that a flipped byte is no other answer.
+    parquet.write_table(table, content, write_page_checksum=True)
+    write_atomically(target, content.getvalue(), force=force, words=RUN)
+
+
+def _columns(run: Measured) -> dict[str, Floats]:
+    return {CSV_TIME: _source_time(run)} | {name: run[name] for name in run.signals}
+
+
+def _source_time(run: Measured) -> Floats:
+    """Source time of every row, in digits that read well."""
+    exact = run.start + grid_of(run.length, run.step)
+    # Nine digits below the step read well, and the exact step stands in the header.
+    digits = 9 - math.floor(math.log10(run.step))
+    if not 0 <= digits <= 15 or np.abs(exact).max() * 10.0**digits >= 2.0**53:
+        return exact
+    rounded = np.round(exact, digits)
+    rounded[0] = run.start
+    return rounded
