@@ -1,5 +1,7 @@
 """From a run to the record that the core computes on: means, delays, sensor filter, rest, initial terms."""
 
+import pickle
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +12,8 @@ from hypothesis import strategies as st
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.solve.records import default_m, equation_tuple, initial_tuple, prepare, record, structure_tuple
+from ftlm.data.several import MOST_KEPT, as_runs
+from ftlm.solve.records import default_m, equation_tuple, initial_tuple, prepare, record, records, structure_tuple
 
 
 def make_run(outputs=None, inputs=None, step=0.1, **options):
@@ -353,3 +356,30 @@ def test_records_refuse_what_the_core_cannot_trust():
         )
     with pytest.raises(ftlm.ModelError, match=r"step = -0\.1 is outside"):
         _core.least_squares([(-0.1, np.ones((1, 4)), None)], equation, [False], [None], (False, []))
+
+
+def test_checked_runs_pass_untouched_and_keep_their_records():
+    runs = as_runs([make_run({"y": np.ones(50)}), make_run({"y": np.arange(50.0)})])
+    assert as_runs(runs) is runs
+    structure = ftlm.equation("D^1.5 y = a y + b u", initial="rest")
+    first, second = records(runs, structure, 32)
+    again = records(runs, structure.with_coefficients({"a": -1.0}), 32, filtered=False)
+    assert again[0] is first
+    assert again[1] is second
+    assert records(runs, replace(structure, delay={"u": 0.1}), 32)[0] is not first
+    assert records(runs, structure, 98)[0] is not records(runs, structure, 98)[0]
+    with pytest.raises(ValueError, match="read-only"):
+        first.means[0, 0] = 1.0
+    assert pickle.loads(pickle.dumps(runs))._kept == {}
+
+
+def test_what_is_kept_with_runs_goes_with_them():
+    run = make_run({"y": np.ones(50)})
+    runs = as_runs(run)
+    for m in range(1, 20):
+        records(runs, ftlm.equation("D^1.5 y = a y + b u", initial="rest"), m)
+    assert len(runs._kept) == MOST_KEPT
+    kept = weakref.ref(next(iter(runs._kept.values()))[0])
+    assert kept() is not None
+    del runs
+    assert kept() is None

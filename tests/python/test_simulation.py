@@ -10,7 +10,7 @@ import pytest
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.solve.free_run import respond
+from ftlm.solve.free_run import compared, respond
 from ftlm.solve.records import record
 
 
@@ -48,7 +48,8 @@ def test_one_equation_is_the_dense_solve(m):
 def test_coupled_equations_are_the_dense_solve(m):
     run = zeros_run(n=201, outputs=("y", "z"))
     coupled = model(TWO, "simulated")
-    _, responses, _ = respond(coupled, run, m)
+    (rec,) = compared([run], coupled, m)
+    responses, _ = respond(coupled, rec)
     u = oracles.pulse_means(run["u"], m, "zoh")
     described = [
         {

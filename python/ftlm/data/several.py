@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
+from typing import Any
 
 from ftlm.base.checks import listed
 from ftlm.base.errors import DataError
 from ftlm.data.run import Run
+
+#: Results that are kept with runs: those of the equations one by one and of the whole.
+MOST_KEPT = 8
 
 
 def check_compatible(runs: Iterable[Run]) -> None:
@@ -46,22 +50,49 @@ def check_compatible(runs: Iterable[Run]) -> None:
             )
 
 
-def as_runs(runs: Run | Sequence[Run]) -> list[Run]:
-    """One run or several as a list.
+class Runs(tuple[Run, ...]):
+    """Runs that fit together, checked once; see :func:`as_runs`.
+
+    What is computed from them time and again stays with them, read-only, and goes when they go.
+    """
+
+    _kept: dict[str, tuple[Any, ...]]
+
+    def __new__(cls, runs: Run | Iterable[Run]) -> Runs:
+        """Check them."""
+        try:
+            every = [runs] if isinstance(runs, Run) else list(runs)
+        except TypeError:
+            raise DataError(f"runs is {type(runs).__name__}; give a Run or a list of them") from None
+        if not every:
+            raise DataError("no run is given; give at least one")
+        for i, run in enumerate(every):
+            if not isinstance(run, Run):
+                raise DataError(f"runs[{i}] is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
+        check_compatible(every)
+        checked = super().__new__(cls, every)
+        checked._kept = {}
+        return checked
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Runs, (tuple(self),)
+
+    def keep(self, key: str, make: Callable[[], Iterable[Any]]) -> tuple[Any, ...]:
+        """Return what was made under this key, or make it; the oldest goes where there are too many."""
+        made = self._kept.get(key)
+        if made is None:
+            made = self._kept[key] = tuple(make())
+            for old in list(self._kept)[:-MOST_KEPT]:
+                self._kept.pop(old, None)
+        return made
+
+
+def as_runs(runs: Run | Iterable[Run]) -> Runs:
+    """One run or several that fit together; what is checked passes untouched.
 
     Raises
     ------
     DataError
         No run, something that is no run, or runs whose names or units differ.
     """
-    try:
-        found = [runs] if isinstance(runs, Run) else list(runs)
-    except TypeError:
-        raise DataError(f"runs is {type(runs).__name__}; give a Run or a list of them") from None
-    if not found:
-        raise DataError("no run is given; give at least one")
-    for i, run in enumerate(found):
-        if not isinstance(run, Run):
-            raise DataError(f"runs[{i}] is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
-    check_compatible(found)
-    return found
+    return runs if isinstance(runs, Runs) else Runs(runs)

@@ -19,8 +19,8 @@ from ftlm.data.structures import Structure
 from ftlm.judge.metrics import Metrics, pooled
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol_html
-from ftlm.solve.free_run import respond
-from ftlm.solve.records import check_m, default_m, equation_tuple, initial_tuple, record
+from ftlm.solve.free_run import compared, respond
+from ftlm.solve.records import check_m, default_m, equation_tuple, initial_tuple, records
 
 #: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
 NEAR_IDENTITY = 0.25
@@ -151,8 +151,8 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
     per_run, initial, steps = [], [], []
     for run in found:
         run.require_outputs([o for o in model.outputs if o in run])
-        rec, responses, terms = respond(model, run, m)
-        full = rec if model.structure.coupling == "measured" else record(run, model.structure, m)
+    for run, rec, full in zip(found, compared(found, model, m), records(found, model.structure, m), strict=True):
+        responses, terms = respond(model, rec)
         equation_figures, output_figures = {}, {}
         for item in model.equations:
             name = item.output

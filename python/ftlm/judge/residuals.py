@@ -22,7 +22,7 @@ from ftlm.data.several import as_runs
 from ftlm.data.solved import Solved, check_solved
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, symbol_html
-from ftlm.solve.free_run import respond
+from ftlm.solve.free_run import compared, respond
 
 #: Refinement of the grid ends when it changes residuals by less than this share of their size.
 SETTLED = 0.05
@@ -272,7 +272,8 @@ def _residuals(model: Solved, runs: Sequence[Run], every: int) -> tuple[dict[str
     terms = 0
     sensor = model.structure.sensor_filter
     for run in runs:
-        rec, responses, initial = respond(model, run, (run.length - 1) * every)
+        (rec,) = compared([run], model, (run.length - 1) * every)
+        responses, initial = respond(model, rec)
         terms += sum(len(t) for t in initial.values())
         for name in model.outputs:
             through = rec.sensor is None or (sensor is not None and name in sensor.outputs)

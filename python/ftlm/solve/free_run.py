@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Literal
 
 import numpy as np
@@ -14,58 +14,51 @@ from ftlm.base.errors import ConvergenceError, DataError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved, check_solved
 from ftlm.data.structures import check_initial
-from ftlm.solve.records import MAX_M, Record, equation_tuple, initial_tuple, record, sensor_series
+from ftlm.solve.records import MAX_M, Record, equation_tuple, initial_tuple, records, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
 #: least from which a sample follows that no jump of a held input at its instant has reached.
 FIRST_REFINEMENT = 2
 
 
-def respond(model: Solved, run: Run, m: int) -> tuple[Record, dict[str, Floats], dict[str, dict[float, float]]]:
-    """Pulse means of the model's outputs beside the record that they are to be compared with.
+def compared(runs: Sequence[Run], model: Solved, m: int) -> list[Record]:
+    """Records that free runs are compared with: their outputs are the measured ones, filtered as those of a free run.
 
     With simulated coupling all outputs follow together from the inputs, then pass the sensor filter; with measured
-    coupling each equation is driven by the other measured signals, in which the filter is already. Initial terms are
-    those that bring the response closest to the measured outputs of this run.
+    coupling each equation is driven by the other measured signals, in which the filter is already.
+    """
+    return records(runs, model.structure, m, filtered=model.structure.coupling != "simulated")
 
-    Returns
-    -------
-    record, responses, initial
-        The record (whose outputs are the measured ones, filtered alike), pulse means by output, and the coefficients
-        of the initial terms by output and exponent.
 
-    Raises
-    ------
-    DataError
-        A signal that the run does not have.
-    ModelError
-        An equation that cannot be solved for its output.
+def respond(model: Solved, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
+    """Pulse means of the model's outputs on one of its :func:`compared` records, and initial terms by exponent.
+
+    The initial terms are those that bring the response closest to the measured outputs.
     """
     structure = model.structure
     coupled = structure.coupling == "simulated"
-    rec = record(run, structure, m, filtered=not coupled)
     terms = initial_tuple(rec.initial)
     inputs = list(rec.inputs)
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
     responses: dict[str, Floats] = {}
     initial: dict[str, dict[float, float]] = {}
 
-    def keep(names: tuple[str, ...], found: tuple[Floats, list[list[float]], list[list[float]]]) -> None:
-        outputs, exponents, values = found
+    def keep(names: tuple[str, ...], response: tuple[Floats, list[list[float]], list[list[float]]]) -> None:
+        outputs, exponents, values = response
         for i, name in enumerate(names):
             responses[name] = outputs[i]
             initial[name] = dict(zip(exponents[i], values[i], strict=True))
 
     if coupled:
         sensor = None
-        series = sensor_series(structure, m, rec.step)
+        series = sensor_series(structure, rec.m, rec.step)
         if series is not None and structure.sensor_filter is not None:
             sensor = (series, [o in structure.sensor_filter.outputs for o in model.outputs])
         keep(model.outputs, _core.respond_with_initial(rec.core(), equations, inputs, terms, sensor))
     else:
         for name, item in zip(model.outputs, equations, strict=True):
             keep((name,), _core.respond_with_initial(rec.core(), [item], inputs, terms, None))
-    return rec, responses, initial
+    return responses, initial
 
 
 def simulate(
@@ -123,7 +116,8 @@ def simulate(
     if own > largest_m:
         raise ModelError(f"run {run.name!r} has {own} intervals, more than {largest_m}; slice it")
     refinement = FIRST_REFINEMENT
-    coarse = _samples(model, run, own * refinement, initial)
+    complete = _completed(run, model)
+    coarse = _samples(model, complete, own * refinement, initial)
     extrapolated: Floats | None = None
     while True:
         refinement *= 2
@@ -132,7 +126,7 @@ def simulate(
                 f"the response of {', '.join(model.outputs)} still moves by more than {tolerance:g} of its size at "
                 f"{own * refinement // 2} pulses; raise tolerance or largest_m, or check that the model is stable"
             )
-        fine = _samples(model, run, own * refinement, initial)
+        fine = _samples(model, complete, own * refinement, initial)
         best = (4.0 * fine - coarse) / 3.0
         if extrapolated is not None:
             change = np.max(np.abs(best - extrapolated), axis=1)
@@ -155,29 +149,32 @@ def _units(model: Solved, run: Run) -> dict[str, str]:
     return inputs | {n: model.units.get(n, "") or run.units.get(n, "") for n in model.outputs}
 
 
-def _samples(model: Solved, run: Run, m: int, initial: Mapping[str, Mapping[float, float]] | None) -> Floats:
-    """Point samples at the run's instants from a simulation on m pulses."""
-    structure = model.structure
-    coupled = structure.coupling == "simulated"
-    given = {s: run[s] for s in run.signals}
-    # A signal that is simulated need not be there; the core never reads it.
-    missing = [o for o in model.outputs if o not in given]
+def _completed(run: Run, model: Solved) -> Run:
+    """Return the run with zeros for outputs that it lacks: what is simulated need not be there, and is never read."""
+    missing = [o for o in model.outputs if o not in run]
+    if not missing:
+        return run
     read = {s: e.output for e in model.equations for s in e.signals if s != e.output}
     lacking = next((o for o in missing if o in read), None)
-    if lacking is not None and not coupled:
+    if lacking is not None and model.structure.coupling != "simulated":
         raise DataError(
             f"run {run.name!r} has no signal {lacking!r}, which the equation of {read[lacking]} reads as measured; "
             "give it, or use coupling='simulated'"
         )
-    if missing:
-        run = Run.from_arrays(
-            step=run.step,
-            inputs={n: run[n] for n in run.inputs},
-            outputs={**{n: run[n] for n in run.outputs}, **{n: np.zeros(run.length) for n in missing}},
-            intersample=run.intersample,
-            name=run.name,
-        )
-    rec = record(run, structure, m, filtered=not coupled)
+    return Run.from_arrays(
+        step=run.step,
+        inputs={n: run[n] for n in run.inputs},
+        outputs={n: run[n] for n in run.outputs} | {n: np.zeros(run.length) for n in missing},
+        intersample=run.intersample,
+        name=run.name,
+    )
+
+
+def _samples(model: Solved, run: Run, m: int, initial: Mapping[str, Mapping[float, float]] | None) -> Floats:
+    """Point samples at the run's instants from a simulation on m pulses."""
+    structure = model.structure
+    coupled = structure.coupling == "simulated"
+    (rec,) = compared([run], model, m)
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
     terms = [sorted((initial or {}).get(o, {}).items()) for o in model.outputs]
     inputs = list(rec.inputs)

@@ -16,6 +16,8 @@ from ftlm.base.errors import DataError, ModelError
 from ftlm.base.statistics import is_rest
 from ftlm.data.equations import Equation
 from ftlm.data.run import Run
+from ftlm.data.samples import locked
+from ftlm.data.several import Runs
 from ftlm.data.structures import Initial, Structure
 
 #: The paper's number of block pulses, used where the record carries as many.
@@ -151,11 +153,27 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     return Record(
         structure.signals,
         run.duration / m,
-        np.ascontiguousarray(np.stack(rows)),
+        locked(np.stack(rows)),
         tuple(s in run.inputs for s in structure.signals),
         sensor,
         initial,
     )
+
+
+def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True) -> list[Record]:
+    """Records of several runs (see :func:`record`), made once for runs that were checked together.
+
+    Records finer than the runs themselves are not kept: they are large, and nobody asks for one twice.
+    """
+
+    def made() -> list[Record]:
+        return [record(run, structure, m, filtered=filtered) for run in runs]
+
+    if not isinstance(runs, Runs) or m >= min(run.length for run in runs):
+        return made()
+    filtered = filtered or structure.sensor_filter is None
+    read = (structure.signals, structure.delay, structure.free_delays, structure.sensor_filter, structure.initial)
+    return list(runs.keep(repr((read, m, filtered)), made))
 
 
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
@@ -234,18 +252,18 @@ def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_o
     m = check_m(chosen, runs, power_of_two=power_of_two)
     for run in runs:
         run.require_outputs([o for o in structure.outputs if o in run])
-    records = [record(run, structure, m) for run in runs]
-    if any(r.initial == "caputo" for r in records):
+    prepared = records(runs, structure, m)
+    if {r.initial for r in prepared} == {"caputo", "rest"}:
         # One rule for all runs of a fit: initial terms that a run at rest does not need are estimated as zero.
-        records = [record(run, replace(structure, initial="caputo"), m) for run in runs]
+        prepared = records(runs, replace(structure, initial="caputo"), m)
     for item in structure.equations:
         for term in item.terms:
-            if term.fixed is None and term.signal != item.output and not any(r.of(term.signal).any() for r in records):
+            if term.fixed is None and term.signal != item.output and not any(r.of(term.signal).any() for r in prepared):
                 raise DataError(
                     f"{term.signal} is 0 throughout, so its coefficient in the equation of {item.output} cannot be "
                     "identified; leave the term out, fix its coefficient, or add a run in which it moves"
                 )
-    return records
+    return prepared
 
 
 def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:
