@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import html
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -115,40 +116,44 @@ class Advice:
         return "\n".join([f"advice on {self.run}:", *(f"  {f.sentence}" for f in self.findings)])
 
     def _repr_html_(self) -> str:
-        from html import escape  # noqa: PLC0415 — only notebooks need it
-
-        items = "".join(f"<li>{escape(f.sentence)}</li>" for f in self.findings)
-        return f"<p>Advice on {escape(self.run)}:</p><ul>{items or '<li>nothing stands out</li>'}</ul>"
+        items = "".join(f"<li>{html.escape(f.sentence)}</li>" for f in self.findings)
+        return f"<p>Advice on {html.escape(self.run)}:</p><ul>{items or '<li>nothing stands out</li>'}</ul>"
 
 
 def advise(run: Measured, structure: Structure | None = None) -> Advice:
     """Look for faults and poor excitation in a run; see :meth:`ftlm.Run.advice`."""
-    found: list[Finding] = []
+    return Advice(run.name, tuple(_findings(run, structure)))
+
+
+def _findings(run: Measured, structure: Structure | None) -> Iterator[Finding]:
     moving = [n for n in run.signals if np.ptp(run[n]) > 0]
     for name in run.signals:
         if name not in moving:
-            found.append(_constant(run, name))
-    found += _twins(run, moving)
+            yield _constant(run, name)
+    yield from _twins(run, moving)
     inputs = [n for n in run.inputs if n in moving]
     outputs = [n for n in run.outputs if n in moving]
     for name in outputs:
-        found += _dead(run, name)
-    wraps = {name: _wraps(run, name) for name in outputs}
+        yield from _dead(run, name)
+    usual = []
     for name in outputs:
-        found += wraps[name]
+        wraps = list(_wraps(run, name))
+        yield from wraps
         # What jumps from one end to the other has no turning points, trend or spikes worth the name.
-        if not wraps[name]:
-            found += _saturation(run, name) + _spikes(run, name)
+        if not wraps:
+            usual.append(name)
+            yield from _saturation(run, name)
+            yield from _spikes(run, name)
     for name in inputs:
-        found += _saturation(run, name)
-    found += _short(run, outputs) + _excitation(run, inputs)
+        yield from _saturation(run, name)
+    yield from _short(run, outputs)
+    yield from _excitation(run, inputs)
     if structure is not None:
-        found += excitation_for(run, structure)
-    usual = [n for n in outputs if not wraps[n]]
-    found += _feedback(run, inputs, usual) + _drift(run, inputs, usual)
+        yield from excitation_for(run, structure)
+    yield from _feedback(run, inputs, usual)
+    yield from _drift(run, inputs, usual)
     for name in outputs:
-        found += _offset(run, name)
-    return Advice(run.name, tuple(found))
+        yield from _offset(run, name)
 
 
 def _with_unit(run: Measured, name: str, value: float) -> str:
@@ -167,15 +172,12 @@ def _stretches(flags: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.i
     return starts, np.flatnonzero(edges == -1) - starts
 
 
-def _twins(run: Measured, names: list[str]) -> list[Finding]:
-    return [
-        Finding(
-            "twin", other, f"{one} and {other} hold the same number in every row: one of them is the wrong column"
-        )
-        for position, one in enumerate(names)
-        for other in names[position + 1 :]
-        if np.array_equal(run[one], run[other])
-    ]  # fmt: skip
+def _twins(run: Measured, names: list[str]) -> Iterator[Finding]:
+    for one, other in itertools.combinations(names, 2):
+        if np.array_equal(run[one], run[other]):
+            yield Finding(
+                "twin", other, f"{one} and {other} hold the same number in every row: one of them is the wrong column"
+            )
 
 
 def _constant(run: Measured, name: str) -> Finding:
@@ -192,35 +194,33 @@ def _constant(run: Measured, name: str) -> Finding:
     )  # fmt: skip
 
 
-def _dead(run: Measured, name: str) -> list[Finding]:
+def _dead(run: Measured, name: str) -> Iterator[Finding]:
     y = run[name]
     still = np.diff(y) == 0
     starts, lengths = _stretches(still)
     if not lengths.size:
-        return []
+        return
     # Coarse steps or a machine that sticks stand still all the time; a dead channel does so only once or twice.
     if float(np.mean(still)) > 0.3 and np.median(lengths) > 1:
-        return []
+        return
     at = int(np.argmax(lengths))
     first, rows = int(starts[at]), int(lengths[at]) + 1
     if rows < max(DEAD_ROWS, DEAD_SHARE * run.length):
-        return []
+        return
     # At an extreme it is clipped, which is said elsewhere; before the first input acts, a machine may well rest.
     if _entered_steeply(y, first, rows):
-        return []
+        return
     resting = y[first] == 0 and first == 0
     inputs_moved = any(np.ptp(run[n][first : first + rows]) > 0 or run[n][first] != 0 for n in run.inputs)
     if resting and not inputs_moved:
-        return []
+        return
     begin, end = first * run.step, (first + rows) * run.step
     after = f"use slice({end:.4g}, None)" if first < run.length // 20 else "check the sensor, or slice it away"
-    return [
-        Finding(
-            "dead", name,
-            f"output {name} is exactly {_with_unit(run, name, float(y[first]))} from {begin:.4g} s to {end:.4g} s "
-            f"({rows} rows) and changes from row to row elsewhere: a channel that was off or was being zeroed; {after}",
-        )
-    ]  # fmt: skip
+    yield Finding(
+        "dead", name,
+        f"output {name} is exactly {_with_unit(run, name, float(y[first]))} from {begin:.4g} s to {end:.4g} s "
+        f"({rows} rows) and changes from row to row elsewhere: a channel that was off or was being zeroed; {after}",
+    )  # fmt: skip
 
 
 def _few_levels(x: Floats) -> bool:
@@ -245,13 +245,16 @@ def _entered_steeply(y: Floats, first: int, rows: int) -> bool:
     return bool(at_extreme and rows < y.size and min(before, after) > max(4 * _quantum(y), 0.2 * typical))
 
 
-def _saturation(run: Measured, name: str) -> list[Finding]:
+def _saturation(run: Measured, name: str) -> Iterator[Finding]:
     y = run[name]
     levels = np.unique(y)
     if name in run.inputs and _few_levels(y):
-        return []  # a signal of a few levels sits at its extremes by design
+        return  # a signal of a few levels sits at its extremes by design
     noise, quantum = noise_of(y), _quantum(y)
-    found = []
+    if name in run.inputs:
+        role, remedy = "input", "harmless if this is what the machine received, else record the measured input"
+    else:
+        role, remedy = "output", "the true value is not known there: lower the amplitude or widen the range"
     for extreme, word in ((levels[0], "lowest"), (levels[-1], "highest")):
         starts, lengths = _stretches(y == extreme)
         long = lengths >= CLIPPED_ROWS
@@ -262,26 +265,17 @@ def _saturation(run: Measured, name: str) -> list[Finding]:
         else:
             clipped = int(np.sum(lengths[long]))
         if clipped >= max(CLIPPED_ROWS, CLIPPED_SHARE * y.size):
-            role = "input" if name in run.inputs else "output"
-            remedy = (
-                "harmless if this is what the machine received, else record the measured input"
-                if role == "input"
-                else "the true value is not known there: lower the amplitude or widen the range"
-            )
-            found.append(
-                Finding(
-                    "saturation", name,
-                    f"{role} {name} stays at its {word} value {_with_unit(run, name, float(extreme))} "
-                    f"for {clipped} rows ({100 * clipped / y.size:.2g} %), cut off while moving: saturated; {remedy}",
-                )
+            yield Finding(
+                "saturation", name,
+                f"{role} {name} stays at its {word} value {_with_unit(run, name, float(extreme))} "
+                f"for {clipped} rows ({100 * clipped / y.size:.2g} %), cut off while moving: saturated; {remedy}",
             )  # fmt: skip
-    return found
 
 
-def _spikes(run: Measured, name: str) -> list[Finding]:
+def _spikes(run: Measured, name: str) -> Iterator[Finding]:
     y = run[name]
     if y.size < 5:
-        return []
+        return
     up, down = np.diff(y)[:-1], np.diff(y)[1:]
     reach = float(np.quantile(y, 0.995) - np.quantile(y, 0.005))
     height = np.minimum(np.abs(up), np.abs(down))
@@ -297,19 +291,17 @@ def _spikes(run: Measured, name: str) -> list[Finding]:
         out &= ~(pulsed[:-1] & pulsed[1:])
     rows = np.flatnonzero(out) + 1
     if not rows.size or rows.size > MOST_SPIKES * y.size:
-        return []
+        return
     worst = rows[int(np.argmax(height[rows - 1]))]
-    return [
-        Finding(
-            "spikes", name,
-            f"output {name} has {rows.size} spike{'s' if rows.size > 1 else ''}, first at row {rows[0]} "
-            f"({rows[0] * run.step:.4g} s), the largest of {_with_unit(run, name, float(height[worst - 1]))} at row "
-            f"{worst}: single wrong samples; replace them by their neighbours' mean",
-        )
-    ]  # fmt: skip
+    yield Finding(
+        "spikes", name,
+        f"output {name} has {rows.size} spike{'s' if rows.size > 1 else ''}, first at row {rows[0]} "
+        f"({rows[0] * run.step:.4g} s), the largest of {_with_unit(run, name, float(height[worst - 1]))} at row "
+        f"{worst}: single wrong samples; replace them by their neighbours' mean",
+    )  # fmt: skip
 
 
-def _wraps(run: Measured, name: str) -> list[Finding]:
+def _wraps(run: Measured, name: str) -> Iterator[Finding]:
     y = run[name]
     steps = np.diff(y)
     reach, typical = float(np.ptp(y)), float(np.median(np.abs(steps)))
@@ -325,16 +317,14 @@ def _wraps(run: Measured, name: str) -> list[Finding]:
         if stays and before * steps[at] < 0 and after * steps[at] < 0:
             rows.append(at + 1)
     if not rows:
-        return []
+        return
     size = float(np.median(np.abs(steps[np.array(rows) - 1])))
     turn = " (a turn)" if run.units.get(name) == "rad" and abs(size / (2 * math.pi) - 1) < 0.1 else ""
-    return [
-        Finding(
-            "wrap", name,
-            f"output {name} jumps by {_with_unit(run, name, size)}{turn} {_times(len(rows))} while moving the other "
-            f"way, first at row {rows[0]}: an encoder that wraps; unwrap it (numpy.unwrap) before loading",
-        )
-    ]  # fmt: skip
+    yield Finding(
+        "wrap", name,
+        f"output {name} jumps by {_with_unit(run, name, size)}{turn} {_times(len(rows))} while moving the other "
+        f"way, first at row {rows[0]}: an encoder that wraps; unwrap it (numpy.unwrap) before loading",
+    )  # fmt: skip
 
 
 def spectral_lines(u: Floats) -> tuple[int, int]:
@@ -350,40 +340,33 @@ def spectral_lines(u: Floats) -> tuple[int, int]:
     return int(np.sum(np.maximum(1, np.rint(lengths / LINE_BINS)))), int(np.argmax(size))
 
 
-def _excitation(run: Measured, inputs: list[str]) -> list[Finding]:
-    found = []
+def _excitation(run: Measured, inputs: list[str]) -> Iterator[Finding]:
     for name in inputs:
         lines, at = spectral_lines(run[name])
         if lines < 2 and at > 2:
             omega = 2 * math.pi * at / (run.length * run.step)
-            found.append(
-                Finding(
-                    "excitation", name,
-                    f"input {name} is one sine at {omega:.3g} rad/s: persistently exciting of order 2, so it fixes two "
-                    "numbers of an equation and no more; add frequencies (square, PRBS, multisine, chirp), or use this "
-                    "run for validation",
-                )
+            yield Finding(
+                "excitation", name,
+                f"input {name} is one sine at {omega:.3g} rad/s: persistently exciting of order 2, so it fixes two "
+                "numbers of an equation and no more; add frequencies (square, PRBS, multisine, chirp), or use this "
+                "run for validation",
             )  # fmt: skip
     for i, name in enumerate(inputs):
         for other in inputs[:i]:
             r = float(np.corrcoef(run[name], run[other])[0, 1])
             if abs(r) > TOGETHER:
-                found.append(
-                    Finding(
-                        "excitation", name,
-                        f"inputs {other} and {name} move together (correlation {r:.4f}): an equation that reads both "
-                        "cannot tell their effects apart; drive them one after the other, or by different signals",
-                    )
+                yield Finding(
+                    "excitation", name,
+                    f"inputs {other} and {name} move together (correlation {r:.4f}): an equation that reads both "
+                    "cannot tell their effects apart; drive them one after the other, or by different signals",
                 )  # fmt: skip
-    return found
 
 
-def excitation_for(run: Measured, structure: Structure) -> list[Finding]:
+def excitation_for(run: Measured, structure: Structure) -> Iterator[Finding]:
     """Whether the inputs have lines enough for the free numbers of each equation.
 
     In steady state a spectral line tells two numbers of every output that it reaches, a constant level one.
     """
-    found = []
     for item in structure.equations:
         inputs = [s for s in item.signals if s in run.inputs]
         # What is measured of the other outputs drives the equation, too.
@@ -397,27 +380,22 @@ def excitation_for(run: Measured, structure: Structure) -> list[Finding]:
         free = len(item.order_names) + len(item.coefficient_names)
         if free > known:
             listed = ", ".join(inputs) or "no input"
-            found.append(
-                Finding(
-                    "excitation", item.output,
-                    f"the equation of {item.output} has {free} free numbers, but {listed} fixes {known} in steady "
-                    "state: what the run tells beyond them comes from its start alone; add frequencies to the input, "
-                    "or fix orders or coefficients",
-                )
+            yield Finding(
+                "excitation", item.output,
+                f"the equation of {item.output} has {free} free numbers, but {listed} fixes {known} in steady "
+                "state: what the run tells beyond them comes from its start alone; add frequencies to the input, "
+                "or fix orders or coefficients",
             )  # fmt: skip
-    return found
 
 
-def _short(run: Measured, outputs: list[str]) -> list[Finding]:
+def _short(run: Measured, outputs: list[str]) -> Iterator[Finding]:
     if run.length < FEW_ROWS:
-        return [
-            Finding(
-                "short", "",
-                f"the run has {run.length} rows: too few for orders and coefficients; record at least {FEW_ROWS}, "
-                "better thousands",
-            )
-        ]  # fmt: skip
-    found = []
+        yield Finding(
+            "short", "",
+            f"the run has {run.length} rows: too few for orders and coefficients; record at least {FEW_ROWS}, "
+            "better thousands",
+        )  # fmt: skip
+        return
     for name in outputs:
         y = run[name]
         swing = float(np.std(y))
@@ -427,34 +405,27 @@ def _short(run: Measured, outputs: list[str]) -> list[Finding]:
         crossings = int(np.sum(np.diff(sides) != 0))
         tail = y[-y.size // 5 :]
         if crossings <= 2 and np.ptp(tail) > 0.1 * np.ptp(y):
-            found.append(
-                Finding(
-                    "short", name,
-                    f"output {name} passes its mean {_times(crossings)} in {run.duration:.4g} s and is still moving "
-                    "at the end: the run is shorter than what dominates it; record several times its slowest period",
-                )
+            yield Finding(
+                "short", name,
+                f"output {name} passes its mean {_times(crossings)} in {run.duration:.4g} s and is still moving "
+                "at the end: the run is shorter than what dominates it; record several times its slowest period",
             )  # fmt: skip
-    return found
 
 
-def _offset(run: Measured, name: str) -> list[Finding]:
-    y = run[name]
-    if is_rest(y):
-        return []
-    return [
-        Finding(
+def _offset(run: Measured, name: str) -> Iterator[Finding]:
+    if not is_rest(run[name]):
+        yield Finding(
             "offset", name,
-            f"output {name} starts at {_with_unit(run, name, float(y[0]))}, not at rest: initial terms will be "
+            f"output {name} starts at {_with_unit(run, name, float(run[name][0]))}, not at rest: initial terms will be "
             "estimated; if this is only the sensor's zero, subtract it, and start the run before the input moves",
-        )
-    ]  # fmt: skip
+        )  # fmt: skip
 
 
-def _drift(run: Measured, inputs: list[str], outputs: list[str]) -> list[Finding]:
+def _drift(run: Measured, inputs: list[str], outputs: list[str]) -> Iterator[Finding]:
     """A trend beside what first-order lags of the inputs, from fast to integrating, explain."""
     m = min(DRIFT_M, run.length - 1)
     if m < 4 * DRIFT_BLOCKS:
-        return []
+        return
     step = run.duration / m
     means = {n: _core.pulse_means(run[n] - run[n][0], m, run.intersample.get(n) == "zoh") for n in (*inputs, *outputs)}
     first = {n: _core.pulse_means(np.full(run.length, float(run[n][0])), m, True) for n in inputs}
@@ -464,7 +435,6 @@ def _drift(run: Measured, inputs: list[str], outputs: list[str]) -> list[Finding
     columns += [means[n] + first[n] for n in inputs]
     columns += [np.cumsum(means[n] + first[n]) for n in inputs]
     t = np.linspace(-0.5, 0.5, m)
-    found = []
     for name in outputs:
         y = means[name]
         free = [] if is_rest(run[name]) else [np.exp(-(t + 0.5) * run.duration / tau) for tau in times]
@@ -483,15 +453,12 @@ def _drift(run: Measured, inputs: list[str], outputs: list[str]) -> list[Finding
         spread = math.sqrt(sum(float(np.sum(b)) ** 2 for b in blocks)) / float(t_left @ t_left)
         size = float(np.std(y))
         if abs(slope) > DRIFT_SHARE * size and abs(slope) > DRIFT_SIGMAS * spread:
-            found.append(
-                Finding(
-                    "drift", name,
-                    f"output {name} drifts by about {_with_unit(run, name, slope)} over the run "
-                    f"({100 * abs(slope) / size:.0f} % of its deviation) beside what the inputs explain; let the "
-                    "sensor settle, or subtract a line if it is known to be the sensor's",
-                )
+            yield Finding(
+                "drift", name,
+                f"output {name} drifts by about {_with_unit(run, name, slope)} over the run "
+                f"({100 * abs(slope) / size:.0f} % of its deviation) beside what the inputs explain; let the "
+                "sensor settle, or subtract a line if it is known to be the sensor's",
             )  # fmt: skip
-    return found
 
 
 def _lagged(x: Floats, order: int) -> Floats:
@@ -499,12 +466,12 @@ def _lagged(x: Floats, order: int) -> Floats:
     return np.stack([x[order - k : x.size - k] for k in range(1, order + 1)])
 
 
-def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> list[Finding]:
+def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> Iterable[Finding]:
     """Whether what is new in an output comes back in what is new in an input."""
     rows = min(run.length, FEEDBACK_ROWS)
     if rows < 20 * FEEDBACK_ORDER:
         return []
-    found: list[tuple[float, Finding]] = []
+    pairs: list[tuple[float, Finding]] = []
     order = FEEDBACK_ORDER
     fed: list[tuple[str, Floats, Floats]] = []
     for name in inputs:
@@ -531,20 +498,18 @@ def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> list[Find
         parts = [np.sum(p) for p in np.array_split(a[:-k] * b[k:], FEEDBACK_PARTS)]
         if len({np.sign(p) for p in parts}) > 1:
             continue
-        finding = (
-            Finding(
-                "feedback", u_name,
-                f"input {u_name} answers what is new in output {y_name} {k} row{'s' if k > 1 else ''} later "
-                f"(correlation {r[k - 1]:.2g}): a closed loop, in which equation-error estimates are biased; use the "
-                "output error, and if you can a reference that moves the machine well",
-            )
+        finding = Finding(
+            "feedback", u_name,
+            f"input {u_name} answers what is new in output {y_name} {k} row{'s' if k > 1 else ''} later "
+            f"(correlation {r[k - 1]:.2g}): a closed loop, in which equation-error estimates are biased; use the "
+            "output error, and if you can a reference that moves the machine well",
         )  # fmt: skip
-        found.append((abs(r[k - 1]), finding))
+        pairs.append((abs(r[k - 1]), finding))
     # One loop is one fact; the strongest pair tells it.
-    best: dict[str, Finding] = {}
-    for _, finding in sorted(found, key=lambda pair: -pair[0]):
-        best.setdefault(finding.signal, finding)
-    return list(best.values())
+    strongest: dict[str, Finding] = {}
+    for _, finding in sorted(pairs, key=lambda pair: -pair[0]):
+        strongest.setdefault(finding.signal, finding)
+    return strongest.values()
 
 
 def _innovation(x: Floats, past: Floats) -> Floats:

@@ -51,6 +51,7 @@ class Term:
 
 
 def derivative(order: Order, signal: str) -> str:
+    """Write a signal with its order."""
     if not order.names and order.constant == 0:
         return signal
     text = str(order)

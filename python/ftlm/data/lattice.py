@@ -47,9 +47,7 @@ class Lattice:
             A name that is no free order, an interval out of range.
         """
         free = structure.order_names
-        for name in self.orders:
-            if name not in free and name != "alpha":
-                raise ModelError(f"lattice order {name!r} is no free order; free are {', '.join(free) or 'none'}")
+        check_lattice_names(self, structure)
         highest = [n for e in structure.equations for n in e.order.names if e.order.is_single]
         values: dict[str, tuple[float, ...]] = {}
         for name in free:
@@ -108,13 +106,7 @@ def lattice(step: float = STEP, alpha: tuple[float, float] = ALPHA, **orders: Va
 
 
 def check_lattice(lattice: Lattice | None) -> None:
-    """Refuse a lattice that is none.
-
-    Raises
-    ------
-    ModelError
-        Something else.
-    """
+    """Refuse a lattice that is none."""
     if not (lattice is None or isinstance(lattice, Lattice)):
         raise ModelError(f"lattice is {type(lattice).__name__}, not a Lattice; use ftlm.lattice(…)")
 
@@ -125,6 +117,7 @@ def axis_of(order: Order, values: Mapping[str, tuple[float, ...]]) -> list[float
 
 
 def check_lattice_names(given: Lattice | None, structure: Structure) -> None:
+    """Refuse a lattice that names an order which is not free."""
     for name in given.orders if given is not None else ():
         if name not in structure.order_names and name != "alpha":
             free = ", ".join(structure.order_names) or "none"
@@ -132,6 +125,7 @@ def check_lattice_names(given: Lattice | None, structure: Structure) -> None:
 
 
 def lattice_of(given: Lattice | None, part: Structure) -> Lattice | None:
+    """Return what a lattice says of a part of its structure."""
     if given is None:
         return None
     names = (*part.order_names, "alpha")

@@ -17,6 +17,7 @@ def is_run_name(name: object) -> bool:
 
 
 def check_run_name(name: object) -> None:
+    """Refuse what cannot be written into any file as the name of a run."""
     if not is_run_name(name):
         raise DataError(
             f"name={name!r} cannot name a run; use 1 to {_NAME_LENGTH} printable characters, not beginning with = + - @"
@@ -24,6 +25,7 @@ def check_run_name(name: object) -> None:
 
 
 def check_signal_name(name: object) -> None:
+    """Refuse what cannot be the name of a column or stand in an equation."""
     if not isinstance(name, str) or len(name) > _NAME_LENGTH or not _SIGNAL_NAME.fullmatch(name):
         raise DataError(
             f"{name!r} cannot name a signal; begin with a letter or _ and use letters, digits, _ . [ ] "

@@ -28,10 +28,12 @@ HELD: Intersample = "zoh"
 
 
 def grid_of(rows: int, step: float) -> Floats:
+    """Regular times from 0 [s]."""
     return np.arange(rows, dtype=np.float64) * step
 
 
 def locked(values: Floats) -> Floats:
+    """Return numbers that nobody can change any more, without a copy."""
     owner = np.ascontiguousarray(values)
     if owner.flags.writeable:
         owner.setflags(write=False)
@@ -40,25 +42,28 @@ def locked(values: Floats) -> Floats:
 
 
 def is_constant(values: Floats) -> bool:
+    """Whether all samples are equal."""
     return bool((values == values[0]).all())
 
 
 def checked_intersample(given: Mapping[str, str] | None, inputs: tuple[str, ...]) -> dict[str, Intersample]:
+    """Return what was said of inputs between rows, and refuse words that say nothing."""
     checked: dict[str, Intersample] = {}
     for signal, kind in as_mapping("intersample", {} if given is None else given).items():
         if signal not in inputs:
             raise DataError(
                 f"intersample=: {signal!r} is not an input{nearest(signal, inputs)}; the inputs are {listed(inputs)}"
             )
-        if kind not in ("zoh", "foh"):
+        if kind != "zoh" and kind != "foh":  # noqa: PLR1714 — the type checker follows this
             raise DataError(
                 f"intersample=: {kind!r} of input {signal!r} is unknown; use 'zoh' (held) or 'foh' (linear)"
             )
-        checked[signal] = "zoh" if kind == "zoh" else "foh"
+        checked[signal] = kind
     return checked
 
 
 def checked_step(step: object, argument: str) -> float:
+    """Return a time between rows [s]."""
     value = as_number(step)
     if value is None:
         raise DataError(f"{argument}={step!r} is not a number; give the time between rows in s")
@@ -68,6 +73,7 @@ def checked_step(step: object, argument: str) -> float:
 
 
 def as_number(given: object) -> float | None:
+    """Return a real number as a float, infinity for one beyond its range, None for anything else."""
     if isinstance(given, bool) or not isinstance(given, (int, float, np.integer, np.floating)):
         return None
     try:
@@ -82,9 +88,8 @@ def as_vector(given: object, thing: str) -> tuple[Floats, np.dtype[Any]]:
         mask = np.ma.getmaskarray(cast("Any", given))
         if mask.any():
             rows = np.flatnonzero(mask)
-            raise bad_rows(
-                thing, "masked (missing) value", int(rows[0]), rows.size, "remove or fill these rows yourself"
-            )
+            fill = "remove or fill these rows yourself"
+            raise bad_rows(thing, "masked (missing) value", int(rows[0]), rows.size, fill)
     try:
         array = np.asarray(given)
         # pandas columns that allow missing values come as objects although they hold numbers.
@@ -111,7 +116,6 @@ def as_vector(given: object, thing: str) -> tuple[Floats, np.dtype[Any]]:
 
 
 def _not_numbers(given: object, array: npt.NDArray[Any], thing: str) -> DataError:
-    way_out = "convert it to numbers first"
     if array.dtype.kind in "Mm":
         return bad_rows(thing, f"dates, not numbers ({array.dtype})", 0, array.size, "convert them to seconds first")
     if array.ndim == 0:
@@ -120,11 +124,10 @@ def _not_numbers(given: object, array: npt.NDArray[Any], thing: str) -> DataErro
     flat = list(given) if isinstance(given, (list, tuple)) and array.ndim == 1 else array.ravel().tolist()
     bad = [index for index, value in enumerate(flat) if not isinstance(value, (int, float, np.number, np.bool_))]
     if not bad:
-        return bad_rows(
-            thing, f"objects, not numbers (dtype {array.dtype})", 0, len(flat), "use np.asarray(x, dtype=float)"
-        )
+        what = f"objects, not numbers (dtype {array.dtype})"
+        return bad_rows(thing, what, 0, len(flat), "use np.asarray(x, dtype=float)")
     what = "missing value None" if flat[bad[0]] is None else f"{_short(flat[bad[0]])} is not a number"
-    return bad_rows(thing, what, bad[0], len(bad), way_out)
+    return bad_rows(thing, what, bad[0], len(bad), "convert it to numbers first")
 
 
 def _short(value: object) -> str:
@@ -133,6 +136,7 @@ def _short(value: object) -> str:
 
 
 def check_lengths(lengths: Mapping[str, int]) -> None:
+    """Refuse columns of different lengths; what most of them have is taken as right."""
     counts = list(lengths.values())
     expected = max(set(counts), key=lambda count: (counts.count(count), count))
     wrong = [(thing, count) for thing, count in lengths.items() if count != expected]
@@ -145,6 +149,7 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
 
 
 def check_values(values: Floats, thing: str, offset: int) -> None:
+    """Refuse what is not finite, and numbers whose squares overflow; ``offset`` is the number of the first row."""
     with np.errstate(invalid="ignore"):
         good = np.abs(values) <= LARGEST
     if good.all():
@@ -156,40 +161,28 @@ def check_values(values: Floats, thing: str, offset: int) -> None:
         raise bad_rows(thing, "NaN", first, count, "remove or fill these rows yourself, or avoid them with slice=")
     if math.isinf(value):
         raise bad_rows(thing, f"infinity ({value})", first, count, "correct these rows, or avoid them with slice=")
-    raise bad_rows(
-        thing,
-        f"{value!r} is larger than {LARGEST:g} and its square overflows",
-        first,
-        count,
-        "correct these rows, scale the signal, or avoid them with slice=",
-    )
+    what = f"{value!r} is larger than {LARGEST:g} and its square overflows"
+    raise bad_rows(thing, what, first, count, "correct these rows, scale the signal, or avoid them with slice=")
 
 
 def check_increasing(clock: Floats, thing: str, offset: int) -> None:
+    """Refuse a time that stands still or goes back."""
     steps = np.diff(clock)
     if (steps > 0).all():
         return
-    first = int(np.flatnonzero(~(steps > 0))[0])
-    if steps[first] == 0:
-        raise bad_rows(
-            thing,
-            f"repeated time {float(clock[first + 1])!r} s",
-            offset + first + 1,
-            int((steps == 0).sum()),
-            "remove the repeated rows, or write the time with more digits",
-        )
-    raise bad_rows(
-        thing,
-        f"decreasing time, {float(clock[first + 1])!r} s after {float(clock[first])!r} s",
-        offset + first + 1,
-        int((steps < 0).sum()),
-        "sort the rows, or split the file where the clock starts again",
-    )
+    before = int(np.flatnonzero(~(steps > 0))[0])
+    row, (earlier, later) = offset + before + 1, clock[before : before + 2].tolist()
+    if steps[before] == 0:
+        way_out = "remove the repeated rows, or write the time with more digits"
+        raise bad_rows(thing, f"repeated time {later!r} s", row, int((steps == 0).sum()), way_out)
+    way_out = "sort the rows, or split the file where the clock starts again"
+    raise bad_rows(thing, f"decreasing time, {later!r} s after {earlier!r} s", row, int((steps < 0).sum()), way_out)
 
 
 def regular_step(
     clock: Floats, thing: str, offset: int, resolution: float, known: float | None
 ) -> tuple[float, tuple[str, ...]]:
+    """Return the step of a regular time, in digits that read well, and what there is to say of its jitter."""
     count = clock.size - 1
     since = clock - clock[0]
     mean = float(since[-1]) / count
@@ -202,30 +195,18 @@ def regular_step(
         usual = float(np.median(steps))
         gaps = np.flatnonzero(steps > _GAP * usual)
         if gaps.size:
-            first = int(gaps[0])
-            raise bad_rows(
-                thing,
-                f"gap of {steps[first]:.6g} s where {usual:.6g} s is usual",
-                offset + first + 1,
-                gaps.size,
-                "load the part before or after it with slice=, or interpolate over it with resample=STEP",
-            )
+            what = f"gap of {steps[gaps[0]]:.6g} s where {usual:.6g} s is usual"
+            way_out = "load the part before or after it with slice=, or interpolate over it with resample=STEP"
+            raise bad_rows(thing, what, offset + int(gaps[0]) + 1, gaps.size, way_out)
         rows = np.flatnonzero(deviation > _JITTER * mean)
-        raise bad_rows(
-            thing,
-            f"jitter of up to {100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _JITTER:g} % allowed)",
-            offset + int(rows[0]),
-            rows.size,
-            "interpolate onto a regular grid with resample=STEP",
-        )
-    fact = (
-        (
-            f"time jitters by up to {100.0 * worst / mean:.2g} % of a step, the most at row "
-            f"{offset + int(deviation.argmax())}; it was taken as regular",
-        )
-        if worst > _JITTER_WORTH_SAYING * mean
-        else ()
-    )
+        share = f"{100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _JITTER:g} % allowed)"
+        way_out = "interpolate onto a regular grid with resample=STEP"
+        raise bad_rows(thing, f"jitter of up to {share}", offset + int(rows[0]), rows.size, way_out)
+    fact: tuple[str, ...] = ()
+    if worst > _JITTER_WORTH_SAYING * mean:
+        row = offset + int(deviation.argmax())
+        share = f"{100.0 * worst / mean:.2g} % of a step, the most at row {row}"
+        fact = (f"time jitters by up to {share}; it was taken as regular",)
     if known is not None:
         if not abs(known - mean) * count <= max(4.0 * resolution, 2.0 * worst, 1e-8 * mean):
             raise DataError(
@@ -261,13 +242,9 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
     start, stop = limits
     ends = clock[[0, -1]]
     if not np.isfinite(ends).all():
-        raise bad_rows(
-            thing,
-            "the first or last time is not finite",
-            0 if not np.isfinite(ends[0]) else clock.size - 1,
-            int((~np.isfinite(clock)).sum()),
-            "remove these rows; slice= counts from the first time",
-        )
+        row, count = 0 if not np.isfinite(ends[0]) else clock.size - 1, int((~np.isfinite(clock)).sum())
+        way_out = "remove these rows; slice= counts from the first time"
+        raise bad_rows(thing, "the first or last time is not finite", row, count, way_out)
     with np.errstate(over="ignore", invalid="ignore"):
         since = clock - clock[0]
         steps = np.diff(since)
@@ -293,6 +270,7 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
 def interpolated(
     since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
 ) -> dict[str, Floats]:
+    """Return signals on another step: held inputs by hold, all else linearly."""
     spans = float(since[-1]) / step
     if spans + 1 > _MOST_ROWS:
         raise DataError(f"resample={step!r} gives more than {_MOST_ROWS} rows; use a larger step")
@@ -308,5 +286,6 @@ def interpolated(
 
 
 def how_interpolated(behaviour: Mapping[str, Intersample]) -> str:
+    """Say what :func:`interpolated` does to each signal."""
     held = [signal for signal, kind in behaviour.items() if kind == "zoh"]
     return f"{'held: ' + ', '.join(held) + '; ' if held else ''}others linear; no anti-alias filter"

@@ -88,12 +88,6 @@ class Solved:
 
 
 def check_solved(model: object) -> None:
-    """Refuse what is no model.
-
-    Raises
-    ------
-    ModelError
-        Something else.
-    """
+    """Refuse what is no model."""
     if not isinstance(model, Solved):
         raise ModelError(f"model is {type(model).__name__}, not a Model; identify a structure or load a model first")

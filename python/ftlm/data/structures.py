@@ -335,6 +335,7 @@ ORDER_OF_COEFFICIENT = re.compile(r"^([abd])(\d+)$")
 
 
 def narrowed(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilter | None:
+    """Return what a sensor filter says of some signals."""
     if sensor is None:
         return None
     outputs = tuple(o for o in sensor.outputs if o in signals)

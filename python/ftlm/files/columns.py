@@ -30,6 +30,7 @@ class Column:
     matrix: str | None = None
 
     def numbers(self) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
+        """Return its numbers, or raise why there are none."""
         if self.problem is not None or self.values is None:
             raise self.problem or DataError(f"column {self.name!r} holds no numbers; choose another column")
         return self.values
@@ -75,6 +76,7 @@ class Pool:
         return tuple(name for name in self._columns if name)
 
     def described(self) -> str:
+        """Return what there is to choose from, in words."""
         skipped = {name: why for table in self._tables for name, why in table.skipped.items()}
         text = f"the columns are {listed(self.names)}"
         if skipped:
@@ -114,7 +116,7 @@ class Pool:
         """Return the time: the column asked for, or the one that names or places itself."""
         if spec is not None:
             return self.find(spec, "time")
-        found = []
+        clocks = []
         for table in self._tables:
             named = [
                 column
@@ -126,18 +128,18 @@ class Pool:
                     f"{table.path.name}: the columns {listed(column.name for column in named)} may all be the time; "
                     "name one with time="
                 )
-            found += named
-        if not found:
+            clocks += named
+        if not clocks:
             matrices = dict.fromkeys(column.matrix for column in used if column.matrix is not None)
-            found = [self._columns[f"{matrix}.1"] for matrix in matrices]
-        if not found:
+            clocks = [self._columns[f"{matrix}.1"] for matrix in matrices]
+        if not clocks:
             raise DataError(
                 "time: no column is called t, time, t_s, time_s, seconds or time [s]; "
                 f"name it with time=, or give the time between rows with step=; {self.described()}"
             )
-        for other in found[1:]:
-            _check_agreement(found[0], other)
-        return found[0]
+        for other in clocks[1:]:
+            _check_agreement(clocks[0], other)
+        return clocks[0]
 
 
 def _check_agreement(one: Column, other: Column) -> None:

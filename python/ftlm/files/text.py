@@ -50,6 +50,7 @@ class _Trouble:
 
 
 def read_text(path: Path) -> FileTable:
+    """Read the columns of one text file."""
     try:
         with open(path, "rb") as stream:
             return _parse_text(path, stream)
@@ -98,18 +99,11 @@ def _parse_text(path: Path, stream: BinaryIO) -> FileTable:
     if rows == 0:
         raise DataError(f"{path.name}: a header and no rows; choose a file that holds a record")
     values = np.concatenate(blocks).T.copy() if len(blocks) > 1 else blocks[0].T.copy()
-    found = names if names is not None else [f"c{index + 1}" for index in range(width)]
-    columns = [
-        Column(
-            variable=name,
-            name=name,
-            source=path,
-            values=values[index],
-            problem=troubles[index].error(name, path) if index in troubles else None,
-        )
-        for index, name in enumerate(found)
-    ]
-    return FileTable(path=path, columns=columns, text=True, header=header)
+    if names is None:
+        names = [f"c{index + 1}" for index in range(width)]
+    problems = [troubles[k].error(name, path) if k in troubles else None for k, name in enumerate(names)]
+    columns = [Column(name, name, path, *column) for name, *column in zip(names, values, problems, strict=True)]
+    return FileTable(path, columns, text=True, header=header)
 
 
 _SEPARATOR_WORDS: dict[str | None, str] = {";": "semicolon", "\t": "tab", ",": "comma", None: "white space"}

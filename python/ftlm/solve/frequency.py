@@ -103,6 +103,7 @@ class TransferFunctions:
 
 
 def systems(model: Solved, *, coupled: bool) -> list[tuple[str, ...]]:
+    """Outputs whose equations are solved together."""
     return [model.outputs] if coupled else [(o,) for o in model.outputs]
 
 
@@ -152,6 +153,7 @@ def _written(polynomial: Polynomial) -> tuple[tuple[float, float], ...]:
 
 
 def is_coupled(coupling: str) -> bool:
+    """Whether all equations act together; refuses what is no coupling."""
     if coupling not in ("simulated", "measured"):
         raise ModelError(f"coupling = {coupling!r} is not known; use 'simulated' or 'measured'")
     return coupling == "simulated"
@@ -229,6 +231,7 @@ def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulate
 
 
 def value_at(polynomial: Polynomial, s: NDArray[Any]) -> Complex:
+    """Value of a sum of powers at complex frequencies."""
     total = np.zeros(s.shape, dtype=np.complex128)
     for power, coefficient in polynomial.items():
         with np.errstate(divide="ignore", invalid="ignore"):
