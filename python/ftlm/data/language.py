@@ -86,13 +86,13 @@ class _Words:
         self.tokens: list[tuple[str, str, int]] = []
         at = 0
         while text[at:].strip():
-            found = _TOKEN.match(text, at)
-            if found is None:
+            token = _TOKEN.match(text, at)
+            if token is None:
                 start = at + len(text[at:]) - len(text[at:].lstrip())
                 raise ModelError(f"equation {text!r}: {text[start]!r} at character {start + 1} has no meaning there")
-            kind = str(found.lastgroup)
-            self.tokens.append((kind, found[kind], found.start(kind)))
-            at = found.end()
+            kind = str(token.lastgroup)
+            self.tokens.append((kind, token[kind], token.start(kind)))
+            at = token.end()
         self.position = 0
 
     def peek(self, ahead: int = 0) -> tuple[str, str, int]:
@@ -119,13 +119,7 @@ class _Words:
 
 
 def parse_equation(text: str) -> Equation:
-    """Read one equation; see :func:`equation`.
-
-    Raises
-    ------
-    ModelError
-        With the character at which the text stops being an equation.
-    """
+    """Read one equation; see :func:`equation`."""
     words = _Words(text)
     order, output = _parse_derivative(words)
     if words.take()[1] != "=":

@@ -125,15 +125,7 @@ def _affine(node: ast.expr) -> tuple[float, dict[str, float]]:
 def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
     """Values of one order: a number, ``"low:high:step"``, a tuple (low, high, step) or a list of numbers.
 
-    Returns
-    -------
-    float or tuple of float
-        A number if the order is fixed, else its values in ascending order.
-
-    Raises
-    ------
-    ModelError
-        A specification that is none of these, or an empty one.
+    Returns a number if the order is fixed, else its values in ascending order.
     """
     if isinstance(spec, str):
         parts = spec.split(":")
@@ -175,13 +167,7 @@ MAX_AXIS = 1_000_000
 
 
 def grid(name: str, low: float, high: float, step: float) -> tuple[float, ...]:
-    """Multiples of ``step`` from ``low`` to ``high``, both included, counted from ``low``.
-
-    Raises
-    ------
-    ModelError
-        A step that is not positive, an interval that is empty or outside [-3, 3], more than a million values.
-    """
+    """Multiples of ``step`` from ``low`` to ``high``, both included, counted from ``low``."""
     low, high, step = (real_number(f"order {name}", v) for v in (low, high, step))
     if not (math.isfinite(step) and step > 0):
         raise ModelError(f"order {name}: step {step:g} is not positive; the paper's is 0.05")

@@ -14,20 +14,7 @@ MOST_KEPT = 8
 
 
 def check_compatible(runs: Iterable[Run]) -> None:
-    """Raise unless all runs have the same inputs, outputs and units.
-
-    Steps, lengths, intersample behaviour and the order of the signals may differ.
-
-    Parameters
-    ----------
-    runs : iterable of Run
-        At least one.
-
-    Raises
-    ------
-    DataError
-        If there is no run, or names or units differ; the run and the signal are named.
-    """
+    """Refuse runs whose inputs, outputs or units differ; steps, lengths, holds and the order of signals may."""
     every = list(runs)
     if not every:
         raise DataError("runs: there is none; pass at least one run")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,14 +35,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     denominator: tuple[tuple[float, float], ...]
 
     def __post_init__(self) -> None:
-        """Refuse a filter that is none.
-
-        Raises
-        ------
-        ModelError
-            A number that is not finite, an order outside [0, 3], a denominator without a term, a numerator of a
-            higher order than the denominator.
-        """
+        """Refuse a filter that is none."""
         for part, terms in (("numerator", self.numerator), ("denominator", self.denominator)):
             for coefficient, order in terms:
                 if not (math.isfinite(coefficient) and 0 <= order <= MAX_ORDER):
@@ -67,23 +61,16 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def check_initial(initial: str | Iterable[float]) -> Initial:
-    """Refuse initial terms that are neither a known word nor exponents above -1.
-
-    Raises
-    ------
-    ModelError
-        With what is allowed.
-    """
-    if isinstance(initial, str):
-        if initial in ("auto", "rest", "caputo"):
-            return initial  # type: ignore[return-value]
-        raise ModelError(f"initial = {initial!r} is not known; use 'auto', 'rest', 'caputo' or exponents of t")
+    """Refuse initial terms that are neither a known word nor exponents above -1."""
+    if isinstance(initial, str) and initial in ("auto", "rest", "caputo"):
+        return initial  # type: ignore[return-value]
     try:
+        if isinstance(initial, str):
+            raise TypeError
         exponents = tuple(real_number("exponent of an initial term", e) for e in initial)
     except TypeError:
-        raise ModelError(
-            f"initial = {initial!r} is not known; use 'auto', 'rest', 'caputo' or exponents of t"
-        ) from None
+        words = "'auto', 'rest', 'caputo' or exponents of t"
+        raise ModelError(f"initial = {initial!r} is not known; use {words}") from None
     bad = next((e for e in exponents if not (math.isfinite(e) and -1 < e <= 10)), None)
     if bad is not None:
         raise ModelError(f"exponent {bad:g} of an initial term is outside (-1, 10]; t to this power is of no use")
@@ -211,23 +198,24 @@ class Structure:
                 continue
             if len(together) == len(self.equations):
                 return {"stage": self}
-            kept = replace(
-                self,
-                equations=tuple(together),
-                order_values={n: v for n, v in self.order_values.items() if n in names},
-                delay={},
-                free_delays={},
-                sensor_filter=None,
-                coefficient_law=(),
-            )
-            out[", ".join(e.output for e in together)] = replace(
-                kept,
-                delay={n: v for n, v in self.delay.items() if n in kept.signals},
-                free_delays={n: v for n, v in self.free_delays.items() if n in kept.signals},
-                sensor_filter=narrowed(self.sensor_filter, kept.signals),
-                name=f"{self.name}, {', '.join(kept.outputs)}",
-            )
+            out[", ".join(e.output for e in together)] = self._of(tuple(together), self.coupling)
         return out
+
+    def _of(self, equations: tuple[Equation, ...], coupling: Literal["measured", "simulated"]) -> Structure:
+        """What is known of some of the equations, free of laws between coefficients."""
+        orders = {n for e in equations for n in e.order_names}
+        signals = tuple(dict.fromkeys(s for e in equations for s in e.signals))
+        return replace(
+            self,
+            equations=equations,
+            order_values={n: v for n, v in self.order_values.items() if n in orders},
+            coupling=coupling,
+            delay={n: v for n, v in self.delay.items() if n in signals},
+            free_delays={n: v for n, v in self.free_delays.items() if n in signals},
+            sensor_filter=narrowed(self.sensor_filter, signals),
+            coefficient_law=(),
+            name=f"{self.name}, {', '.join(e.output for e in equations)}",
+        )
 
     def equation(self, output: str) -> Structure:
         """One equation of this structure alone, with measured coupling and free of order laws.
@@ -241,7 +229,7 @@ class Structure:
             No such output.
         """
         check_known("output", [output], self.outputs)
-        found = next(e for e in self.equations if e.output == output)
+        own = next(e for e in self.equations if e.output == output)
         modelled = [s for e in self.equations for s in e.signals if s in self.outputs]
 
         def freed(k: int, term: Term) -> Term:
@@ -253,18 +241,8 @@ class Structure:
             name = {"a": "beta", "b": "gamma", "d": "mu"}[paper[1]] + paper[2] if paper else f"nu_{output}_{k + 1}"
             return replace(term, order=Order(0.0, ((name, 1.0),)))
 
-        single = replace(found, terms=tuple(freed(k, t) for k, t in enumerate(found.terms)))
-        return replace(
-            self,
-            equations=(single,),
-            order_values={n: v for n, v in self.order_values.items() if n in single.order_names},
-            coupling="measured",
-            delay={n: v for n, v in self.delay.items() if n in single.signals},
-            free_delays={n: v for n, v in self.free_delays.items() if n in single.signals},
-            sensor_filter=narrowed(self.sensor_filter, single.signals),
-            coefficient_law=(),
-            name=f"{self.name}, {output}",
-        )
+        single = replace(own, terms=tuple(freed(k, t) for k, t in enumerate(own.terms)))
+        return self._of((single,), "measured")
 
     def with_orders(self, orders: Mapping[str, Values]) -> Structure:
         """Fix free orders (a number) or give them a lattice (see :func:`parse_values`).
@@ -321,9 +299,7 @@ class Structure:
         return "\n".join(str(e) for e in self.equations)
 
     def _repr_html_(self) -> str:
-        from html import escape  # noqa: PLC0415 — only notebooks need it
-
-        return f"<pre>{escape(str(self))}</pre>"
+        return f"<pre>{html.escape(str(self))}</pre>"
 
 
 def delay_name(signal: str) -> str:

@@ -6,8 +6,8 @@ import importlib
 import math
 import re
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -84,8 +84,8 @@ class Approximation:
         """Response of the approximation, shape (outputs, inputs, W)."""
         omega = np.asarray(w, dtype=np.float64)
         system = 1j * omega[:, None, None] * np.eye(self.states) - self.a
-        found = self.c @ np.linalg.solve(system, np.broadcast_to(self.b, (omega.size, *self.b.shape))) + self.d
-        return np.asarray(np.moveaxis(found, 0, -1), dtype=np.complex128)
+        response = self.c @ np.linalg.solve(system, np.broadcast_to(self.b, (omega.size, *self.b.shape))) + self.d
+        return np.asarray(np.moveaxis(response, 0, -1), dtype=np.complex128)
 
     def __str__(self) -> str:
         gain, phase = max(self.gain_error.values()), max(self.phase_error.values())
@@ -129,13 +129,16 @@ class _Builder:
         return len(self.a) - 1
 
     def matrices(self) -> tuple[Floats, Floats, Floats]:
-        n = len(self.a)
-        found = (np.zeros((n, n)), np.zeros((n, self.shape[0])), np.zeros((n, self.shape[1])))
-        for i in range(n):
-            for matrix, row in zip(found, (self.a[i], self.u[i], self.y[i]), strict=True):
-                for j, value in row.items():
-                    matrix[i, j] = value
-        return found
+        inputs, outputs = self.shape
+        return _dense(self.a, len(self.a)), _dense(self.u, inputs), _dense(self.y, outputs)
+
+
+def _dense(rows: Sequence[Mapping[int, float]], width: int) -> Floats:
+    matrix = np.zeros((len(rows), width))
+    for i, row in enumerate(rows):
+        for j, value in row.items():
+            matrix[i, j] = value
+    return matrix
 
 
 #: A signal inside the approximation: what it reads of states, inputs and outputs.
@@ -145,6 +148,15 @@ _Signal = tuple[dict[int, float], dict[int, float], dict[int, float]]
 def _scaled(signal: _Signal, factor: float) -> _Signal:
     x, u, y = ({i: factor * v for i, v in part.items()} for part in signal)
     return x, u, y
+
+
+def _sum(signals: Iterable[_Signal]) -> _Signal:
+    total: _Signal = ({}, {}, {})
+    for signal in signals:
+        for into, part in zip(total, signal, strict=True):
+            for j, v in part.items():
+                into[j] = into.get(j, 0.0) + v
+    return total
 
 
 def _filtered(builder: _Builder, signal: _Signal, power: float, band: tuple[float, float], order: int) -> _Signal:
@@ -224,11 +236,9 @@ def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> 
     # equation form one chain that adds up what every term feeds in (observer form): none runs away by itself, and what
     # a model does at rest and far below the band stays exact.
     filters: dict[tuple[str, float], _Signal] = {}
-    n = len(outputs)
-    states: list[dict[int, float]] = [{} for _ in outputs]
-    direct, loop = np.zeros((n, len(inputs))), np.zeros((n, n))
-    for i, item in enumerate(model.equations):
-        fed: dict[int, _Signal] = {}
+    read: list[_Signal] = []
+    for item in model.equations:
+        fed: dict[int, list[_Signal]] = {}
         for term in item.terms:
             eta = round(item.order.constant - term.order.constant, 9)
             whole = math.ceil(eta)
@@ -236,75 +246,59 @@ def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> 
             if key not in filters:
                 source = sources[term.signal]
                 filters[key] = _filtered(builder, source, key[1], reach, count) if key[1] > 0 else source
-            into = fed.setdefault(whole, ({}, {}, {}))
-            for total, part in zip(into, _scaled(filters[key], float(term.fixed or 0.0)), strict=True):
-                for j, v in part.items():
-                    total[j] = total.get(j, 0.0) + v
+            fed.setdefault(whole, []).append(_scaled(filters[key], float(term.fixed or 0.0)))
         behind: _Signal = ({}, {}, {})
         for level in range(max(fed), 0, -1):
-            x, u, y = (dict(part) for part in fed.get(level, ({}, {}, {})))
-            for j, v in behind[0].items():
-                x[j] = x.get(j, 0.0) + v
-            behind = ({builder.state(x, u, y): 1.0}, {}, {})
-        states[i] = behind[0]
-        x, u, y = fed.get(0, ({}, {}, {}))
-        for j, v in x.items():
-            states[i][j] = states[i].get(j, 0.0) + v
-        for j, v in u.items():
-            direct[i, j] += v
-        for j, v in y.items():
-            loop[i, j] += v
+            behind = ({builder.state(*_sum([*fed.get(level, []), behind])): 1.0}, {}, {})
+        read.append(_sum([behind, *fed.get(0, [])]))
     a, b, feedback = builder.matrices()
-    read = np.zeros((n, a.shape[0]))
-    for i, row in enumerate(states):
-        for j, v in row.items():
-            read[i, j] = v
-    solved = np.eye(n) - loop
+    reads, direct, loop = (
+        _dense(rows, width)
+        for rows, width in zip(zip(*read, strict=True), (len(a), len(inputs), len(outputs)), strict=True)
+    )
+    solved = np.eye(len(outputs)) - loop
     if abs(float(np.linalg.det(solved))) < 1e-12:
         raise ModelError(
             f"the equations of {', '.join(outputs)} cannot be solved for them: they are no more than a loop"
         )
-    c: Floats = np.asarray(np.linalg.solve(solved, read), dtype=np.float64)
+    c: Floats = np.asarray(np.linalg.solve(solved, reads), dtype=np.float64)
     d: Floats = np.asarray(np.linalg.solve(solved, direct), dtype=np.float64)
     a, b = a + feedback @ c, b + feedback @ d
-    return _judged(
-        model, Approximation(a, b, c, d, outputs, inputs, (low, high), count, {}, {}, stable=True, warnings=())
-    )
+    unjudged = Approximation(a, b, c, d, outputs, inputs, (low, high), count, {}, {}, stable=True, warnings=())
+    return _judged(model, unjudged)
 
 
-def _judged(model: Solved, found: Approximation) -> Approximation:
-    omega = np.geomspace(*found.band, COMPARED)
+def _judged(model: Solved, system: Approximation) -> Approximation:
+    """Say how far off an approximation is, and how much of what it says of stability holds."""
+    low, high = system.band
+    omega = np.geomspace(low, high, COMPARED)
     exact = frequency_response(model, omega, sensor=False)
-    got = found.frequency_response(omega)
+    got = system.frequency_response(omega)
     gain, phase = {}, {}
-    for i, output in enumerate(found.outputs):
-        for j, signal in enumerate(found.inputs):
+    for i, output in enumerate(system.outputs):
+        for j, signal in enumerate(system.inputs):
             if not np.any(exact[i, j]):
                 continue
             with np.errstate(divide="ignore", invalid="ignore"):
                 quotient = got[i, j] / exact[i, j]
                 gain[output, signal] = float(np.max(np.abs(20 * np.log10(np.abs(quotient)))))
                 phase[output, signal] = float(np.degrees(np.max(np.abs(np.angle(quotient)))))
-    roots = np.linalg.eigvals(found.a)
-    stable = bool(np.all(roots.real < -AT_ORIGIN * found.band[0]))
+    roots = np.linalg.eigvals(system.a)
+    stable = bool(np.all(roots.real < -AT_ORIGIN * low))
     words = []
     worst_gain, worst_phase = max(gain.values(), default=0.0), max(phase.values(), default=0.0)
     if not (worst_gain <= GAIN_DB and worst_phase <= PHASE_DEGREES):
         words.append(
-            f"over {found.band[0]:g} to {found.band[1]:g} rad/s the approximation is off by up to {worst_gain:.2g} dB "
+            f"over {low:g} to {high:g} rad/s the approximation is off by up to {worst_gain:.2g} dB "
             f"and {worst_phase:.2g} degrees: a gain or phase margin smaller than that means nothing; raise order, or "
             "change the band"
         )
-    own = stability(model)
-    if own.unstable_poles != np.sum(roots.real > AT_ORIGIN * found.band[0]):
+    if stability(model).unstable_poles != np.sum(roots.real > AT_ORIGIN * low):
         words.append(
             "the approximation does not have as many unstable poles as the model: no stability margin of it holds for "
             "the model; raise order, or move the band"
         )
-    return Approximation(
-        found.a, found.b, found.c, found.d, found.outputs, found.inputs, found.band, found.order, gain, phase, stable,
-        tuple(words),
-    )  # fmt: skip
+    return replace(system, gain_error=gain, phase_error=phase, stable=stable, warnings=tuple(words))
 
 
 def to_control(model: Solved, *, band: tuple[float, float], order: int = 5) -> Any:
@@ -334,12 +328,12 @@ def to_control(model: Solved, *, band: tuple[float, float], order: int = 5) -> A
         control = importlib.import_module("control")
     except ImportError:
         raise ModelError("python-control is not installed; pip install 'ftlm[control]'") from None
-    found = approximate(model, band=band, order=order)
-    for words in found.warnings:
+    near = approximate(model, band=band, order=order)
+    for words in near.warnings:
         warnings.warn(words, UserWarning, stacklevel=2)
     system = control.ss(
-        found.a, found.b, found.c, found.d, inputs=list(found.inputs), outputs=list(found.outputs),
+        near.a, near.b, near.c, near.d, inputs=list(near.inputs), outputs=list(near.outputs),
         name=identifier(model.structure.name),
     )  # fmt: skip
-    system.approximation = found
+    system.approximation = near
     return system

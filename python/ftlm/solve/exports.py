@@ -110,13 +110,7 @@ def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) ->
 def export_text(
     model: Solved, to: Literal["control", "matlab", "json"], *, band: tuple[float, float] | None = None, order: int = 5
 ) -> str:
-    """A model as text for another tool.
-
-    Raises
-    ------
-    ModelError
-        Another tool, or no band where one is needed.
-    """
+    """A model as text for another tool; refuses another one, and no band where one is needed."""
     if to == "json":
         return json_text(model)
     if to == "matlab":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,7 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ftlm.base.arrays import Complex, Floats
 from ftlm.base.errors import DataError, ModelError
-from ftlm.data.equations import Equation
+from ftlm.data.equations import Equation, Term
+from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.solve.free_run import simulate
@@ -308,12 +310,10 @@ def with_numbers(model: Solved, numbers: Floats) -> Solved:
     return replace(model, structure=replace(model.structure, equations=tuple(equations)))
 
 
-def _unchecked(item: Equation, order: object, terms: tuple[object, ...]) -> Equation:
+def _unchecked(item: Equation, order: Order, terms: tuple[Term, ...]) -> Equation:
     """An equation whose orders may lie a hair outside of what a person may write, as a derivative at an edge needs."""
-    new = object.__new__(type(item))
-    object.__setattr__(new, "output", item.output)
-    object.__setattr__(new, "order", order)
-    object.__setattr__(new, "terms", terms)
+    new = copy.copy(item)
+    vars(new).update(order=order, terms=terms)
     return new
 
 

@@ -79,13 +79,7 @@ def default_m(runs: Sequence[Run], *, power_of_two: bool) -> int:
 
 
 def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
-    """Refuse an m that is no number of pulses, that a run does not carry, or that Haar coordinates cannot take.
-
-    Raises
-    ------
-    ModelError
-        Naming the run, what it carries and what to choose.
-    """
+    """Refuse an m that is no number of pulses, that a run does not carry, or that Haar coordinates cannot take."""
     m = check_pulses(m, math.inf)
     for run in runs:
         carried = run.length - 1
@@ -111,26 +105,9 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     """Pulse means of every signal of a structure, delays and sensor filter honoured.
 
     Outputs are point samples taken as linear in between; inputs hold or are linear as the run says; m may exceed the
-    run's own grid only where nothing is measured against it.
-
-    Parameters
-    ----------
-    run
-        The run.
-    structure
-        Whose signals are wanted.
-    m
-        Number of pulses.
-    filtered
-        Whether to put signals that were not measured through the sensor filter through it (equation error), or to
-        leave them (coupled free run).
-
-    Raises
-    ------
-    DataError
-        A signal that the run does not have, or one so small that its squares vanish.
-    ModelError
-        A delay of a signal that is no input, or a free delay.
+    run's own grid only where nothing is measured against it. ``filtered`` puts signals that were not measured through
+    the sensor filter through it (equation error); a coupled free run leaves them. Refuses signals that the run lacks,
+    those so small that their squares vanish, and delays of what is no input.
     """
     initial = structure.initial
     if initial == "auto":
@@ -239,17 +216,8 @@ def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
 
 
 def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_of_two: bool) -> list[Record]:
-    """Make the records of runs for an estimator on the equation error.
-
-    Raises
-    ------
-    DataError
-        A signal that a run lacks, a constant output, or a signal with a free coefficient that is 0 in all runs.
-    ModelError
-        An m that the runs do not carry.
-    """
-    chosen = default_m(runs, power_of_two=power_of_two) if m is None else m
-    m = check_m(chosen, runs, power_of_two=power_of_two)
+    """Make the records of runs for an estimator on the equation error, refusing what it cannot be given."""
+    m = check_m(default_m(runs, power_of_two=power_of_two) if m is None else m, runs, power_of_two=power_of_two)
     for run in runs:
         run.require_outputs([o for o in structure.outputs if o in run])
     prepared = records(runs, structure, m)
