@@ -54,19 +54,11 @@ class Run(Measured):
 
     @classmethod
     def from_arrays(
-        cls,
-        *,
-        step: float | None = None,
-        time: object = None,
-        inputs: Mapping[str, object] | None,
-        outputs: Mapping[str, object],
-        units: Mapping[str, str] | None = None,
-        intersample: Mapping[str, str] | None = None,
-        name: str = "run",
-        resample: float | None = None,
-        slice: Sequence[float | None] | None = None,
-        time_unit: str = "s",
-    ) -> Run:
+        cls, *, step: float | None = None, time: object = None, inputs: Mapping[str, object] | None,
+        outputs: Mapping[str, object], units: Mapping[str, str] | None = None,
+        intersample: Mapping[str, str] | None = None, name: str = "run", resample: float | None = None,
+        slice: Sequence[float | None] | None = None, time_unit: str = "s",
+    ) -> Run:  # fmt: skip
         """Make a run from one-dimensional arrays.
 
         Parameters
@@ -105,29 +97,21 @@ class Run(Measured):
             large; if lengths differ; if a name, unit or behaviour is unknown or used twice; if time is not finite,
             repeated, decreasing, jittered or has a gap; if `step` is not positive.
         """
-        return built(
-            Asked(
-                as_mapping("inputs", {} if inputs is None else inputs), as_mapping("outputs", outputs), step, time,
-                units, intersample, name, resample, slice, time_unit,
-            )
+        asked = Asked(
+            as_mapping("inputs", {} if inputs is None else inputs), as_mapping("outputs", outputs), step=step,
+            time=time, units=units, intersample=intersample, name=name, resample=resample, window=slice,
+            time_unit=time_unit,
         )  # fmt: skip
+        return built(asked)
 
     @classmethod
     def from_frame(
-        cls,
-        frame: object,
-        *,
-        time: Hashable | None = None,
-        step: float | None = None,
+        cls, frame: object, *, time: Hashable | None = None, step: float | None = None,
         inputs: Mapping[str, Hashable] | Sequence[str] | str | None,
-        outputs: Mapping[str, Hashable] | Sequence[str] | str,
-        units: Mapping[str, str] | None = None,
-        intersample: Mapping[str, str] | None = None,
-        name: str = "run",
-        resample: float | None = None,
-        slice: Sequence[float | None] | None = None,
-        time_unit: str = "s",
-    ) -> Run:
+        outputs: Mapping[str, Hashable] | Sequence[str] | str, units: Mapping[str, str] | None = None,
+        intersample: Mapping[str, str] | None = None, name: str = "run", resample: float | None = None,
+        slice: Sequence[float | None] | None = None, time_unit: str = "s",
+    ) -> Run:  # fmt: skip
         """Make a run from a pandas or polars frame, a dict of arrays or a structured NumPy array.
 
         Parameters
@@ -169,12 +153,12 @@ class Run(Measured):
         wanted = [names_to_columns(argument, given) for argument, given in (("inputs", inputs), ("outputs", outputs))]
         labels = {s: f"signal {s!r} (column {column!r})" for part in wanted for s, column in part.items()}
         given_inputs, given_outputs = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in wanted)
-        return built(
-            Asked(
-                given_inputs, given_outputs, step, clock, units, intersample, name, resample, slice, time_unit,
-                labels, "time" if time is None else f"time (column {time!r})",
-            )
+        asked = Asked(
+            given_inputs, given_outputs, step=step, time=clock, units=units, intersample=intersample, name=name,
+            resample=resample, window=slice, time_unit=time_unit, labels=labels,
+            time_label="time" if time is None else f"time (column {time!r})",
         )  # fmt: skip
+        return built(asked)
 
     def __repr__(self) -> str:
         lines = [self._headline()]
@@ -186,17 +170,11 @@ class Run(Measured):
 
     def _repr_html_(self) -> str:
         rows = "".join(
-            f"<tr><td>{html.escape(name)}</td><td>{role}</td><td>{html.escape(self._units[name])}</td>"
-            f"<td>{low:.6g}</td><td>{high:.6g}</td></tr>"
-            for name, role, low, high in (
-                (
-                    name,
-                    f"input ({self._intersample[name]})" if name in self._intersample else "output",
-                    float(self._data[name].min()),
-                    float(self._data[name].max()),
-                )
-                for name in self.signals
-            )
+            f"<tr><td>{html.escape(name)}</td>"
+            f"<td>{f'input ({self._intersample[name]})' if name in self._intersample else 'output'}</td>"
+            f"<td>{html.escape(self._units[name])}</td>"
+            f"<td>{self._data[name].min():.6g}</td><td>{self._data[name].max():.6g}</td></tr>"
+            for name in self.signals
         )
         warnings = "".join(f"<li>{html.escape(text)}</li>" for text in self.warnings)
         return (
@@ -278,16 +256,17 @@ class Run(Measured):
             if old not in self:
                 raise self._unknown(old)
             check_signal_name(new)
-        new_names = [mapping.get(name, name) for name in self.signals]
-        for index, name in enumerate(new_names):
-            if name in new_names[:index]:
+        renamed = {name: mapping.get(name, name) for name in self.signals}
+        names = list(renamed.values())
+        for index, name in enumerate(names):
+            if name in names[:index]:
                 raise DataError(f"rename: two signals would be called {name!r}; give every signal its own name")
         return self._with(
-            _data={mapping.get(name, name): values for name, values in self._data.items()},
-            inputs=tuple(mapping.get(name, name) for name in self.inputs),
-            outputs=tuple(mapping.get(name, name) for name in self.outputs),
-            _units={mapping.get(name, name): unit for name, unit in self._units.items()},
-            _intersample={mapping.get(name, name): kind for name, kind in self._intersample.items()},
+            inputs=tuple(renamed[name] for name in self.inputs),
+            outputs=tuple(renamed[name] for name in self.outputs),
+            _data={renamed[name]: values for name, values in self._data.items()},
+            _units={renamed[name]: unit for name, unit in self._units.items()},
+            _intersample={renamed[name]: kind for name, kind in self._intersample.items()},
         )
 
     def with_intersample(self, mapping: Mapping[str, str]) -> Run:
@@ -334,13 +313,8 @@ class Run(Measured):
         if not outputs:
             raise DataError(f"select: no output is left; keep at least one of {listed(self.outputs)}")
         inputs = tuple(name for name in kept if name in self.inputs)
-        return self._with(
-            _data={name: self._data[name] for name in inputs + outputs},
-            inputs=inputs,
-            outputs=outputs,
-            _units={name: self._units[name] for name in inputs + outputs},
-            _intersample={name: self._intersample[name] for name in inputs},
-        )
+        # The record keeps what is told of its own signals alone.
+        return self._with(inputs=inputs, outputs=outputs)
 
     def require_outputs(self, names: Iterable[str]) -> None:
         """Raise unless every name is an output of this run that an equation can be estimated from.
@@ -363,13 +337,9 @@ class Run(Measured):
                 )
             values = self._data[name]
             if is_constant(values):
-                raise bad_rows(
-                    f"output {name!r} of run {self.name!r}",
-                    f"constant, every row is {float(values[0])!r}",
-                    0,
-                    values.size,
-                    "check the sensor and the column, or load a part of the record in which it moves with slice=",
-                )
+                thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(values[0])!r}"
+                way_out = "check the sensor and the column, or load a part of the record in which it moves with slice="
+                raise bad_rows(thing, what, 0, values.size, way_out)
 
     def advice(self, structure: Structure | None = None) -> Advice:
         """What to know about this run before a model is identified from it, in sentences with numbers.

@@ -38,20 +38,13 @@ class _Wanted:
 
 
 def load(
-    path: PathLike | Sequence[PathLike],
-    *,
-    time: str | int | None = None,
+    path: PathLike | Sequence[PathLike], *, time: str | int | None = None,
     inputs: Mapping[str, str | int] | Sequence[str] | str | None = None,
-    outputs: Mapping[str, str | int] | Sequence[str] | str | None = None,
-    units: Mapping[str, str] | None = None,
-    columns: Mapping[str, object] | PathLike | None = None,
-    intersample: Mapping[str, str] | None = None,
-    step: float | None = None,
-    slice: Sequence[float | None] | None = None,
-    resample: float | None = None,
-    name: str | None = None,
-    time_unit: str = "s",
-) -> Run:
+    outputs: Mapping[str, str | int] | Sequence[str] | str | None = None, units: Mapping[str, str] | None = None,
+    columns: Mapping[str, object] | PathLike | None = None, intersample: Mapping[str, str] | None = None,
+    step: float | None = None, slice: Sequence[float | None] | None = None, resample: float | None = None,
+    name: str | None = None, time_unit: str = "s",
+) -> Run:  # fmt: skip
     """Load one run from a text, version-5 .mat or parquet file, or from several files that hold its columns.
 
     Parameters
@@ -134,15 +127,16 @@ def load(
     if name is None:
         stem = paths[0].stem
         name = header.name if header is not None else stem if is_run_name(stem) else "run"
-    known = Asked(
-        given_inputs, given_outputs, wanted.step, None if clock is None else clock.numbers(), wanted.units,
-        wanted.intersample, name, resample, slice, time_unit, labels,
-        "time" if clock is None else f"{clock.source.name}: column {clock.name!r} (time)",
+    asked = Asked(
+        given_inputs, given_outputs, step=wanted.step, time=None if clock is None else clock.numbers(),
+        units=wanted.units, intersample=wanted.intersample, name=name, resample=resample, window=slice,
+        time_unit=time_unit, labels=labels,
+        time_label="time" if clock is None else f"{clock.source.name}: column {clock.name!r} (time)",
     )  # fmt: skip
     if header is not None:
         stated = header.step if clock is not None and clock.name == CSV_TIME else None
-        known = replace(known, known_step=stated, facts=header.warnings, about=header.about)
-    return built(known)
+        asked = replace(asked, known_step=stated, facts=header.warnings, about=header.about)
+    return built(asked)
 
 
 def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:
@@ -167,7 +161,7 @@ def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:
 
 def _size(path: Path) -> int:
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         try:
             beside = sorted(entry.name for entry in path.parent.iterdir())
@@ -176,17 +170,17 @@ def _size(path: Path) -> int:
         raise DataError(f"{str(path)!r} does not exist{nearest(path.name, beside)}; check the path") from None
     except (OSError, ValueError) as error:
         raise DataError(f"{str(path)!r} cannot be opened ({error}); check the path and its permissions") from None
-    if not stat.S_ISREG(found.st_mode):
+    if not stat.S_ISREG(status.st_mode):
         raise DataError(f"{str(path)!r} is not a file; pass the path of a file")
-    return found.st_size
+    return status.st_size
 
 
 def _tables(paths: list[Path]) -> list[FileTable]:
     read: dict[Path, FileTable] = {}
     for kind in (MATLAB, PARQUET):
-        found = [path for path in paths if path.suffix.lower() in kind.suffixes]
-        if found:
-            read |= dict(zip(found, read_apart(found, kind), strict=True))
+        own = [path for path in paths if path.suffix.lower() in kind.suffixes]
+        if own:
+            read |= dict(zip(own, read_apart(own, kind), strict=True))
     return [read[path] if path in read else read_text(path) for path in paths]
 
 
