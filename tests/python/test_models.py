@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 import stat
 import struct
 
@@ -12,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ftlm
-from ftlm.base.output import write_atomically
+from ftlm.base.output import COMMAND, PLAIN, RUN, check_free, check_new, write_atomically
 from ftlm.data.equations import numeric
 from ftlm.data.language import parse_equation
 from ftlm.data.orders import grid, parse_values
@@ -603,6 +604,29 @@ def test_a_file_that_cannot_be_written_is_an_error_in_words(tmp_path):
     with pytest.raises(ftlm.DataError, match="cannot be written"):
         full_model().save(f"{tmp_path}/nul\0.json")
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
+
+
+@pytest.mark.parametrize(
+    ("words", "exists", "folder", "missing"),
+    [
+        (PLAIN, "{} exists; {} with force=True (--force)", "{} exists; {} with force=True (--force)", "{} is no folder"),
+        (RUN, "'{}' exists; {} with force=True (--force)", "'{}' is a folder; give the name of a file in it",
+         "'{}' is no folder"),
+        (COMMAND, "{} exists; {} with --force", "{} is a folder; name a file in it", "{} is no folder"),
+    ],
+)  # fmt: skip
+def test_whether_a_file_may_be_written_is_said_in_the_words_of_who_asks(tmp_path, words, exists, folder, missing):
+    there, new = tmp_path / "there", tmp_path / "new"
+    there.touch()
+    way_out = "choose another name, or overwrite it"
+    for path, text in ((there, exists.format(there, way_out)), (tmp_path, folder.format(tmp_path, way_out))):
+        for check in (check_new, check_free):
+            with pytest.raises(ftlm.DataError, match=f"^{re.escape(text)}$"):
+                check(path, force=False, words=words)
+    with pytest.raises(ftlm.DataError, match=f"^{re.escape(missing.format(new))}; make it first$"):
+        check_free(None, new / "file", force=False, words=words)
+    check_free(there, new, None, force=True, words=words)
+    assert check_new(new / "file", force=False, words=words) == new / "file"
 
 
 def test_a_written_file_has_the_usual_permissions(tmp_path):

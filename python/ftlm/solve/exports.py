@@ -24,19 +24,20 @@ def _comment(text: str, mark: str) -> str:
 
 def json_text(model: Solved) -> str:
     """The transfer functions of a model as JSON, exact in powers and coefficients."""
-    found = transfer_functions(model)
+    transfer = transfer_functions(model)
     document = {
         "format": "ftlm-transfer-functions",
         "written_by": f"ftlm {__version__}",
         "name": model.structure.name,
-        "outputs": list(found.outputs),
-        "inputs": list(found.inputs),
+        "outputs": list(transfer.outputs),
+        "inputs": list(transfer.inputs),
         "units": dict(model.units),
-        "delay_s": found.delay,
+        "delay_s": transfer.delay,
         "meaning": "output = sum over inputs of (sum of c s^p) / (sum of c s^p) exp(-s delay); pairs are [c, p]",
-        "denominator": {o: [list(pair) for pair in pairs] for o, pairs in found.denominator.items()},
+        "denominator": {o: [list(pair) for pair in pairs] for o, pairs in transfer.denominator.items()},
         "numerator": {
-            o: {u: [list(pair) for pair in found.numerators[o, u]] for u in found.inputs} for o in found.outputs
+            o: {u: [list(pair) for pair in transfer.numerators[o, u]] for u in transfer.inputs}
+            for o in transfer.outputs
         },
         "equations": [str(e) for e in model.equations],
     }
@@ -45,7 +46,7 @@ def json_text(model: Solved) -> str:
 
 def matlab_text(model: Solved) -> str:
     """A MATLAB script: the transfer functions as vectors, and as FOMCON's ``fotf`` objects where FOMCON is there."""
-    found = transfer_functions(model)
+    transfer = transfer_functions(model)
 
     def vector(values: Sequence[float]) -> str:
         return "[" + " ".join(f"{v:.17g}" for v in values) + "]"
@@ -57,16 +58,16 @@ def matlab_text(model: Solved) -> str:
         "% FOMCON (https://fomcon.net) makes fotf objects of them; without it the vectors remain.",
     ]
     used: set[str] = set()
-    for output in found.outputs:
-        for signal in found.inputs:
-            top = found.numerators[output, signal]
+    for output in transfer.outputs:
+        for signal in transfer.inputs:
+            top = transfer.numerators[output, signal]
             if not top:
                 continue
             name = f"G_{identifier(output)}_{identifier(signal)}"
             while name in used:
                 name += "_"
             used.add(name)
-            bottom = found.denominator[output]
+            bottom = transfer.denominator[output]
             lines += [
                 "",
                 _comment(f"{output} from {signal}", "%"),
@@ -74,7 +75,7 @@ def matlab_text(model: Solved) -> str:
                 f"{name}.nb = {vector([p for _, p in top])};",
                 f"{name}.a = {vector([c for c, _ in bottom])};",
                 f"{name}.na = {vector([p for _, p in bottom])};",
-                f"{name}.delay = {found.delay[signal]:.17g};",
+                f"{name}.delay = {transfer.delay[signal]:.17g};",
                 "if exist('fotf', 'file')",
                 f"  {name} = fotf({name}.a, {name}.na, {name}.b, {name}.nb, {name}.delay);",
                 "end",
@@ -84,7 +85,7 @@ def matlab_text(model: Solved) -> str:
 
 def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) -> str:
     """A Python script that makes the python-control system, without ftlm."""
-    found = approximate(model, band=band, order=order)
+    near = approximate(model, band=band, order=order)
 
     def matrix(values: Floats) -> str:
         rows = ",\n    ".join(repr([float(v) for v in row]) for row in values)
@@ -93,15 +94,15 @@ def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) ->
     lines = [
         _comment(f"{model.structure.name}, written by ftlm {__version__}", "#"),
         *(_comment(numeric(e), "#") for e in model.equations),
-        *(_comment(line, "#") for line in str(found).splitlines()),
+        *(_comment(line, "#") for line in str(near).splitlines()),
         "import control",
         "import numpy as np",
         "",
-        f"A = {matrix(found.a)}",
-        f"B = {matrix(found.b)}",
-        f"C = {matrix(found.c)}",
-        f"D = {matrix(found.d)}",
-        f"system = control.ss(A, B, C, D, inputs={list(found.inputs)!r}, outputs={list(found.outputs)!r}, "
+        f"A = {matrix(near.a)}",
+        f"B = {matrix(near.b)}",
+        f"C = {matrix(near.c)}",
+        f"D = {matrix(near.d)}",
+        f"system = control.ss(A, B, C, D, inputs={list(near.inputs)!r}, outputs={list(near.outputs)!r}, "
         f"name={identifier(model.structure.name)!r})",
     ]
     return "\n".join(lines) + "\n"

@@ -216,10 +216,10 @@ def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulate
                 b[:, i, inputs.index(signal)] = scale * value_at(polynomial, s)
         singular = np.abs(np.linalg.det(a)) == 0
         a[singular] = np.eye(len(names))
-        found = np.linalg.solve(a, b)
-        found[singular] = np.where(b[singular] != 0, np.inf, 0)
+        response = np.linalg.solve(a, b)
+        response[singular] = np.where(b[singular] != 0, np.inf, 0)
         for i, name in enumerate(names):
-            out[model.outputs.index(name)] = found[:, i, :].T
+            out[model.outputs.index(name)] = response[:, i, :].T
     for k, name in enumerate(inputs):
         delay = model.structure.delay.get(name, 0.0)
         if delay:
@@ -273,13 +273,11 @@ def response_deviation(model: Solved, w: ArrayLike, *, coupling: str = "simulate
         step = DELTA * max(abs(value), 1e-3)
         if not np.any(covariance[k]):
             continue
-        sides = []
-        for sign in (1.0, -1.0):
-            moved = values.copy()
-            moved[k] += sign * step
-            sides.append(frequency_response(with_numbers(model, moved), w, coupling=coupling))
+        above, below = values.copy(), values.copy()
+        above[k], below[k] = value + step, value - step
+        higher, lower = (frequency_response(with_numbers(model, v), w, coupling=coupling) for v in (above, below))
         with np.errstate(divide="ignore", invalid="ignore"):
-            derivative[k] = (sides[0] - sides[1]) / (2 * step) / centre
+            derivative[k] = (higher - lower) / (2 * step) / centre
     matrix = np.asarray(covariance, dtype=np.float64)
     variances = [np.einsum("i...,ij,j...->...", part, matrix, part) for part in (derivative.real, derivative.imag)]
     gain, phase = (np.sqrt(np.maximum(v, 0.0)) for v in variances)
@@ -290,9 +288,7 @@ def model_numbers(model: Solved) -> Floats:
     """Every number of a model in one vector: of each equation alpha, then order and coefficient of each term."""
     numbers: list[float] = []
     for item in model.equations:
-        numbers.append(item.order.constant)
-        for term in item.terms:
-            numbers += [term.order.constant, float(term.fixed or 0.0)]
+        numbers += [item.order.constant, *(v for t in item.terms for v in (t.order.constant, float(t.fixed or 0.0)))]
     return np.array(numbers)
 
 
@@ -302,10 +298,10 @@ def with_numbers(model: Solved, numbers: Floats) -> Solved:
     equations = []
     for item in model.equations:
         alpha = replace(item.order, constant=next(at))
-        terms = []
-        for term in item.terms:
-            order = replace(term.order, constant=next(at))
-            terms.append(replace(term, order=order, coefficient=next(at) / term.factor))
+        # Arguments are taken in this order: an order, then its coefficient.
+        terms = [
+            replace(t, order=replace(t.order, constant=next(at)), coefficient=next(at) / t.factor) for t in item.terms
+        ]
         equations.append(_unchecked(item, alpha, tuple(terms)))
     return replace(model, structure=replace(model.structure, equations=tuple(equations)))
 
@@ -357,7 +353,7 @@ def step_response(model: Solved, time: ArrayLike, *, tolerance: float = 1e-6) ->
         drive = {n: np.full(t.size, float(n == name)) for n in inputs}
         rest = {n: np.zeros(t.size) for n in model.outputs}
         run = Run.from_arrays(step=step, inputs=drive, outputs=rest, name=f"unit step of {name}")
-        found = simulate(together, run, tolerance=tolerance)
+        stepped = simulate(together, run, tolerance=tolerance)
         for i, output in enumerate(model.outputs):
-            out[i, k] = found[output]
+            out[i, k] = stepped[output]
     return out

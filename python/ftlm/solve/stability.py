@@ -72,23 +72,20 @@ class Stability:
 
 
 def _characteristic(model: Solved, *, coupled: bool) -> list[Polynomial]:
-    found = []
-    for names in systems(model, coupled=coupled):
-        items = [e for e in model.equations if e.output in names]
-        found.append(determinant([row_of(e, names)[0] for e in items]))
-    return found
+    return [
+        determinant([row_of(e, names)[0] for e in model.equations if e.output in names])
+        for names in systems(model, coupled=coupled)
+    ]
 
 
 def common_base(powers: Sequence[float]) -> float | None:
     """Largest q of which all powers are multiples, or None where it is below 0.01."""
-    fractions = [Fraction(p).limit_denominator(1000) for p in powers if abs(p) > GRAIN]
-    if any(abs(float(f) - p) > 1e-8 for f, p in zip(fractions, [p for p in powers if abs(p) > GRAIN], strict=True)):
+    powers = [p for p in powers if abs(p) > GRAIN]
+    fractions = [Fraction(p).limit_denominator(1000) for p in powers]
+    if any(abs(float(f) - p) > 1e-8 for f, p in zip(fractions, powers, strict=True)):
         return None
-    base = Fraction(0)
-    for f in fractions:
-        base = Fraction(
-            math.gcd(base.numerator * f.denominator, f.numerator * base.denominator), base.denominator * f.denominator
-        )
+    common = math.lcm(*(f.denominator for f in fractions))
+    base = Fraction(math.gcd(*(int(f * common) for f in fractions)), common)
     # Above 1 one root would stand for several poles.
     base /= max(math.ceil(base), 1)
     return float(base) if base * 1000 >= 999 * SMALLEST_BASE else None
@@ -133,7 +130,7 @@ def poles(model: Solved, *, coupling: str = "simulated") -> Complex:
     ModelError
         Orders without a common base, or a degree in it above 100.
     """
-    found: list[complex] = []
+    every: list[complex] = []
     for polynomial in _characteristic(model, coupled=is_coupled(coupling)):
         roots = _roots(polynomial)
         if roots is None:
@@ -147,8 +144,8 @@ def poles(model: Solved, *, coupling: str = "simulated") -> Complex:
         if abs(base - 1) < GRAIN:
             kept = values  # whole orders have one sheet, the negative real axis included
         # Principal logarithm: arg s = arg(lambda) / q lies within (-pi, pi) by the choice above.
-        found += (np.abs(kept) ** (1 / base) * np.exp(1j * np.angle(kept) / base)).tolist()
-    return np.array(sorted(found, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
+        every += (np.abs(kept) ** (1 / base) * np.exp(1j * np.angle(kept) / base)).tolist()
+    return np.array(sorted(every, key=lambda s: (abs(s), s.imag)), dtype=np.complex128)
 
 
 def stability(model: Solved, *, coupling: str = "simulated") -> Stability:
@@ -191,12 +188,12 @@ def stability(model: Solved, *, coupling: str = "simulated") -> Stability:
         else:
             count, near = right_zeros(polynomial)
             unstable, on_axis, method = unstable + count, on_axis or near, "argument principle"
-    found = transfer_functions(model, coupling=coupling)
+    transfer = transfer_functions(model, coupling=coupling)
     origin = 0.0
-    for output, pairs in found.denominator.items():
+    for output, pairs in transfer.denominator.items():
         lowest = min(p for _, p in pairs)
-        for signal in found.inputs:
-            top = [p for _, p in found.numerators[output, signal]]
+        for signal in transfer.inputs:
+            top = [p for _, p in transfer.numerators[output, signal]]
             origin = max(origin, round(lowest - min(top), 9)) if top else origin
     good = unstable == 0 and not on_axis and origin <= 0
     return Stability(good, unstable, max(origin, 0.0), on_axis, method, base if method == "poles" else None)
