@@ -606,15 +606,17 @@ def test_a_file_that_cannot_be_written_is_an_error_in_words(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["folder"]
 
 
+FORCED = "exists; {} with force=True (--force)"
+
+
 @pytest.mark.parametrize(
     ("words", "exists", "folder", "missing"),
     [
-        (PLAIN, "{} exists; {} with force=True (--force)", "{} exists; {} with force=True (--force)", "{} is no folder"),
-        (RUN, "'{}' exists; {} with force=True (--force)", "'{}' is a folder; give the name of a file in it",
-         "'{}' is no folder"),
+        (PLAIN, f"{{}} {FORCED}", f"{{}} {FORCED}", "{} is no folder"),
+        (RUN, f"'{{}}' {FORCED}", "'{}' is a folder; give the name of a file in it", "'{}' is no folder"),
         (COMMAND, "{} exists; {} with --force", "{} is a folder; name a file in it", "{} is no folder"),
     ],
-)  # fmt: skip
+)
 def test_whether_a_file_may_be_written_is_said_in_the_words_of_who_asks(tmp_path, words, exists, folder, missing):
     there, new = tmp_path / "there", tmp_path / "new"
     there.touch()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -52,15 +53,11 @@ class Pool:
 
     def __init__(self, tables: list[FileTable]) -> None:
         self._tables = tables
-        owners: dict[str, set[Path]] = {}
-        for table in tables:
-            for column in table.columns:
-                owners.setdefault(column.variable, set()).add(table.path)
+        files = Counter(variable for variable, _ in {(c.variable, t.path) for t in tables for c in t.columns})
         self._columns: dict[str, Column] = {}
         for table in tables:
             for column in table.columns:
-                shared = len(owners[column.variable]) > 1
-                prefix = f"{table.path.stem}/" if shared else ""
+                prefix = f"{table.path.stem}/" if files[column.variable] > 1 else ""
                 name = prefix + column.name
                 if name in self._columns and name:
                     raise DataError(
