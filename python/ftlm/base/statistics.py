@@ -15,6 +15,11 @@ REST_SIGMAS = 5.0
 REST_SHARE = 1e-3
 #: Median absolute deviation of a normal variable in units of its standard deviation.
 MAD = 0.6744897501960817
+#: Share of true models that a test is allowed to refuse.
+LEVEL = 0.01
+#: Half-widths of a 95 % and of a 99 % interval in standard deviations.
+NORMAL_95 = 1.959963984540054
+NORMAL_99 = NormalDist().inv_cdf(1 - LEVEL / 2)
 
 
 def is_rest(samples: Floats) -> bool:
@@ -31,8 +36,15 @@ def noise_of(samples: Floats) -> float:
     return float(np.median(np.abs(np.diff(samples, 2)))) / MAD / float(np.sqrt(6.0)) if samples.size > 2 else 0.0
 
 
-#: Half-width of a 95 % interval in standard errors.
-NORMAL_95 = 1.959963984540054
+def ljung_box(correlations: Floats, count: int) -> float:
+    """Ljung and Box's sum over autocorrelations at lags from 1 of a series of ``count`` samples."""
+    return count * (count + 2) * float(np.sum(correlations**2 / (count - np.arange(1, correlations.size + 1))))
+
+
+def chi_squared_99(degrees: int) -> float:
+    """99 % quantile of chi-squared by Wilson and Hilferty, good to 0.3 % from five degrees of freedom."""
+    z = NormalDist().inv_cdf(1 - LEVEL)
+    return degrees * (1 - 2 / (9 * degrees) + z * math.sqrt(2 / (9 * degrees))) ** 3
 
 
 def is_white(series: Floats, lags: int = 25) -> bool:
@@ -42,19 +54,4 @@ def is_white(series: Floats, lags: int = 25) -> bool:
     if power == 0.0 or e.size <= lags + 1:
         return True
     correlations = np.array([float(e[k:] @ e[:-k]) / power for k in range(1, lags + 1)])
-    statistic = e.size * (e.size + 2) * float(np.sum(correlations**2 / (e.size - np.arange(1, lags + 1))))
-    # 99 % quantile of chi-squared by Wilson and Hilferty, good to 0.1 % at 25 degrees of freedom.
-    quantile = lags * (1 - 2 / (9 * lags) + 2.3263478740408408 * math.sqrt(2 / (9 * lags))) ** 3
-    return statistic <= quantile
-
-
-#: Share of true models that a test is allowed to refuse.
-LEVEL = 0.01
-#: Half-width of a 99 % band in standard deviations.
-NORMAL_99 = NormalDist().inv_cdf(1 - LEVEL / 2)
-
-
-def chi_squared_99(degrees: int) -> float:
-    """99 % quantile of chi-squared by Wilson and Hilferty, good to 0.3 % from five degrees of freedom."""
-    z = NormalDist().inv_cdf(1 - LEVEL)
-    return degrees * (1 - 2 / (9 * degrees) + z * math.sqrt(2 / (9 * degrees))) ** 3
+    return ljung_box(correlations, e.size) <= chi_squared_99(lags)

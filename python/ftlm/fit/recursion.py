@@ -78,7 +78,7 @@ def multi_innovation_trace(
     -----
     O(m k^3) for the recursion and one division of series for each step given.
     """
-    settings = Settings.check("output-error", "l1", "multi-innovation", innovation_length, prior_covariance, rows, 1, 1)
+    settings = Settings.check(innovation_length=innovation_length, prior_covariance=prior_covariance, rows=rows)
     if len(equation.equations) != 1 or equation.order_names:
         raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
     stride = whole_number(every)
