@@ -15,10 +15,10 @@ from ftlm.base.arrays import Floats
 from ftlm.base.checks import check_threads, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
-from ftlm.data.lattice import Lattice, axis_of
+from ftlm.data.lattice import Lattice
 from ftlm.data.orders import Order
 from ftlm.data.structures import Structure
-from ftlm.solve.records import Record, initial_tuple
+from ftlm.solve.records import Record, initial_tuple, lattice_tuple
 
 #: Orders are coded in steps of this, the digits that the paper prints and fewer; regressors are then shared.
 RESOLUTION = 0.001
@@ -164,13 +164,8 @@ class _Problem:
         """Size of the lattice; under a law an upper bound of it."""
         if self.law:
             return math.prod(len(v) for v in values.values())
-        item, first = structure.equations[0], records[0]
-        axes = [
-            (first.signals.index(t.signal), axis_of(t.order, values), bool(t.order.names) and t.fixed is None)
-            for t in item.terms
-        ]
-        orders = (first.signals.index(item.output), axis_of(item.order, values), axes)
-        return _core.lattice_size(orders, list(first.inputs))
+        orders = lattice_tuple(structure.equations[0], records[0].signals, values)
+        return _core.lattice_size(orders, list(records[0].inputs))
 
     def tidy(self, genes: Floats) -> Floats:
         """Orders in whole steps."""

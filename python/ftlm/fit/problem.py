@@ -12,15 +12,10 @@ import numpy as np
 from ftlm.base.arrays import Floats
 from ftlm.data.orders import MAX_ORDER, Order
 from ftlm.data.structures import Structure, delay_name
+from ftlm.solve.records import affine
 
 #: Own bounds of orders where the structure gives none.
 ALPHA_BOUNDS = (0.05, MAX_ORDER)
-
-
-def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
-    """An order as the core takes it: its constant and its weight of each free order."""
-    weights = dict(order.weights)
-    return order.constant, [weights.get(n, 0.0) for n in names]
 
 
 @dataclass(frozen=True)
@@ -80,13 +75,10 @@ class FreeProblem:
         ratios = {
             f for _, factors in self.products.values() for f in factors if f not in self.structure.coefficient_names
         }
-        out = []
-        for name, value in zip(self.coefficients, start, strict=True):
-            if plain or value == 0:
-                out.append("plain")
-            else:
-                out.append("excess" if name in ratios and value > 1 else "logarithm")
-        return out
+        return [
+            "plain" if plain or value == 0 else "excess" if name in ratios and value > 1 else "logarithm"
+            for name, value in zip(self.coefficients, start, strict=True)
+        ]
 
     def laws(self, signals: Sequence[str]) -> list[Any]:
         """Equations with affine orders and monomial coefficients."""

@@ -17,9 +17,17 @@ from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Hints, Structure
 from ftlm.fit.grid import Attempt
-from ftlm.fit.problem import ALPHA_BOUNDS, FreeProblem, affine
+from ftlm.fit.problem import ALPHA_BOUNDS, FreeProblem
 from ftlm.fit.resonance_scan import scan_equation
-from ftlm.solve.records import Record, initial_tuple, named_coefficients, named_signals, record
+from ftlm.solve.records import (
+    Record,
+    affine,
+    initial_tuple,
+    lattice_tuple,
+    named_coefficients,
+    named_signals,
+    record,
+)
 
 #: Pulses of the record on which starts are searched.
 START_M = 1024
@@ -286,14 +294,9 @@ def equation_rows(
 ) -> list[Row]:
     """Best rows of one equation whose orders are free by themselves."""
     signals = records[0].signals
-    values = [list(axes[o.names[0]]) if o.names else [o.constant] for o in (item.order, *(t.order for t in item.terms))]
-    terms = [
-        (signals.index(t.signal), axis, bool(t.order.names) and t.fixed is None)
-        for t, axis in zip(item.terms, values[1:], strict=True)
-    ]
     try:
         table = _core.search(
-            [r.core() for r in records], (signals.index(item.output), values[0], terms), list(records[0].inputs),
+            [r.core() for r in records], lattice_tuple(item, signals, axes), list(records[0].inputs),
             [t.fixed for t in item.terms], initial_tuple(records[0].initial), settings.core(), None,
         )  # fmt: skip
     except ModelError as error:
