@@ -76,15 +76,12 @@ def order_law(stage: int, input_order: Literal["published", "derived"] = "publis
 
 def flexible_link(
     *,
-    stage: Literal[1, 2, "both"] = 1,
-    input_order: Literal["published", "derived"] = "published",
-    coupling: Literal["simulated", "measured"] = "simulated",
-    cross_stage: bool = False,
-    friction: bool = False,
+    stage: Literal[1, 2, "both"] = 1, input_order: Literal["published", "derived"] = "published",
+    coupling: Literal["simulated", "measured"] = "simulated", cross_stage: bool = False, friction: bool = False,
     laws: Sequence[Literal["orders", "coefficients"]] = ("orders", "coefficients"),
     parameters: Literal["effective", "table-3"] = "effective",
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
-) -> Structure:
+) -> Structure:  # fmt: skip
     """Make the paper's structure (22)-(25): two equations a stage.
 
     Parameters
@@ -188,14 +185,12 @@ def _stage(
 
 
 def link_model(
-    *,
-    stage: Literal[1, 2, "both"] = 1,
+    *, stage: Literal[1, 2, "both"] = 1,
     parameters: Literal["effective", "table-3"] | Mapping[int, LinkParameters] = "effective",
-    orders: Mapping[str, float] | None = None,
-    coefficients: Mapping[str, float] | None = None,
+    orders: Mapping[str, float] | None = None, coefficients: Mapping[str, float] | None = None,
     input_order: Literal["published", "derived"] = "published",
     coupling: Literal["simulated", "measured"] = "simulated",
-) -> Model:
+) -> Model:  # fmt: skip
     """Make the arm with everything known: by default the integer-order model of the maker's manual.
 
     Parameters

@@ -99,19 +99,7 @@ def descend(
 
 @dataclass(frozen=True)
 class Grid:
-    """A problem on its runs, the samples and pulses on which residuals are taken, and what each output weighs.
-
-    Parameters
-    ----------
-    problem, runs
-        What is fitted, to what.
-    weights
-        By output, in units of which a residual costs.
-    every
-        Pulses a sample interval.
-    decimation
-        Each so many samples one counts.
-    """
+    """A problem on its runs, what each output weighs, pulses a sample interval, and of how many samples one counts."""
 
     problem: FreeProblem
     runs: Sequence[Run]
@@ -179,6 +167,7 @@ class Grid:
             try:
                 return max(attempt.level, self.descend(attempt, 1).level)
             except FtlmError:
+                # It has no finite free run there.
                 return math.inf
 
         costs = [worse(a) for a in attempts]

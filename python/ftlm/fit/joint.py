@@ -135,30 +135,14 @@ class JointFit:
 
 
 def fit_output_error(
-    runs: Sequence[Run],
-    structure: Structure,
-    *,
-    threads: int = 1,
-    start: Mapping[str, float] | None = None,
-    refine: bool = True,
-    progress: Callable[[int, int], None] | None = None,
-) -> JointFit:
+    runs: Sequence[Run], structure: Structure, *, threads: int = 1, start: Mapping[str, float] | None = None,
+    refine: bool = True, progress: Callable[[int, int], None] | None = None,
+) -> JointFit:  # fmt: skip
     """Fit all equations of a structure on all runs by output error, from an automatic start.
 
-    Parameters
-    ----------
-    runs
-        Runs with the same names and units.
-    structure
-        Free orders and coefficients; a stated coefficient law is imposed. Its initial terms must be decided.
-    threads
-        Threads of the starts.
-    start
-        Values of all free orders, coefficients and delays by name, instead of the automatic start.
-    refine
-        Whether to refine the grid below the samples until it does not matter.
-    progress
-        Called with (starts done, starts in all).
+    A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
+    everything free by name; without `refine` the grid is not refined below the samples. Progress is told (starts done,
+    starts in all).
 
     Raises
     ------
@@ -265,15 +249,9 @@ def joint_fit(optimum: Optimum, starts: list[tuple[float, str]]) -> JointFit:
     return JointFit(
         orders=dict(zip(problem.orders, orders, strict=True)),
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
-        covariance=covariance(best, grid),
+        delays=dict(zip(problem.delays, delays, strict=True)), products=dict(problem.products),
+        covariance=covariance(best, grid), residuals=grid.residuals(best),
         noise={o: level / w for (o, level), w in zip(levels.items(), grid.weights, strict=True)},
-        cost=float(best.outcome["cost"]),
-        samples=len(best.outcome["residuals"]),
-        refinement=grid.every,
-        settled=optimum.settled,
-        converged=best.converged,
-        starts=starts,
-        residuals=grid.residuals(best),
-        products=dict(problem.products),
-        delays=dict(zip(problem.delays, delays, strict=True)),
-    )
+        cost=float(best.outcome["cost"]), samples=len(best.outcome["residuals"]), refinement=grid.every,
+        settled=optimum.settled, converged=best.converged, starts=starts,
+    )  # fmt: skip

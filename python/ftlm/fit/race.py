@@ -67,17 +67,7 @@ class Laps:
 
 
 def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None) -> list[Attempt]:
-    """Coarse fits from all starts, best first.
-
-    Parameters
-    ----------
-    alike
-        All samples, every output weighing alike.
-    floor
-        Cost per residual that noise alone leaves.
-    threads, progress
-        See :func:`ftlm.identify`.
-    """
+    """Coarse fits from all starts, best first, every output weighing alike; noise alone leaves `floor` per residual."""
     problem, runs = alike.problem, alike.runs
     starts = delayed_attempts(runs, problem, threads)
     laps = Laps(len(starts), threads, progress)

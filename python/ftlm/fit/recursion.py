@@ -42,15 +42,9 @@ class Trace:
 
 
 def multi_innovation_trace(
-    run: Run,
-    equation: Structure,
-    *,
-    innovation_length: int = 7,
-    prior_covariance: float = 1.0,
-    rows: Literal["haar", "time"] = "haar",
-    m: int | None = None,
-    every: int = 1,
-) -> Trace:
+    run: Run, equation: Structure, *, innovation_length: int = 7, prior_covariance: float = 1.0,
+    rows: Literal["haar", "time"] = "haar", m: int | None = None, every: int = 1,
+) -> Trace:  # fmt: skip
     """Run the recursion (44) step by step: coefficients, and error (45) of the model they make, after every step.
 
     Parameters

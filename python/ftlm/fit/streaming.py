@@ -41,15 +41,9 @@ class Streaming:
     """
 
     def __init__(
-        self,
-        structure: Structure,
-        *,
-        step: float,
-        longest: float,
-        inputs: Sequence[str] = ("I1", "I2"),
-        innovation_length: int = 7,
-        prior_covariance: float = 1.0,
-    ) -> None:
+        self, structure: Structure, *, step: float, longest: float, inputs: Sequence[str] = ("I1", "I2"),
+        innovation_length: int = 7, prior_covariance: float = 1.0,
+    ) -> None:  # fmt: skip
         if structure.order_names:
             raise ModelError(
                 f"the orders {', '.join(structure.order_names)} are free; a stream needs numbers: give them with "

@@ -180,9 +180,7 @@ def coupled_rank(task: Task, settings: Settings, m: int | None, search: SearchRe
     return rank
 
 
-def by_genetic_algorithm(
-    task: Task, settings: Genetic, norm: str, m: int | None, threads: int | None, progress: Told
-) -> Fit:
+def by_genetic_algorithm(task: Task, settings: Genetic, norm: str, m: int | None, threads: int, progress: Told) -> Fit:
     """Orders and coefficients by a genetic algorithm: each equation alone, or all under their order law."""
     structure = task.structure
     parts = {"stage": structure} if structure.has_order_law else {o: structure.equation(o) for o in structure.outputs}

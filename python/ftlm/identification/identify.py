@@ -8,7 +8,6 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Literal
 
-from ftlm.base.checks import check_threads
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.lattice import Lattice, check_lattice, check_lattice_names
 from ftlm.data.run import Run
@@ -122,9 +121,9 @@ def identify(
         raise ModelError(f"store= and executor= are for order searches, and {why}; leave them out")
     task = Task(tuple(several), structure, lattice)
     if method == "output-error":
-        return judged(by_output_error(task, m, check_threads(threads), progress))
+        return judged(by_output_error(task, m, settings.threads, progress))
     if method == "genetic":
-        return judged(by_genetic_algorithm(task, genetic or Genetic(), norm, m, threads, progress))
+        return judged(by_genetic_algorithm(task, genetic or Genetic(), norm, m, settings.threads, progress))
     if executor is not None and threads is None:
         settings = replace(settings, threads=1)
     return judged(by_lattice(task, settings, m, progress, store, executor))

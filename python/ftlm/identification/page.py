@@ -48,11 +48,7 @@ TRACE_POINTS = 64
 
 
 def identification_page(
-    result: Judged,
-    path: str | os.PathLike[str],
-    *,
-    validation: Run | Sequence[Run] | None = None,
-    force: bool = False,
+    result: Judged, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
 ) -> Path:
     """Write the report of one identification.
 
@@ -108,12 +104,9 @@ def identification_page(
 
 
 def first_sections(
-    model: Model,
-    warnings: Sequence[str],
-    compared: Sequence[tuple[str, Comparison]],
-    validated: bool,
+    model: Model, warnings: Sequence[str], compared: Sequence[tuple[str, Comparison]], validated: bool,
     joint: JointFit | None,
-) -> list[Section]:
+) -> list[Section]:  # fmt: skip
     """Warnings, equations, errors, charts."""
     units = model.units
     words = [
@@ -128,14 +121,10 @@ def first_sections(
     # Two lines a chart, drawn once wide and once narrow with half the points.
     points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
     drawn = [f for label, c in compared for f in comparison_charts(c, units=units, label=label, points=points)]
-    stable = model.stability()
+    equations = [*(equation_html(e) for e in model.equations), f"As a whole, the model is {model.stability()}."]
     sections = [
         Section("Warnings", words[1:] if warned else words, warned),
-        Section(
-            "Equations",
-            [*(equation_html(e) for e in model.equations), f"As a whole, the model is {stable}."],
-            tables=[parameter_table(model, joint)],
-        ),
+        Section("Equations", equations, tables=[parameter_table(model, joint)]),
     ]
     if compared:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."

@@ -99,11 +99,7 @@ class Identification(Judged):
         return validate(self, runs)
 
     def report(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        validation: Run | Sequence[Run] | None = None,
-        force: bool = False,
+        self, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
     ) -> Path:
         """Write everything about this result as one HTML file that opens offline.
 
