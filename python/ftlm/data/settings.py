@@ -31,24 +31,11 @@ class Settings:
 
     @classmethod
     def check(
-        cls,
-        criterion: str = "output-error",
-        norm: str = "l1",
-        coefficients: str = "multi-innovation",
-        innovation_length: int = 7,
-        prior_covariance: float = 1.0,
-        rows: str = "haar",
-        keep: int = 20,
-        threads: int | None = None,
-        early_stopping: bool = True,
-    ) -> Settings:
-        """Refuse words and numbers that mean nothing.
-
-        Raises
-        ------
-        ModelError
-            Naming the argument and what it may be.
-        """
+        cls, criterion: str = "output-error", norm: str = "l1", coefficients: str = "multi-innovation",
+        innovation_length: int = 7, prior_covariance: float = 1.0, rows: str = "haar", keep: int = 20,
+        threads: int | None = None, early_stopping: bool = True,
+    ) -> Settings:  # fmt: skip
+        """Refuse words and numbers that mean nothing with a `ModelError` that names the argument."""
         for name, value, known in (
             ("criterion", criterion, ("output-error", "equation-error")),
             ("norm", norm, ("l1", "l2")),
