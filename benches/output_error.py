@@ -23,8 +23,9 @@ from scipy.special import binom, gamma
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
 
 import plants
+from ftlm.fit.grid import Attempt, descend, experiment
 from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import Attempt, FreeProblem, descend, experiment
+from ftlm.fit.problem import FreeProblem
 from ftlm.solve.records import record
 
 #: Factors on the true coefficients and shifts of the true orders from which both start.
@@ -77,7 +78,7 @@ def main() -> None:
     run, structure = plants.noisy_run("A", 40.0, 0), plants.structure("A")
     problem, truth = FreeProblem.of(structure), plants.truth("A")
     weights = [1.0 / (0.01 * float(np.std(plants.clean_run("A")[o]))) for o in structure.outputs]
-    prepared = [experiment(run, problem, "rest", weights)]
+    prepared = [experiment(run, problem, weights)]
     rec = record(run, structure, run.length - 1, filtered=False)
     signals = structure.signals
     orders = [
@@ -90,7 +91,7 @@ def main() -> None:
     start = time.perf_counter()
     rounds = 5
     for _ in range(rounds):
-        ours = descend(problem, prepared, signals, "rest", Attempt(orders, coefficients, "given", {}), evaluations=200)
+        ours = descend(problem, prepared, Attempt(orders, coefficients, "given", {}), evaluations=200)
     own = (time.perf_counter() - start) / rounds
 
     signs = np.sign(coefficients[:4])
@@ -113,11 +114,11 @@ def main() -> None:
     errors = np.array([plants.CRAMER_RAO_40_DB["A"][n] for n in (*problem.orders, *problem.coefficients)])
     apart = np.max(np.abs(back(theirs.x) - at) / errors)
     z = np.concatenate([at[:5], np.log(np.abs(at[5:9])), [np.log(at[9] - 1.0)]])
-    same = float(np.max(np.abs(residuals(z) - np.asarray(ours.found["residuals"]))))
+    same = float(np.max(np.abs(residuals(z) - np.asarray(ours.outcome["residuals"]))))
     # By processor time on one core, which other work on the machine does not stretch.
     start = time.process_time()
     for _ in range(rounds):
-        descend(problem, prepared, signals, "rest", Attempt(orders, coefficients, "given", {}), evaluations=200)
+        descend(problem, prepared, Attempt(orders, coefficients, "given", {}), evaluations=200)
     one = (time.process_time() - start) / rounds
     start = time.process_time()
     fit_output_error([run], structure, threads=1, refine=False)
@@ -131,9 +132,10 @@ def main() -> None:
     lines = [
         f"`python benches/output_error.py`, commit {commit.stdout.strip()}, {platform.machine()}:",
         "",
-        f"- P7, ten numbers, two outputs of 5 000 samples, 40 dB, same start: {own:.3f} s, {ours.found['evaluations']} "
-        f"evaluations, one core; SciPy on NumPy {rival:.1f} s, {theirs.nfev} evaluations: {rival / own:.0f} times; "
-        f"simulators differ by {same:.1g} of the noise; costs {ours.found['cost']:.4f} and {theirs.cost:.4f}, optima "
+        f"- P7, ten numbers, two outputs of 5 000 samples, 40 dB, same start: {own:.3f} s, "
+        f"{ours.outcome['evaluations']} evaluations, one core; SciPy on NumPy {rival:.1f} s, "
+        f"{theirs.nfev} evaluations: {rival / own:.0f} times; "
+        f"simulators differ by {same:.1g} of the noise; costs {ours.outcome['cost']:.4f} and {theirs.cost:.4f}, optima "
         f"{apart:.1g} standard errors apart",
         f"- automatic start with its fits, processor time: {whole:.2f} s, {whole / one:.0f} times that of the fit "
         f"({one:.3f} s); wall time on {cores} cores {waited:.2f} s, {waited / own:.0f} times (promised 60); load "

@@ -24,8 +24,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 import plants
+from ftlm.fit.grid import Attempt, descend, experiment
 from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import Attempt, FreeProblem, descend, experiment
+from ftlm.fit.problem import FreeProblem
 from ftlm.paper.arm import demo_plant
 
 if TYPE_CHECKING:
@@ -103,10 +104,10 @@ def bias(names: Iterable[str]) -> Iterator[str]:
         split = len(problem.orders)
         before: np.ndarray | None = None
         for every in (1, 2, 4, 8, 16):
-            prepared = [experiment(run, problem, "rest", weights, every=every)]
+            prepared = [experiment(run, problem, weights, every=every)]
             start = Attempt(true[:split], true[split:], "truth", {})
-            end = descend(problem, prepared, structure.signals, "rest", start, evaluations=60, plain=True)
-            jacobian = np.asarray(end.found["jacobian"])
+            end = descend(problem, prepared, start, evaluations=60, plain=True)
+            jacobian = np.asarray(end.outcome["jacobian"])
             size = np.linalg.norm(jacobian, axis=1)
             scaled = jacobian / size[:, None]
             errors = np.sqrt(np.diag(np.linalg.inv(scaled @ scaled.T))) / size

@@ -12,8 +12,9 @@ from typer.testing import CliRunner
 import ftlm
 import plants
 from ftlm import _core, cli
+from ftlm.fit.grid import Attempt, descend, experiment
 from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import Attempt, FreeProblem, descend, experiment
+from ftlm.fit.problem import FreeProblem
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 
@@ -90,9 +91,9 @@ def test_an_input_that_is_linear_in_between_is_delayed_to_second_order():
     for every in (1, 2, 4):
         problem = FreeProblem.of(structure())
         run = late_run(DELAY, 200, 0, held=False)
-        prepared = [experiment(run, problem, "rest", [1.0], every=every)]
+        prepared = [experiment(run, problem, [1.0], every=every)]
         start = Attempt([2.2, 0.9], [plants.THREE_TERMS[n] for n in ("a1", "a0", "b0")], "truth", {}, [DELAY])
-        end = descend(problem, prepared, ("y", "u"), "rest", start, evaluations=40, plain=True)
+        end = descend(problem, prepared, start, evaluations=40, plain=True)
         errors.append(abs(end.delays[0] - DELAY))
     assert errors[0] < 0.02 * plants.clean_run("3T").step
     assert errors[2] < errors[0] / 6
@@ -178,7 +179,7 @@ def test_a_model_has_no_free_delay_and_no_second_name():
 
 def test_the_core_refuses_delays_that_are_none():
     problem = FreeProblem.of(structure())
-    prepared = [experiment(plants.noisy_run("3T", 40, 5), problem, "rest", [1.0])]
+    prepared = [experiment(plants.noisy_run("3T", 40, 5), problem, [1.0])]
 
     def core(delays):
         return _core.output_error(

@@ -2,10 +2,13 @@
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
+from msgspec import UNSET
 
 import ftlm
+from ftlm.search.orders import make_job
 
 FREE = {1: ("alpha1", "beta2", "alpha2", "gamma1", "mu2"), 2: ("alpha3", "beta4", "alpha4", "gamma3", "mu4")}
 
@@ -338,3 +341,14 @@ def test_the_whole_arm_is_one_joint_fit():
         for name, value in demo_plant(stage).orders.items():
             assert abs(found.orders[name] - value) < 5 * found.standard_errors[name], name
     assert min(found.fit_percent.values()) > 99
+
+
+def test_hints_are_kept_by_what_changes_a_structure_and_stand_in_no_file_text_or_comparison(clean_a):
+    structure = ftlm.flexible_link(stage=1, coupling="measured")
+    fixed = structure.with_orders({"alpha1": 2.0}).with_coefficients({"a1": 600.0})
+    assert fixed.hints.freed["a1"] == "beta1"
+    assert replace(structure, hints=UNSET) == structure
+    assert "hints" not in repr(structure) + str(structure)
+    job = make_job([clean_a], structure.equation("theta11"), ftlm.lattice(step=0.5), m=64, rows="time")
+    assert b"hints" not in msgspec.msgpack.encode(job.request("theta11"))
+    assert set(structure.equation("theta11").order_names) == {"alpha1", "beta1", "gamma1", "mu1"}

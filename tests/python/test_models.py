@@ -18,6 +18,7 @@ from ftlm.data.equations import numeric
 from ftlm.data.language import parse_equation
 from ftlm.data.orders import grid, parse_values
 from ftlm.data.structures import SensorFilter, check_initial
+from ftlm.model.file import ModelFile
 
 # ----------------------------------------------------------------------------------------------------------------------
 # Orders
@@ -651,7 +652,7 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 def altered(change):
     """The text of a model file after a change to its document."""
     model = full_model()
-    document = json.loads(__import__("msgspec").json.encode(model._to_file()))
+    document = json.loads(__import__("msgspec").json.encode(ModelFile.of(model)))
     change(document)
     return json.dumps(document)
 

@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 import ftlm
 from ftlm import _core
 from ftlm.base.statistics import is_white
+from ftlm.fit.grid import experiment
 from ftlm.fit.joint import fit_output_error
-from ftlm.fit.problem import FreeProblem, experiment
+from ftlm.fit.problem import FreeProblem
 from ftlm.fit.simpler import lower_orders
 from ftlm.paper.arm import demo_plant
 
@@ -62,7 +63,7 @@ def test_the_analytic_jacobian_is_that_of_finite_differences(coupling: str, init
     run = arm_run(1, 301, 1e-3, 0)
     words = "caputo" if initial[0] else "rest"
     problem = FreeProblem.of(replace(ftlm.flexible_link(stage=1, coupling=coupling), initial=words))
-    prepared = [experiment(run, problem, words, [1.0, 10.0], every=2)]
+    prepared = [experiment(run, problem, [1.0, 10.0], every=2)]
     # Away from whole differences of orders, where initial terms merge.
     named = {"alpha1": 1.93, "alpha2": 1.91, "gamma1": 0.9, "beta2": 0.13, "mu2": 0.8}
     named |= {"a1": 500.0, "b1": -50.0, "d1": 8.0, "g1": 120.0, "r1": 1.5}
@@ -92,7 +93,7 @@ def test_the_analytic_jacobian_is_that_of_finite_differences(coupling: str, init
 def test_the_optimum_is_scipys() -> None:
     run = three_terms(30, 5, rows=513)
     problem = FreeProblem.of(structure())
-    prepared = [experiment(run, problem, "rest", [20.0])]
+    prepared = [experiment(run, problem, [20.0])]
     start = np.array([2.1, 1.0, -0.7, -1.1, 1.1])
 
     def residuals(x: np.ndarray) -> np.ndarray:
@@ -225,12 +226,12 @@ def test_the_choice_of_an_optimum_is_given_in_words() -> None:
 
 def test_only_one_equation_of_whole_orders_starts_from_a_lower_one(small_run):
     one = ftlm.equation("D^2 y = a1 D y + a0 y + b0 u", initial=(0.0, 1.0))
-    (lower,) = lower_orders(FreeProblem.of(one), [small_run], (0.0, 1.0))
+    (lower,) = lower_orders(FreeProblem.of(one), [small_run])
     assert [e.order.constant for e in lower.problem.structure.equations] == [1.0]
-    assert (lower.coefficient, lower.others, lower.initial) == ("a1", ("a0", "b0"), (0.0,))
+    assert (lower.coefficient, lower.others, lower.problem.structure.initial) == ("a1", ("a0", "b0"), (0.0,))
     for words in ("D^alpha y = a1 D y + a0 y + b0 u", "D^2 y = b0 u"):
-        assert lower_orders(FreeProblem.of(ftlm.equation(words)), [small_run], "rest") == []
+        assert lower_orders(FreeProblem.of(ftlm.equation(words)), [small_run]) == []
     # Of two equations each measures the other, but both are fitted at once.
     pair = ftlm.flexible_link(stage=1, laws=(), coupling="measured")
     whole = pair.with_orders({n: 2.0 if n.startswith("alpha") else 0.5 for n in pair.order_names})
-    assert lower_orders(FreeProblem.of(whole), [small_run], "rest") == []
+    assert lower_orders(FreeProblem.of(whole), [small_run]) == []

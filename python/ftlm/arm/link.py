@@ -14,11 +14,23 @@ from ftlm.arm.parameters import INTEGER_ORDERS, PARAMETERS, LinkParameters
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Term
 from ftlm.data.orders import Order
-from ftlm.data.structures import SensorFilter, Structure
+from ftlm.data.structures import Hints, SensorFilter, Structure
 from ftlm.model.model import Model
 
 #: Orders of the cross-stage terms: torques of the other stage act through its angles and its current as they are.
 CROSS_ORDER = 0.0
+#: A link is second order or a little less.
+HIGHEST = (1.2, 2.0)
+#: Values beside the whole orders of a link's physics: damping on the rate or a little below, stiffness on the angle.
+NATURAL = {"alpha": (2.0,), "gamma": (0.9, 1.0), "beta": (0.0, 0.15), "mu": (0.8, 1.0)}
+#: Orders by the letter of the coefficient whose term they differentiate, as in (22)-(25).
+ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
+#: What no order law changes: where the orders of either stage lie, and what they are called.
+HINTS = Hints(
+    HIGHEST,
+    {f"{order}{n}": values for order, values in NATURAL.items() for n in range(1, 5)},
+    {f"{letter}{n}": f"{order}{n}" for letter, order in ORDER_OF.items() for n in range(1, 5)},
+)
 
 
 def order_law(stage: int, input_order: Literal["published", "derived"] = "published") -> dict[str, Order]:
@@ -64,15 +76,12 @@ def order_law(stage: int, input_order: Literal["published", "derived"] = "publis
 
 def flexible_link(
     *,
-    stage: Literal[1, 2, "both"] = 1,
-    input_order: Literal["published", "derived"] = "published",
-    coupling: Literal["simulated", "measured"] = "simulated",
-    cross_stage: bool = False,
-    friction: bool = False,
+    stage: Literal[1, 2, "both"] = 1, input_order: Literal["published", "derived"] = "published",
+    coupling: Literal["simulated", "measured"] = "simulated", cross_stage: bool = False, friction: bool = False,
     laws: Sequence[Literal["orders", "coefficients"]] = ("orders", "coefficients"),
     parameters: Literal["effective", "table-3"] = "effective",
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
-) -> Structure:
+) -> Structure:  # fmt: skip
     """Make the paper's structure (22)-(25): two equations a stage.
 
     Parameters
@@ -125,10 +134,8 @@ def flexible_link(
         equations += _stage(j, order_law(j, input_order), "orders" in laws, cross_stage, friction)
         h, d = 2 * j - 1, 2 * j
         coefficient_law += [
-            (f"a{d}", -1.0, (f"a{h}", f"r{j}")),
-            (f"b{d}", -1.0, (f"b{h}",)),
-            (f"d{d}", -1.0, (f"d{h}", f"r{j}")),
-            (f"g{d}", -1.0, (f"g{h}",)),
+            (f"{c}{d}", -1.0, (f"{c}{h}", *ratio))
+            for c, ratio in (("a", (f"r{j}",)), ("b", ()), ("d", (f"r{j}",)), ("g", ()))
         ]
         reference |= PARAMETERS[parameters][j].coefficients(j)
     if sensor_filter == "stock":
@@ -136,13 +143,10 @@ def flexible_link(
     if not (sensor_filter is None or isinstance(sensor_filter, SensorFilter)):
         raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or a SensorFilter")
     structure = Structure(
-        equations=tuple(equations),
-        coupling=coupling,
-        sensor_filter=sensor_filter,
-        coefficient_law=tuple(coefficient_law) if "coefficients" in laws else (),
-        reference=reference,
-        name=f"flexible link, stage {stage}" if stage != "both" else "flexible link, both stages",
-    )
+        equations=tuple(equations), coupling=coupling, sensor_filter=sensor_filter,
+        coefficient_law=tuple(coefficient_law) if "coefficients" in laws else (), reference=reference,
+        name=f"flexible link, stage {stage}" if stage != "both" else "flexible link, both stages", hints=HINTS,
+    )  # fmt: skip
     if input_order == "derived":
         structure = structure.with_orders({f"alpha{2 * j}": 2.0 for j in stages})
     return structure
@@ -151,6 +155,7 @@ def flexible_link(
 def _stage(
     stage: int, law: Mapping[str, Order], tied: bool, cross_stage: bool, friction: bool
 ) -> tuple[Equation, Equation]:
+    """Equations of the hub and of the deflection."""
     h, d = 2 * stage - 1, 2 * stage
     hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
     other = 3 - stage
@@ -167,41 +172,25 @@ def _stage(
             terms.append(Term(f"coulomb_{hub}", Order(), f"c{n}"))
         return terms
 
-    return (
-        Equation(
-            hub,
-            order(f"alpha{h}"),
-            (
-                Term(deflection, order(f"beta{h}"), f"a{h}"),
-                Term(hub, order(f"gamma{h}"), f"b{h}"),
-                Term(deflection, order(f"mu{h}"), f"d{h}"),
-                Term(current, Order(), f"g{h}"),
-                *extra(h),
-            ),
-        ),
-        Equation(
-            deflection,
-            order(f"alpha{d}"),
-            (
-                Term(deflection, order(f"beta{d}"), f"a{d}"),
-                Term(hub, order(f"gamma{d}"), f"b{d}"),
-                Term(deflection, order(f"mu{d}"), f"d{d}"),
-                Term(current, law["input"] if tied else Order(), f"g{d}"),
-                *extra(d),
-            ),
-        ),
-    )
+    def equation(output: str, n: int, drive: Order) -> Equation:
+        terms = [
+            Term(deflection, order(f"beta{n}"), f"a{n}"),
+            Term(hub, order(f"gamma{n}"), f"b{n}"),
+            Term(deflection, order(f"mu{n}"), f"d{n}"),
+            Term(current, drive, f"g{n}"),
+        ]
+        return Equation(output, order(f"alpha{n}"), (*terms, *extra(n)))
+
+    return equation(hub, h, Order()), equation(deflection, d, law["input"] if tied else Order())
 
 
 def link_model(
-    *,
-    stage: Literal[1, 2, "both"] = 1,
+    *, stage: Literal[1, 2, "both"] = 1,
     parameters: Literal["effective", "table-3"] | Mapping[int, LinkParameters] = "effective",
-    orders: Mapping[str, float] | None = None,
-    coefficients: Mapping[str, float] | None = None,
+    orders: Mapping[str, float] | None = None, coefficients: Mapping[str, float] | None = None,
     input_order: Literal["published", "derived"] = "published",
     coupling: Literal["simulated", "measured"] = "simulated",
-) -> Model:
+) -> Model:  # fmt: skip
     """Make the arm with everything known: by default the integer-order model of the maker's manual.
 
     Parameters

@@ -17,38 +17,25 @@ REFINEMENTS = 5
 
 @dataclass(frozen=True)
 class Settings:
-    """Checked settings of a search."""
+    """Checked settings of an estimator of coefficients, and of the order search that ranks by it."""
 
-    criterion: str
-    norm: str
-    coefficients: str
-    innovation_length: int
-    prior_covariance: float
-    rows: str
-    keep: int
-    threads: int
+    criterion: str = "output-error"
+    norm: str = "l1"
+    coefficients: str = "multi-innovation"
+    innovation_length: int = 7
+    prior_covariance: float = 1.0
+    rows: str = "haar"
+    keep: int = 20
+    threads: int = 1
     early_stopping: bool = True
 
     @classmethod
     def check(
-        cls,
-        criterion: str,
-        norm: str,
-        coefficients: str,
-        innovation_length: int,
-        prior_covariance: float,
-        rows: str,
-        keep: int,
-        threads: int | None,
-        early_stopping: bool = True,
-    ) -> Settings:
-        """Refuse words and numbers that mean nothing.
-
-        Raises
-        ------
-        ModelError
-            Naming the argument and what it may be.
-        """
+        cls, criterion: str = "output-error", norm: str = "l1", coefficients: str = "multi-innovation",
+        innovation_length: int = 7, prior_covariance: float = 1.0, rows: str = "haar", keep: int = 20,
+        threads: int | None = None, early_stopping: bool = True,
+    ) -> Settings:  # fmt: skip
+        """Refuse words and numbers that mean nothing with a `ModelError` that names the argument."""
         for name, value, known in (
             ("criterion", criterion, ("output-error", "equation-error")),
             ("norm", norm, ("l1", "l2")),

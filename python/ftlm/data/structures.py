@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import html
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
@@ -78,6 +78,26 @@ def check_initial(initial: str | Iterable[float]) -> Initial:
 
 
 @dataclass(frozen=True)
+class Hints:
+    """What the maker of a structure knows of where its orders lie; it tells a fit where to start, and bounds nothing.
+
+    Parameters
+    ----------
+    highest
+        Usual interval of highest orders; None: anything.
+    natural
+        Values beside the whole orders of its physics, by order; starts are looked for there, too, if all orders have
+        some.
+    freed
+        Names of the orders that an equation taken out of an order law frees, by the coefficient of their term.
+    """
+
+    highest: tuple[float, float] | None = None
+    natural: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    freed: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Structure:
     """Equations over shared signals, with what is known about them; some orders or coefficients may be free.
 
@@ -104,6 +124,8 @@ class Structure:
         Coefficients by name as the maker of the machine states them, to be set beside estimates.
     name
         What this is.
+    hints
+        Where its orders lie, if its maker knows; no part of what it says, so never compared nor written.
     """
 
     equations: tuple[Equation, ...]
@@ -116,6 +138,7 @@ class Structure:
     coefficient_law: tuple[tuple[str, float, tuple[str, ...]], ...] = ()
     reference: Mapping[str, float] = field(default_factory=dict)
     name: str = "equation"
+    hints: Hints | UnsetType = field(default=UNSET, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if not self.equations:
@@ -237,8 +260,7 @@ class Structure:
                 return term
             if term.signal not in modelled:
                 return replace(term, order=Order())
-            paper = ORDER_OF_COEFFICIENT.match(str(term.coefficient))
-            name = {"a": "beta", "b": "gamma", "d": "mu"}[paper[1]] + paper[2] if paper else f"nu_{output}_{k + 1}"
+            name = (self.hints or Hints()).freed.get(str(term.coefficient), f"nu_{output}_{k + 1}")
             return replace(term, order=Order(0.0, ((name, 1.0),)))
 
         single = replace(own, terms=tuple(freed(k, t) for k, t in enumerate(own.terms)))
@@ -307,11 +329,8 @@ def delay_name(signal: str) -> str:
     return f"delay_{signal}"
 
 
-ORDER_OF_COEFFICIENT = re.compile(r"^([abd])(\d+)$")
-
-
 def narrowed(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilter | None:
-    """Return what a sensor filter says of some signals."""
+    """Return the filter of those outputs that are left, or None."""
     if sensor is None:
         return None
     outputs = tuple(o for o in sensor.outputs if o in signals)

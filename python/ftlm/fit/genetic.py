@@ -15,10 +15,10 @@ from ftlm.base.arrays import Floats
 from ftlm.base.checks import check_threads, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
-from ftlm.data.lattice import Lattice, axis_of
+from ftlm.data.lattice import Lattice
 from ftlm.data.orders import Order
 from ftlm.data.structures import Structure
-from ftlm.solve.records import Record, initial_tuple
+from ftlm.solve.records import Record, initial_tuple, lattice_tuple
 
 #: Orders are coded in steps of this, the digits that the paper prints and fewer; regressors are then shared.
 RESOLUTION = 0.001
@@ -80,19 +80,10 @@ class Genetic:
 
 @dataclass(frozen=True)
 class GeneticRun:
-    """What the algorithm came to.
+    """What the algorithm came to: the best candidate of all seeds, and what each seed came to, within which bounds.
 
-    Parameters
-    ----------
-    orders, coefficients
-        Of the best candidate of all seeds, by name.
-    errors
-        Error of the best candidate of each seed: (45), or RMSE (46) for the norm ``"l2"``; under an order law the sum
-        of each output's divided by its spread.
-    evaluations
-        Candidates evaluated for each seed.
-    bounds
-        (low, high) of every order and coefficient.
+    Errors are (45), or RMSE (46) for the norm ``"l2"``; under an order law the sum of each output's divided by its
+    spread.
     """
 
     orders: dict[str, float]
@@ -173,13 +164,8 @@ class _Problem:
         """Size of the lattice; under a law an upper bound of it."""
         if self.law:
             return math.prod(len(v) for v in values.values())
-        item, first = structure.equations[0], records[0]
-        axes = [
-            (first.signals.index(t.signal), axis_of(t.order, values), bool(t.order.names) and t.fixed is None)
-            for t in item.terms
-        ]
-        orders = (first.signals.index(item.output), axis_of(item.order, values), axes)
-        return _core.lattice_size(orders, list(first.inputs))
+        orders = lattice_tuple(structure.equations[0], records[0].signals, values)
+        return _core.lattice_size(orders, list(records[0].inputs))
 
     def tidy(self, genes: Floats) -> Floats:
         """Orders in whole steps."""
@@ -200,16 +186,16 @@ class _Problem:
         """Orders and coefficients by name."""
         tidied = self.tidy(genes[None, :])
         n = len(self.order_names)
-        found = dict(zip(self.names, tidied[0].tolist(), strict=True))
+        values = dict(zip(self.names, tidied[0].tolist(), strict=True))
         if not self.law:
             part = self.rows[0]
             row = part.candidates(tidied, repaired=True)[0]
             for column, value in enumerate(row[: 1 + part.own.size].tolist()):
                 gene = np.flatnonzero(part.weights[:n, column])
                 if gene.size:
-                    found[self.names[int(gene[0])]] = value
-        orders = {name: round(found[name], 9) for name in self.order_names}
-        return orders, {name: found[name] for name in self.coefficient_names}
+                    values[self.names[int(gene[0])]] = value
+        orders = {name: round(values[name], 9) for name in self.order_names}
+        return orders, {name: values[name] for name in self.coefficient_names}
 
 
 def default_bounds(
@@ -233,48 +219,19 @@ def default_bounds(
 
 
 def genetic_search(
-    records: list[Record],
-    structure: Structure,
-    lattice: Lattice,
-    settings: Genetic,
-    *,
-    norm: str = "l1",
-    threads: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> GeneticRun:
-    """Minimise the error of the free run over orders and coefficients by a genetic algorithm.
+    records: list[Record], structure: Structure, lattice: Lattice, settings: Genetic, *, norm: str = "l1",
+    threads: int | None = None, progress: Callable[[int, int], None] | None = None,
+) -> GeneticRun:  # fmt: skip
+    """Minimise the error of the free run over orders and coefficients of one equation, or several under an order law.
 
-    Parameters
-    ----------
-    records
-        Pulse means, at rest.
-    structure
-        One equation, or several under an order law; other outputs act as measured.
-    lattice
-        Whose ends bound the orders, and whose size is the default number of evaluations.
-    settings
-        Seeds, evaluations, population, bounds.
-    norm
-        ``"l1"`` for (45), ``"l2"`` for (46).
-    threads, progress
-        See :func:`ftlm.search_orders`; progress counts evaluations over all seeds.
-
-    Returns
-    -------
-    GeneticRun
-        The best of all seeds, and what each came to. The same for any number of threads.
+    The ends of the lattice bound the orders, its size is the default number of evaluations; progress counts these over
+    all seeds. The result is the same for any number of threads.
 
     Raises
     ------
     ModelError
         PyGAD is not installed, a record that does not start at rest, bounds of a number that is not free, a lattice
         so large that the number of evaluations must be given.
-
-    Notes
-    -----
-    Real-coded: simulated binary crossover, polynomial mutation, truncation selection whose survivors are the next
-    generation's parents. A candidate that cannot be among those is left as soon as its partial error says so, which
-    changes no generation.
     """
     try:
         import pygad  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this baseline needs it
@@ -292,50 +249,62 @@ def genetic_search(
             f"the lattice has {wanted} candidates, too many to evaluate one by one; give Genetic(evaluations=…)"
         )
     wanted = max(wanted, 2 * settings.population)
-    parents = max(2, round(PARENTS * settings.population))
     total = wanted * len(settings.seeds)
-    before = 0
-    best: tuple[float, Floats] = (math.inf, np.zeros(len(problem.names)))
-    errors: dict[int, float] = {}
-    evaluations: dict[int, int] = {}
-    for seed in settings.seeds:
-        kept = _Kept(parents)
-        low, high = np.array([problem.bounds[n] for n in problem.names]).T
+    ends: dict[int, _Kept] = {}
+    for number, seed in enumerate(settings.seeds):
 
-        def enough(_: Any, kept: _Kept = kept) -> str | None:
-            return "stop" if kept.count >= wanted else None
-
-        def crossover(chosen: Any, size: tuple[int, int], running: Any) -> Floats:
-            return simulated_binary(np.asarray(chosen, dtype=np.float64), size, running.numpy_random_generator)
-
-        def mutation(children: Any, running: Any, low: Floats = low, high: Floats = high) -> Floats:
-            return polynomial(np.asarray(children, dtype=np.float64), low, high, running.numpy_random_generator)
-
-        def fitness(_: Any, genes: Any, __: Any, kept: _Kept = kept, before: int = before) -> list[float]:
-            found = problem.errors(np.asarray(genes, dtype=np.float64), kept.limit)
-            kept.take(found, np.asarray(genes, dtype=np.float64))
+        def told(count: int, before: int = number * wanted) -> None:
             if progress is not None:
-                progress(min(before + kept.count, total), total)
-            return np.where(np.isfinite(found), -found, HOPELESS).tolist()  # type: ignore[no-any-return]
+                progress(min(before + count, total), total)
 
-        algorithm = pygad.GA(
-            num_generations=MOST_COPIES * math.ceil(wanted / (settings.population - parents)),
-            on_generation=enough,
-            num_parents_mating=parents, keep_elitism=parents, sol_per_pop=settings.population,
-            num_genes=len(problem.names), fitness_func=fitness, fitness_batch_size=settings.population,
-            gene_space=[{"low": low, "high": high} for low, high in (problem.bounds[n] for n in problem.names)],
-            parent_selection_type="sss", crossover_type=crossover, mutation_type=mutation,
-            random_seed=int(seed), suppress_warnings=True, save_best_solutions=False,
-        )  # fmt: skip
-        algorithm.run()
-        errors[int(seed)], evaluations[int(seed)] = kept.best, kept.count
-        before += wanted
-        if kept.best < best[0]:
-            best = (kept.best, kept.genes)
-    if not math.isfinite(best[0]):
+        ends[int(seed)] = _evolved(pygad.GA, problem, settings.population, int(seed), wanted, told)
+    best = min(ends.values(), key=lambda kept: kept.best)
+    if not math.isfinite(best.best):
         raise ModelError("no candidate of the genetic algorithm had a finite error; narrow its bounds")
-    orders, coefficients = problem.named(best[1])
-    return GeneticRun(orders, coefficients, errors, evaluations, problem.bounds)
+    orders, coefficients = problem.named(best.genes)
+    errors = {seed: kept.best for seed, kept in ends.items()}
+    return GeneticRun(orders, coefficients, errors, {s: kept.count for s, kept in ends.items()}, problem.bounds)
+
+
+def _evolved(
+    algorithm: Any, problem: _Problem, population: int, seed: int, wanted: int, told: Callable[[int], None]
+) -> _Kept:
+    """Run the algorithm from one seed until it has spent its evaluations.
+
+    Real-coded: simulated binary crossover, polynomial mutation, truncation selection whose survivors are the next
+    generation's parents. A candidate that cannot be among those is left as soon as its partial error says so, which
+    changes no generation.
+    """
+    parents = max(2, round(PARENTS * population))
+    kept = _Kept(parents)
+    bounds = [problem.bounds[n] for n in problem.names]
+    low, high = np.array(bounds).T
+
+    def enough(_: Any) -> str | None:
+        return "stop" if kept.count >= wanted else None
+
+    def crossover(chosen: Any, size: tuple[int, int], running: Any) -> Floats:
+        return simulated_binary(np.asarray(chosen, dtype=np.float64), size, running.numpy_random_generator)
+
+    def mutation(children: Any, running: Any) -> Floats:
+        return polynomial(np.asarray(children, dtype=np.float64), low, high, running.numpy_random_generator)
+
+    def fitness(_: Any, genes: Any, __: Any) -> list[float]:
+        candidates = np.asarray(genes, dtype=np.float64)
+        errors = problem.errors(candidates, kept.limit)
+        kept.take(errors, candidates)
+        told(kept.count)
+        return np.where(np.isfinite(errors), -errors, HOPELESS).tolist()  # type: ignore[no-any-return]
+
+    algorithm(
+        num_generations=MOST_COPIES * math.ceil(wanted / (population - parents)), on_generation=enough,
+        num_parents_mating=parents, keep_elitism=parents, sol_per_pop=population, num_genes=len(bounds),
+        fitness_func=fitness, fitness_batch_size=population,
+        gene_space=[{"low": start, "high": end} for start, end in bounds],
+        parent_selection_type="sss", crossover_type=crossover, mutation_type=mutation, random_seed=seed,
+        suppress_warnings=True, save_best_solutions=False,
+    ).run()  # fmt: skip
+    return kept
 
 
 def simulated_binary(parents: Floats, size: tuple[int, int], random: Any) -> Floats:

@@ -42,15 +42,9 @@ class Trace:
 
 
 def multi_innovation_trace(
-    run: Run,
-    equation: Structure,
-    *,
-    innovation_length: int = 7,
-    prior_covariance: float = 1.0,
-    rows: Literal["haar", "time"] = "haar",
-    m: int | None = None,
-    every: int = 1,
-) -> Trace:
+    run: Run, equation: Structure, *, innovation_length: int = 7, prior_covariance: float = 1.0,
+    rows: Literal["haar", "time"] = "haar", m: int | None = None, every: int = 1,
+) -> Trace:  # fmt: skip
     """Run the recursion (44) step by step: coefficients, and error (45) of the model they make, after every step.
 
     Parameters
@@ -78,7 +72,7 @@ def multi_innovation_trace(
     -----
     O(m k^3) for the recursion and one division of series for each step given.
     """
-    settings = Settings.check("output-error", "l1", "multi-innovation", innovation_length, prior_covariance, rows, 1, 1)
+    settings = Settings.check(innovation_length=innovation_length, prior_covariance=prior_covariance, rows=rows)
     if len(equation.equations) != 1 or equation.order_names:
         raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
     stride = whole_number(every)

@@ -7,18 +7,16 @@ terms, follow by linear least squares on the output error itself.
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
 from ftlm import _core
 from ftlm.base.errors import FtlmError
 from ftlm.data.equations import Equation
-from ftlm.solve.records import Record, equation_tuple, initial_tuple, structure_tuple
+from ftlm.solve.records import Record, equation_tuple, initial_tuple, named_coefficients, structure_tuple
 
 #: Frequencies of the scan in units of the frequency below which 90 % of the output's power lies.
 FREQUENCIES = tuple(np.geomspace(0.15, 8.0, 14).tolist())
@@ -42,29 +40,16 @@ def own_coefficients(item: Equation, omega: float, damping: float) -> dict[str, 
 def scan_equation(
     records: Sequence[Record], item: Equation, frequency: float, *, keep: int
 ) -> list[tuple[float, dict[str, float]]]:
-    """Best points of the scan of one equation whose orders are numbers.
+    """Best points of the scan of one equation whose orders are numbers, of each frequency only the best damping.
 
-    Parameters
-    ----------
-    records
-        Records with measured coupling.
-    item
-        The equation, its coefficients free.
-    frequency
-        Unit of the scan's frequencies [rad/s].
-    keep
-        Most points to return; of one frequency only the best damping.
-
-    Returns
-    -------
-    list
-        (root mean square output error as a share of the output's size, coefficients by name), best first.
+    The frequency [rad/s] is the unit of the scan's. A point is the root mean square output error as a share of the
+    output's size, and the coefficients by name.
     """
     others = tuple(t for t in item.terms if t.signal != item.output)
     if not others or len(others) == len(item.terms):
         return []
     rest = replace(item, terms=others)
-    found = []
+    points = []
     for share in FREQUENCIES:
         best: tuple[float, dict[str, float]] | None = None
         for damping in DAMPINGS:
@@ -79,8 +64,8 @@ def scan_equation(
             if math.isfinite(point[0]) and (best is None or point[0] < best[0]):
                 best = point
         if best is not None:
-            found.append(best)
-    return sorted(found, key=lambda p: p[0])[:keep]
+            points.append(best)
+    return sorted(points, key=lambda p: p[0])[:keep]
 
 
 def _projected(
@@ -106,14 +91,13 @@ def _projected(
         sensor = response if rec.sensor is None else _core.series_multiply(response, rec.sensor, rec.m)
         filtered.append(replace(rec, means=means, sensor=sensor))
     # Caputo's powers of the whole equation: the rest alone would not know those of the own terms.
-    initial: Any = initial_tuple(records[0].initial)
+    initial = initial_tuple(records[0].initial)
     signals = records[0].signals
     cores = [r.core() for r in filtered]
     raw = _core.least_squares(cores, structure_tuple(rest, signals), inputs, [t.fixed for t in rest.terms], initial)[0]
-    values = dict(own)
-    values |= {str(t.coefficient): c / t.factor for t, c in zip(rest.terms, raw, strict=True) if t.fixed is None}
+    values = {**own, **named_coefficients(rest, raw)}
     solved = equation_tuple(rest.with_coefficients(values), signals)
     missed = [_core.equation_error(core, solved, inputs, initial) for core in cores]
     size = math.sqrt(sum(float(np.sum(np.square(r.of(item.output)))) for r in records))
-    error = math.sqrt(sum(float(e @ e) for e in itertools.chain(missed))) / max(size, 1e-300)
+    error = math.sqrt(sum(float(e @ e) for e in missed)) / max(size, 1e-300)
     return error, values

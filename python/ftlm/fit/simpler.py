@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from ftlm.base.errors import FtlmError
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
-from ftlm.fit.problem import Attempt, FreeProblem
+from ftlm.fit.grid import Attempt
+from ftlm.fit.problem import FreeProblem
 
 #: A pole of this many radians a sample is faster than the samples see.
 FAST_POLE = 0.2
@@ -19,20 +19,8 @@ FAST_POLE = 0.2
 class LowerOrder:
     """A problem one of whose equations ends with its highest own term: what is left of it behind a fast pole.
 
-    Parameters
-    ----------
-    problem
-        The problem.
-    coefficient
-        Of the term that is now the highest, 1 there.
-    factor
-        Known factor of that term.
-    others
-        Coefficients of the equation's other terms.
-    fast
-        Size of the term's coefficient that makes the pole fast.
-    initial
-        Initial terms of the equation of lower order: a power of t that it integrates to would be a drive.
+    The coefficient of that term, but for its known factor, is 1 there, and `fast` where the pole is; `others` are the
+    coefficients of the equation's other terms.
     """
 
     problem: FreeProblem
@@ -40,7 +28,6 @@ class LowerOrder:
     factor: float
     others: tuple[str, ...]
     fast: float
-    initial: Any
 
     def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
         """The same dynamics in the whole problem, but for what is faster than the sampling."""
@@ -56,7 +43,7 @@ class LowerOrder:
         )
 
 
-def lower_orders(problem: FreeProblem, runs: Sequence[Run], initial: Any) -> list[LowerOrder]:
+def lower_orders(problem: FreeProblem, runs: Sequence[Run]) -> list[LowerOrder]:
     """The problem of lower order of one equation whose own orders are numbers; free orders get there by themselves."""
     structure = problem.structure
     if structure.has_order_law or problem.products or len(structure.equations) > 1:
@@ -71,39 +58,28 @@ def lower_orders(problem: FreeProblem, runs: Sequence[Run], initial: Any) -> lis
     known = any(t.fixed is not None or t.coefficient == highest.coefficient for t in rest)
     if not isinstance(highest.coefficient, str) or highest.order.constant <= 0 or known:
         return []
+    initial = structure.initial
     if not isinstance(initial, str):
+        # A power of t that the equation of lower order integrates to would be a drive.
         initial = tuple(e for e in initial if e < highest.order.constant)
     try:
         lower = replace(item, order=highest.order, terms=rest)
-        reduced = FreeProblem.of(replace(structure, equations=(lower,)))
+        reduced = FreeProblem.of(replace(structure, equations=(lower,), initial=initial))
     except FtlmError:
         # A term of another signal differentiates more often than the equation of lower order integrates.
         return []
     fast = (FAST_POLE / step) ** (item.order.constant - highest.order.constant)
     names = tuple(t.coefficient for t in rest if isinstance(t.coefficient, str))
-    return [LowerOrder(reduced, highest.coefficient, highest.factor, names, fast, initial)]
+    return [LowerOrder(reduced, highest.coefficient, highest.factor, names, fast)]
 
 
 @dataclass(frozen=True)
 class Simpler:
-    """A problem with one own term less.
-
-    Parameters
-    ----------
-    problem
-        The problem.
-    coefficient
-        What is 0 in it.
-    order
-        Highest order of the equation that lacks the term.
-    initial
-        Initial terms.
-    """
+    """A problem with one own term less: its coefficient, and the highest order of the equation that lacks it."""
 
     problem: FreeProblem
     coefficient: str
     order: Order
-    initial: Any
 
     def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
         """The same point of the whole problem; the order of a term that is 0 may be any, so it is half the highest."""
@@ -118,7 +94,7 @@ class Simpler:
         )
 
 
-def simpler(problem: FreeProblem, initial: Any) -> list[Simpler]:
+def simpler(problem: FreeProblem) -> list[Simpler]:
     """Problems with one own term less; none under a law, where no coefficient can be 0 by itself."""
     structure = problem.structure
     if structure.has_order_law or problem.products:
@@ -134,5 +110,5 @@ def simpler(problem: FreeProblem, initial: Any) -> list[Simpler]:
             names = {n for e in equations for n in e.order_names}
             values = {n: v for n, v in structure.order_values.items() if n in names}
             reduced = replace(structure, equations=equations, order_values=values)
-            out.append(Simpler(FreeProblem.of(reduced), term.coefficient, item.order, initial))
+            out.append(Simpler(FreeProblem.of(reduced), term.coefficient, item.order))
     return out

@@ -5,19 +5,29 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ftlm import _core
 from ftlm.base.errors import FtlmError, ModelError
-from ftlm.data.orders import MAX_ORDER, Order
+from ftlm.data.equations import Equation
+from ftlm.data.orders import MAX_ORDER
 from ftlm.data.run import Run
-from ftlm.data.structures import Structure
-from ftlm.fit.problem import ALPHA_BOUNDS, Attempt, FreeProblem
+from ftlm.data.settings import Settings
+from ftlm.data.structures import Hints, Structure
+from ftlm.fit.grid import Attempt
+from ftlm.fit.problem import ALPHA_BOUNDS, FreeProblem
 from ftlm.fit.resonance_scan import scan_equation
-from ftlm.solve.records import Record, initial_tuple, named_signals, record
+from ftlm.solve.records import (
+    Record,
+    affine,
+    initial_tuple,
+    lattice_tuple,
+    named_coefficients,
+    named_signals,
+    record,
+)
 
 #: Pulses of the record on which starts are searched.
 START_M = 1024
@@ -30,10 +40,9 @@ PREFILTERS = (1.0, 2.0, 4.0, 8.0, None)
 #: Steps of the lattices on which a row is followed downhill, and how often it may move on each.
 ZOOM_STEPS = (0.1, 0.05)
 ZOOM_ROUNDS = 8
-#: Rows of each prefilter's table, and how many of them become starts: the first ones, then those that differ by
-#: APART in some order.
+#: Rows of each prefilter's table, and how many of them become starts: the first, then those that differ by APART in
+#: some order.
 ROWS_PER_FILTER = 400
-FIRST_ROWS = 1
 STARTS_PER_FILTER = 4
 APART = 0.35
 #: Points of a scan of resonances that become starts.
@@ -53,12 +62,20 @@ def power_frequency(run: Run, output: str) -> float:
     return 2.0 * math.pi * max(at, 1) / (y.size * run.step)
 
 
+@dataclass(frozen=True)
+class Row:
+    """A row of a lattice: its orders, and the coefficients freely estimated there, by name."""
+
+    orders: dict[str, float]
+    coefficients: dict[str, float]
+
+
 def start_axes(problem: FreeProblem) -> dict[str, list[float]]:
     """A coarse lattice of the free orders within their bounds."""
+    equations = problem.structure.equations
+    highest = {n for e in equations if e.order.is_single for n in e.order.names}
+    usual = (problem.structure.hints or Hints()).highest or (0.2, MAX_ORDER)
     axes = {}
-    highest = {n for e in problem.structure.equations if e.order.is_single for n in e.order.names}
-    # A link is second order or a little less; any other equation may be anything.
-    usual = (1.2, 2.0) if problem.structure.reference else (0.2, MAX_ORDER)
     for name, bounds in zip(problem.orders, problem.bounds, strict=True):
         low, high = usual if name in highest and bounds == ALPHA_BOUNDS else bounds
         if name not in highest:
@@ -66,15 +83,9 @@ def start_axes(problem: FreeProblem) -> dict[str, list[float]]:
         count = max(round((high - low) / START_STEP), 0)
         axes[name] = [round(v, 9) for v in np.linspace(low, high, count + 1)] if high > low else [low]
     # Orders at which other signals enter matter less for where the optimum is than the output's own.
-    driving = {
-        n
-        for e in problem.structure.equations
-        for t in e.terms
-        for n in t.order.names
-        if t.signal != e.output and n not in highest
-    }
+    driving = {n for e in equations for t in e.terms if t.signal != e.output for n in t.order.names} - highest
     for kept in ((0.0, 1.0), (0.0,)):
-        if all(math.prod(len(axes[n]) for n in e.order_names) <= START_CANDIDATES for e in problem.structure.equations):
+        if all(math.prod(len(axes[n]) for n in e.order_names) <= START_CANDIDATES for e in equations):
             break
         for name in driving:
             low, high = axes[name][0], axes[name][-1]
@@ -83,23 +94,21 @@ def start_axes(problem: FreeProblem) -> dict[str, list[float]]:
 
 
 def natural_axes(problem: FreeProblem) -> dict[str, list[float]] | None:
-    """A small lattice beside the whole orders of a flexible link's physics, or None for any other structure."""
-    if not problem.structure.reference:
-        return None
-    usual = {"alpha": [2.0], "gamma": [0.9, 1.0], "beta": [0.0, 0.15], "mu": [0.8, 1.0]}
+    """A small lattice beside the whole orders of a structure's physics, or None where it knows of none."""
+    natural = (problem.structure.hints or Hints()).natural
     axes = {}
     for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
-        values = [v for v in usual.get(name.rstrip("0123456789"), []) if low <= v <= high]
+        values = [v for v in natural.get(name, ()) if low <= v <= high]
         if not values:
             return None
         axes[name] = values
-    return axes
+    return axes if natural else None
 
 
-def delayed_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, threads: int) -> list[Attempt]:
+def delayed_attempts(runs: Sequence[Run], problem: FreeProblem, threads: int) -> list[Attempt]:
     """Starts at several delays where some are free: a fit from too far away in time ends on a wrong oscillation."""
     if not problem.delays:
-        return start_attempts(runs, problem, initial, threads)
+        return start_attempts(runs, problem, threads)
     fastest = max(power_frequency(run, o) for run in runs for o in problem.structure.outputs)
     axes = []
     for name in problem.delays:
@@ -110,23 +119,25 @@ def delayed_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, th
     attempts = []
     for point in itertools.product(*axes):
         known = problem.structure.with_delays(dict(zip(problem.delays, point, strict=True)))
-        for attempt in start_attempts(runs, FreeProblem.of(known), initial, threads):
-            words = ", ".join(f"{1e3 * v:.3g} ms" for v in point)
-            attempts.append(replace(attempt, origin=f"{attempt.origin}, delay {words}", delays=list(point)))
+        words = ", ".join(f"{1e3 * v:.3g} ms" for v in point)
+        attempts += [
+            replace(attempt, origin=f"{attempt.origin}, delay {words}", delays=list(point))
+            for attempt in start_attempts(runs, FreeProblem.of(known), threads)
+        ]
     return attempts
 
 
-def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, threads: int) -> list[Attempt]:
+def start_attempts(runs: Sequence[Run], problem: FreeProblem, threads: int) -> list[Attempt]:
     """Starts from order lattices on prefiltered records, where least squares suffers less from noise.
 
     The prefilter commutes with the equation: all signals pass it, so the true coefficients stay the same while noise
     above the band is gone.
     """
-    structure = replace(problem.structure, coupling="measured", initial=initial)
+    structure = replace(problem.structure, coupling="measured")
     m = min(START_M, min(run.length for run in runs) - 1)
     frequency = float(np.median([power_frequency(run, o) for run in runs for o in structure.outputs]))
-    axes = start_axes(problem)
     natural = natural_axes(problem)
+    lattices = [(start_axes(problem), APART)] + ([] if natural is None else [(natural, 0.0)])
     attempts: list[Attempt] = []
     fastest = math.pi / max(run.duration / m for run in runs)
     for multiple in PREFILTERS:
@@ -135,27 +146,34 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, initial: Any, thre
             continue
         records = [prefiltered(record(run, structure, m), multiple and multiple * frequency) for run in runs]
         origin = "no prefilter" if multiple is None else f"prefilter {multiple * frequency:.3g} rad/s"
-        lattices = [(axes, APART)]
-        if natural is not None:
-            lattices.append((natural, 0.0))
-        for points, apart in lattices:
-            picked: list[list[float]] = []
-            for rank, (orders, estimated) in enumerate(lattice_rows(problem, structure, records, points, threads)):
-                values = [orders[n] for n in problem.orders]
-                far = all(max(abs(a - b) for a, b in zip(values, p, strict=True)) >= apart for p in picked)
-                if picked and rank >= FIRST_ROWS and not far:
-                    continue
-                picked.append(values)
-                zoomed, close = (orders, estimated)
-                if rank == 0:
-                    zoomed, close = zoom(problem, structure, records, orders, estimated, threads)
-                values = [zoomed[n] for n in problem.orders]
-                if any(np.allclose(values, a.orders, atol=1e-9) and a.origin == origin for a in attempts):
-                    continue
-                attempts.append(Attempt(values, problem.free_from(close), origin, {}))
-                if len(picked) >= STARTS_PER_FILTER:
-                    break
+        here: list[Attempt] = []
+        for axes, apart in lattices:
+            here += lattice_attempts(problem, structure, records, axes, apart, origin, here, threads)
+        attempts += here
     return attempts + scanned_attempts(runs, problem, structure, m, attempts)
+
+
+def lattice_attempts(
+    problem: FreeProblem, structure: Structure, records: list[Record], axes: Mapping[str, list[float]], apart: float,
+    origin: str, before: Sequence[Attempt], threads: int,
+) -> list[Attempt]:  # fmt: skip
+    """Starts from the rows of a lattice that lie apart, the best one followed downhill; none that stood before."""
+    attempts: list[Attempt] = []
+    picked: list[list[float]] = []
+    for row in lattice_rows(structure, records, axes, threads):
+        values = [row.orders[n] for n in problem.orders]
+        far = all(max(abs(a - b) for a, b in zip(values, p, strict=True)) >= apart for p in picked)
+        if picked and not far:
+            continue
+        start = row if picked else zoom(problem, structure, records, row, threads)
+        picked.append(values)
+        values = [start.orders[n] for n in problem.orders]
+        if any(np.allclose(values, a.orders, atol=1e-9) for a in (*before, *attempts)):
+            continue
+        attempts.append(Attempt(values, problem.free_from(start.coefficients), origin, {}))
+        if len(picked) >= STARTS_PER_FILTER:
+            break
+    return attempts
 
 
 def scanned_attempts(
@@ -177,15 +195,12 @@ def scanned_attempts(
         scans = []
         for item in fixed.equations:
             frequency = float(np.median([power_frequency(run, item.output) for run in runs]))
-            scans.append(scan_equation(records, item, frequency, keep=SCANNED))
-        for rank in range(max(map(len, scans), default=0)):
-            estimated: dict[str, float] = {}
-            for scan in scans:
-                if scan:
-                    estimated |= scan[min(rank, len(scan) - 1)][1]
-            if len(estimated) == len(structure.coefficient_names):
-                values = [point[n] for n in problem.orders]
-                out.append(Attempt(values, problem.free_from(estimated), "scan of resonances", {}))
+            scans.append([Row({}, c) for _, c in scan_equation(records, item, frequency, keep=SCANNED)])
+        values = [point[n] for n in problem.orders]
+        out += [
+            Attempt(values, problem.free_from(row.coefficients), "scan of resonances", {})
+            for row in side_by_side(scans, structure)
+        ]
     return out
 
 
@@ -200,28 +215,21 @@ def whole_orders(problem: FreeProblem) -> list[float]:
     return [min(max(usual.get(n, 0.0), low), high) for n, (low, high) in pairs]
 
 
-def zoom(
-    problem: FreeProblem,
-    structure: Structure,
-    records: list[Record],
-    orders: dict[str, float],
-    estimated: dict[str, float],
-    threads: int,
-) -> tuple[dict[str, float], dict[str, float]]:
+def zoom(problem: FreeProblem, structure: Structure, records: list[Record], row: Row, threads: int) -> Row:
     """Follow a row downhill on ever finer lattices around it."""
     bounds = dict(zip(problem.orders, problem.bounds, strict=True))
     for step in ZOOM_STEPS:
         for _ in range(ZOOM_ROUNDS):
             axes = {}
-            for name, value in orders.items():
+            for name, value in row.orders.items():
                 low, high = bounds[name]
                 around = (value - step, value, value + step)
                 axes[name] = sorted({round(min(max(v, low), high), 9) for v in around})
-            rows = lattice_rows(problem, structure, records, axes, threads, keep=1)
-            if not rows or rows[0][0] == orders:
+            rows = lattice_rows(structure, records, axes, threads, keep=1)
+            if not rows or rows[0].orders == row.orders:
                 break
-            orders, estimated = rows[0]
-    return orders, estimated
+            row = rows[0]
+    return row
 
 
 def prefiltered(rec: Record, frequency: float | None) -> Record:
@@ -238,90 +246,77 @@ def prefiltered(rec: Record, frequency: float | None) -> Record:
 
 
 def lattice_rows(
-    problem: FreeProblem,
-    structure: Structure,
-    records: list[Record],
-    axes: Mapping[str, list[float]],
-    threads: int,
-    *,
+    structure: Structure, records: list[Record], axes: Mapping[str, list[float]], threads: int, *,
     keep: int = ROWS_PER_FILTER,
-) -> list[tuple[dict[str, float], dict[str, float]]]:
-    """Best rows of the coarse lattice: orders by name and freely estimated coefficients by name."""
-    signals = records[0].signals
-    cores = [r.core() for r in records]
-    inputs = list(records[0].inputs)
-    initial = initial_tuple(records[0].initial)
-    settings = ("output-error", "l1", 0, 1.0, False, keep, threads, True, 0)
+) -> list[Row]:  # fmt: skip
+    """Best rows of a coarse lattice, by least squares."""
+    settings = Settings(coefficients="least-squares", rows="time", keep=keep, threads=threads)
+    if not structure.has_order_law:
+        return side_by_side([equation_rows(e, records, axes, settings) for e in structure.equations], structure)
+    stages = list(structure.parts().values())
+    if len(stages) <= 1:
+        return stage_rows(structure, records, axes, settings)
+    # Stages that share no order are searched one by one; the best of each belong together.
+    own = [{n: v for n, v in axes.items() if n in stage.order_names} for stage in stages]
+    tables = [lattice_rows(s, records, a, threads, keep=keep) for s, a in zip(stages, own, strict=True)]
+    return side_by_side(tables, structure)
 
-    def coefficients(item: Any, raw: Sequence[float]) -> dict[str, float]:
-        terms = zip(item.terms, raw, strict=True)
-        return {t.coefficient: c / t.factor for t, c in terms if isinstance(t.coefficient, str)}
 
-    stages = list(structure.parts().values()) if structure.has_order_law else []
-    if len(stages) > 1:
-        # Stages that share no order are searched one by one; the best of each belong together.
-        tables = [
-            lattice_rows(
-                problem, part, records, {n: v for n, v in axes.items() if n in part.order_names}, threads, keep=keep
-            )
-            for part in stages
-        ]
-        return merged_rows(tables, structure)
-    if structure.has_order_law:
-        names = list(axes)
-
-        def affine(order: Order) -> tuple[float, list[float]]:
-            weights = dict(order.weights)
-            return order.constant, [weights.get(n, 0.0) for n in names]
-
-        laws = [
-            (signals.index(e.output), affine(e.order), [(signals.index(t.signal), affine(t.order)) for t in e.terms])
-            for e in structure.equations
-        ]
-        scales = [sum(float(np.std(r.of(e.output))) * r.m for r in records) for e in structure.equations]
-        fixed = [[t.fixed for t in e.terms] for e in structure.equations]
-        joined = _core.search_stage(
-            cores, [axes[n] for n in names], laws, inputs, fixed, scales, initial, settings, None
+def stage_rows(
+    structure: Structure, records: list[Record], axes: Mapping[str, list[float]], settings: Settings
+) -> list[Row]:
+    """Best rows of equations under their order law."""
+    signals, names = records[0].signals, list(axes)
+    laws = [
+        (
+            signals.index(e.output), affine(e.order, names),
+            [(signals.index(t.signal), affine(t.order, names)) for t in e.terms],
         )
-        rows = []
-        for _, _, free, parts in joined["rows"]:
-            estimated: dict[str, float] = {}
-            for item, part in zip(structure.equations, parts, strict=True):
-                estimated |= coefficients(item, part[3])
-            rows.append((dict(zip(names, free, strict=True)), estimated))
-        return rows
-    tables = []
-    for item in structure.equations:
-
-        def axis(order: Order) -> list[float]:
-            return list(axes[order.names[0]]) if order.names else [order.constant]
-
-        terms = [(signals.index(t.signal), axis(t.order), bool(t.order.names) and t.fixed is None) for t in item.terms]
-        lattice = (signals.index(item.output), axis(item.order), terms)
-        try:
-            found = _core.search(cores, lattice, inputs, [t.fixed for t in item.terms], initial, settings, None)
-        except ModelError as error:
-            raise named_signals(error, signals) from None
-        table = []
-        for _, _, alpha, orders, raw, _ in found["rows"]:
-            every = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
-            table.append(({o.names[0]: v for o, v in every if o.names}, coefficients(item, raw)))
-        tables.append(table)
-    return merged_rows(tables, structure)
+        for e in structure.equations
+    ]  # fmt: skip
+    scales = [sum(float(np.std(r.of(e.output))) * r.m for r in records) for e in structure.equations]
+    joined = _core.search_stage(
+        [r.core() for r in records], [axes[n] for n in names], laws, list(records[0].inputs),
+        [[t.fixed for t in e.terms] for e in structure.equations], scales, initial_tuple(records[0].initial),
+        settings.core(), None,
+    )  # fmt: skip
+    rows = []
+    for _, _, free, parts in joined["rows"]:
+        row = Row(dict(zip(names, free, strict=True)), {})
+        for item, (_, _, _, raw, _) in zip(structure.equations, parts, strict=True):
+            row.coefficients.update(named_coefficients(item, raw))
+        rows.append(row)
+    return rows
 
 
-def merged_rows(
-    tables: Sequence[Sequence[tuple[dict[str, float], dict[str, float]]]], structure: Structure
-) -> list[tuple[dict[str, float], dict[str, float]]]:
+def equation_rows(
+    item: Equation, records: list[Record], axes: Mapping[str, list[float]], settings: Settings
+) -> list[Row]:
+    """Best rows of one equation whose orders are free by themselves."""
+    signals = records[0].signals
+    try:
+        table = _core.search(
+            [r.core() for r in records], lattice_tuple(item, signals, axes), list(records[0].inputs),
+            [t.fixed for t in item.terms], initial_tuple(records[0].initial), settings.core(), None,
+        )  # fmt: skip
+    except ModelError as error:
+        raise named_signals(error, signals) from None
+    rows = []
+    for _, _, alpha, orders, raw, _ in table["rows"]:
+        every = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
+        rows.append(Row({o.names[0]: v for o, v in every if o.names}, named_coefficients(item, raw)))
+    return rows
+
+
+def side_by_side(tables: Sequence[Sequence[Row]], structure: Structure) -> list[Row]:
     """Rows of independent tables side by side, rank by rank; a table that ends goes on with its last row."""
     rows = []
-    for rank in range(max(len(t) for t in tables)):
-        merged: tuple[dict[str, float], dict[str, float]] = ({}, {})
-        for table in tables:
-            if table:
-                row = table[min(rank, len(table) - 1)]
-                merged[0].update(row[0])
-                merged[1].update(row[1])
-        if len(merged[1]) == len(structure.coefficient_names):
+    for rank in range(max(map(len, tables), default=0)):
+        merged = Row({}, {})
+        for table in filter(None, tables):
+            row = table[min(rank, len(table) - 1)]
+            merged.orders.update(row.orders)
+            merged.coefficients.update(row.coefficients)
+        if len(merged.coefficients) == len(structure.coefficient_names):
             rows.append(merged)
     return rows

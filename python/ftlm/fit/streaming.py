@@ -10,7 +10,7 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import ModelError
 from ftlm.data.structures import Structure
-from ftlm.solve.records import structure_tuple
+from ftlm.solve.records import named_coefficients, structure_tuple
 
 
 class Streaming:
@@ -41,15 +41,9 @@ class Streaming:
     """
 
     def __init__(
-        self,
-        structure: Structure,
-        *,
-        step: float,
-        longest: float,
-        inputs: Sequence[str] = ("I1", "I2"),
-        innovation_length: int = 7,
-        prior_covariance: float = 1.0,
-    ) -> None:
+        self, structure: Structure, *, step: float, longest: float, inputs: Sequence[str] = ("I1", "I2"),
+        innovation_length: int = 7, prior_covariance: float = 1.0,
+    ) -> None:  # fmt: skip
         if structure.order_names:
             raise ModelError(
                 f"the orders {', '.join(structure.order_names)} are free; a stream needs numbers: give them with "
@@ -61,16 +55,10 @@ class Streaming:
             )
         self.signals = tuple(structure.signals)
         self.structure = structure
-        self._terms = [e.terms for e in structure.equations]
         known = [name in inputs for name in self.signals]
-        self._core = _core.Streaming(
-            step,
-            max(2, round(longest / step) + 1),
-            known,
-            [(structure_tuple(e, self.signals), [t.fixed for t in e.terms]) for e in structure.equations],
-            innovation_length,
-            prior_covariance,
-        )
+        equations = [(structure_tuple(e, self.signals), [t.fixed for t in e.terms]) for e in structure.equations]
+        rows = max(2, round(longest / step) + 1)
+        self._core = _core.Streaming(step, rows, known, equations, innovation_length, prior_covariance)
 
     def push(self, samples: Floats) -> None:
         """Takes samples, shape (n, len(signals)), in SI units and in the order of `signals`.
@@ -89,12 +77,8 @@ class Streaming:
     @property
     def coefficients(self) -> dict[str, float]:
         """By name, after the newest sample."""
-        found = {}
-        for terms, values in zip(self._terms, self._core.coefficients, strict=True):
-            for term, value in zip(terms, values, strict=True):
-                if isinstance(term.coefficient, str):
-                    found[term.coefficient] = value / term.factor
-        return found
+        values = zip(self.structure.equations, self._core.coefficients, strict=True)
+        return {name: c for item, raw in values for name, c in named_coefficients(item, raw).items()}
 
     @property
     def pulses(self) -> int:

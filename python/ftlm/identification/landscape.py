@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError, ModelError
-from ftlm.fit.problem import Attempt, FreeProblem, descend, experiment
-from ftlm.identification.judged import Judged
+from ftlm.fit.grid import Attempt, Grid
+from ftlm.fit.joint import JointFit
+from ftlm.fit.problem import FreeProblem
+from ftlm.identification.judged import Judged, Task
 from ftlm.paint.heat import Landscape
 from ftlm.solve.records import prepare
 
@@ -36,11 +38,11 @@ def correlated_orders(result: Judged) -> tuple[str, str, float] | None:
     if result.joint is None:
         return None
     names = list(result.joint.orders)
-    found = np.abs(result.joint.correlation[: len(names), : len(names)])
-    found = np.where(np.isfinite(found) & ~np.eye(len(names), dtype=bool), found, -1.0)
-    if len(names) < 2 or found.max() < 0:
+    sizes = np.abs(result.joint.correlation[: len(names), : len(names)])
+    sizes = np.where(np.isfinite(sizes) & ~np.eye(len(names), dtype=bool), sizes, -1.0)
+    if len(names) < 2 or sizes.max() < 0:
         return None
-    i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(found)), found.shape))
+    i, j = sorted(int(k) for k in np.unravel_index(int(np.argmax(sizes)), sizes.shape))
     return names[i], names[j], float(result.joint.correlation[i, j])
 
 
@@ -81,50 +83,69 @@ def output_error_landscape(
     errors = joint.standard_errors
     if not all(0 < errors[n] < math.inf for n in (first, second)):
         return None
-    decided = prepare(task.runs, replace(task.structure, free_delays={}), None, power_of_two=False)[0].initial
-    structure = replace(task.structure, initial=decided)
-    problem = FreeProblem.of(structure)
-    weights = [1.0 / joint.noise[o] for o in structure.outputs]
-    experiments = [experiment(run, problem, structure.initial, weights, every=joint.refinement) for run in task.runs]
-
-    def attempt(values: Sequence[float], evaluations: int) -> Attempt:
-        held, coefficients, delays = problem.split(list(values))
-        start = Attempt(held, coefficients, "landscape", {}, delays)
-        return descend(
-            problem, experiments, structure.signals, structure.initial, start, evaluations=evaluations, plain=True
-        )
-
-    # The estimate is extrapolated to step 0; the grid has an optimum of its own close by.
-    best = attempt(joint.values.tolist(), REFITS)
-    centre = best.values
-    at = [problem.names.index(n) for n in (first, second)]
-    residuals, jacobian = np.asarray(best.found["residuals"]), np.asarray(best.found["jacobian"])
-    rest = np.delete(jacobian, at, axis=0)
-    size = np.linalg.norm(rest, axis=1, keepdims=True)
-    basis = np.linalg.svd(rest / np.where(size > 0, size, 1.0), full_matrices=False)[2] if refit and rest.size else None
-    bounds = dict(zip(problem.orders, problem.bounds, strict=True))
+    around = Around.of(joint, task, (first, second), refit=refit)
+    bounds = dict(zip(around.grid.problem.orders, around.grid.problem.bounds, strict=True))
     axes = []
-    for name, k in zip((first, second), at, strict=True):
-        low, high = centre[k] - HALF_WIDTH * errors[name], centre[k] + HALF_WIDTH * errors[name]
+    for name, k in zip((first, second), around.at, strict=True):
+        low, high = around.centre[k] - HALF_WIDTH * errors[name], around.centre[k] + HALF_WIDTH * errors[name]
         axes.append(np.linspace(max(low, bounds[name][0]), min(high, bounds[name][1]), SIDE))
-
-    def cost(x: float, y: float) -> float:
-        moved = centre.copy()
-        moved[at] = x, y
-        try:
-            found = np.asarray(attempt(moved.tolist(), 1).found["residuals"])
-        except FtlmError:
-            return math.inf
-        if basis is not None:
-            found = found - basis.T @ (basis @ found)
-        return float(found @ found)
-
-    scores = np.array([[cost(x, y) for x in axes[0]] for y in axes[1]])
-    whole = residuals if basis is None else residuals - basis.T @ (basis @ residuals)
-    least = min(float(whole @ whole), float(scores.min()))
+    scores = np.array([[around.cost(x, y) for x in axes[0]] for y in axes[1]])
+    least = min(around.rest(around.best), float(scores.min()))
     kept = "All other numbers refitted, by one linear step." if refit else "All other numbers held at the optimum."
     i, j = names.index(first), names.index(second)
     return Landscape(
         (first, second), axes[0], axes[1], 1.0 + scores - least, kept,
         "1 + increase of the weighted sum of squares", float(joint.correlation[i, j]),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Around:
+    """A joint fit around its optimum: the grid it ended on, the best point there, and what all but two numbers span."""
+
+    grid: Grid
+    best: Attempt
+    at: list[int]
+    basis: Floats | None
+
+    @classmethod
+    def of(cls, joint: JointFit, task: Task, names: tuple[str, str], *, refit: bool) -> Around:
+        """The optimum of the last grid; the estimate is extrapolated to step 0, so it is close by."""
+        decided = prepare(task.runs, replace(task.structure, free_delays={}), None, power_of_two=False)[0].initial
+        problem = FreeProblem.of(replace(task.structure, initial=decided))
+        weights = [1.0 / joint.noise[o] for o in problem.structure.outputs]
+        grid = Grid(problem, task.runs, weights, joint.refinement)
+        best = _moved(grid, joint.values, REFITS)
+        at = [problem.names.index(n) for n in names]
+        others = np.delete(np.asarray(best.outcome["jacobian"]), at, axis=0)
+        size = np.linalg.norm(others, axis=1, keepdims=True)
+        spanned = refit and bool(others.size)
+        scaled = others / np.where(size > 0, size, 1.0)
+        return cls(grid, best, at, np.linalg.svd(scaled, full_matrices=False)[2] if spanned else None)
+
+    @property
+    def centre(self) -> Floats:
+        """Values of everything free at the best point."""
+        return self.best.values
+
+    def rest(self, attempt: Attempt) -> float:
+        """Sum of squares that is left of an attempt's residuals once all other numbers follow."""
+        residuals = np.asarray(attempt.outcome["residuals"])
+        if self.basis is not None:
+            residuals = residuals - self.basis.T @ (self.basis @ residuals)
+        return float(residuals @ residuals)
+
+    def cost(self, x: float, y: float) -> float:
+        """The same where the two numbers are moved; infinite where that has no finite free run."""
+        values = self.centre.copy()
+        values[self.at] = x, y
+        try:
+            return self.rest(_moved(self.grid, values, 1))
+        except FtlmError:
+            return math.inf
+
+
+def _moved(grid: Grid, values: Floats, evaluations: int) -> Attempt:
+    """Descend from given values of everything free."""
+    orders, coefficients, delays = grid.problem.split(values.tolist())
+    return grid.descend(Attempt(orders, coefficients, "landscape", {}, delays), evaluations, plain=True)

@@ -49,13 +49,9 @@ def one_of_many(
 
 
 def identify_many(
-    runs: Sequence[Run | Sequence[Run]],
-    structure: Structure,
-    *,
-    executor: Executor | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    **options: Any,
-) -> list[Identified]:
+    runs: Sequence[Run | Sequence[Run]], structure: Structure, *, executor: Executor | None = None,
+    progress: Callable[[int, int], None] | None = None, **options: Any,
+) -> list[Identified]:  # fmt: skip
     """Identify each of many runs by itself.
 
     Parameters
@@ -97,12 +93,12 @@ def identify_many(
     if options.get("store") is not None:
         raise ModelError("a store keeps one identification; call identify for each run with a store of its own")
     if executor is None:
-        found = []
-        for item in items:
-            found.append(one_of_many(item, structure, options))
+        every = []
+        for name, item in zip(names, items, strict=True):
+            every.append(Identified(name, *one_of_many(item, structure, options)))
             if progress is not None:
-                progress(len(found), len(items))
-        return [Identified(name, *pair) for name, pair in zip(names, found, strict=True)]
+                progress(len(every), len(items))
+        return every
     options = {"threads": 1, **options}
     pending: list[Future[Any]] = []
     try:
@@ -123,6 +119,7 @@ def identify_many(
 
 
 def _pair(future: Future[Any]) -> tuple[Identification | None, FtlmError | None]:
+    """What a worker made of its run, or that it was lost."""
     try:
         pair: tuple[Identification | None, FtlmError | None] = future.result()
     except (Exception, CancelledError) as error:

@@ -6,7 +6,6 @@ import math
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from markupsafe import Markup
@@ -16,8 +15,9 @@ from ftlm.data.run import Run
 from ftlm.data.several import as_runs
 from ftlm.fit.joint import JointFit
 from ftlm.fit.recursion import multi_innovation_trace, trace_chart
-from ftlm.identification.judged import Judged
+from ftlm.identification.judged import Judged, Task
 from ftlm.identification.landscape import output_error_landscape
+from ftlm.identification.settings import settings_rows
 from ftlm.identification.warnings import validate
 from ftlm.judge.charts import comparison_charts, residual_charts
 from ftlm.judge.comparison import Comparison, errors_table, initial_terms_table, warned
@@ -31,9 +31,9 @@ from ftlm.paint.heat import heat_map
 from ftlm.paint.lines import Figure
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
-from ftlm.paint.text import Cell, Exact, number, symbol, symbol_html
+from ftlm.paint.text import Cell, number, symbol, symbol_html
 from ftlm.search.orders import landscape
-from ftlm.search.result import search_summary, search_top
+from ftlm.search.result import SearchResult, search_summary, search_top
 
 #: Charts of a page and points in all of them: at no more than 10 bytes a point the page stays below 2 MB.
 PAGE_CHARTS = 60
@@ -48,11 +48,7 @@ TRACE_POINTS = 64
 
 
 def identification_page(
-    result: Judged,
-    path: str | os.PathLike[str],
-    *,
-    validation: Run | Sequence[Run] | None = None,
-    force: bool = False,
+    result: Judged, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
 ) -> Path:
     """Write the report of one identification.
 
@@ -88,8 +84,8 @@ def identification_page(
             f"the standard errors of {', '.join(undefined)} are not defined: the fit's covariance is not finite; "
             "nothing is known of how sure these numbers are"
         )
-    for run, found in zip(others, validated, strict=True):
-        warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in found.warnings]
+    for run, comparison in zip(others, validated, strict=True):
+        warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in comparison.warnings]
         warnings += [f"validation run {run.name}: {w}" for w in run.warnings]
     compared = [("estimation", result.comparison), *(("validation", c) for c in validated)]
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
@@ -108,12 +104,9 @@ def identification_page(
 
 
 def first_sections(
-    model: Model,
-    warnings: Sequence[str],
-    compared: Sequence[tuple[str, Comparison]],
-    validated: bool,
+    model: Model, warnings: Sequence[str], compared: Sequence[tuple[str, Comparison]], validated: bool,
     joint: JointFit | None,
-) -> list[Section]:
+) -> list[Section]:  # fmt: skip
     """Warnings, equations, errors, charts."""
     units = model.units
     words = [
@@ -128,24 +121,16 @@ def first_sections(
     # Two lines a chart, drawn once wide and once narrow with half the points.
     points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
     drawn = [f for label, c in compared for f in comparison_charts(c, units=units, label=label, points=points)]
-    stable = model.stability()
+    equations = [*(equation_html(e) for e in model.equations), f"As a whole, the model is {model.stability()}."]
     sections = [
         Section("Warnings", words[1:] if warned else words, warned),
-        Section(
-            "Equations",
-            [*(equation_html(e) for e in model.equations), f"As a whole, the model is {stable}."],
-            tables=[parameter_table(model, joint)],
-        ),
+        Section("Equations", equations, tables=[parameter_table(model, joint)]),
     ]
     if compared:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."
         sections += [
             Section("Errors", tables=[errors_table(compared, units=units)]),
-            Section(
-                "Measured and simulated",
-                left_out if charts > PAGE_CHARTS else (),
-                figures=drawn[:PAGE_CHARTS],
-            ),
+            Section("Measured and simulated", left_out if charts > PAGE_CHARTS else (), figures=drawn[:PAGE_CHARTS]),
         ]
     return sections
 
@@ -156,15 +141,17 @@ def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
 
 
 def residual_section(tests: Sequence[tuple[str, Residuals]], information: InformationCriteria | None) -> Section:
+    """Residual tests, information criteria, correlations as charts."""
     tables = [residual_table(t, title=f"{label}: {', '.join(t.runs)}") for label, t in tests]
     if information is not None:
         tables.append(information_table(information))
     figures = [f for label, t in tests for f in residual_charts(t, label=label)]
-    words = () if tests else ("The runs are too short for residual tests.",)
+    words = () if tests else "The runs are too short for residual tests."
     return Section("Residuals", words, tables=tables, figures=figures[:SMALL_CHARTS], small=True)
 
 
 def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Section:
+    """Gain and phase as far as runs of these steps and durations show them."""
     omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
     words = "Exact, orders as they are; the equations together, from what is not modelled."
     if model.estimate is None or model.estimate.covariance is None:
@@ -183,15 +170,8 @@ def _search_sections(result: Judged) -> list[Section]:
         )
         sections.append(Section("Convergence of the recursion", words, figures=traces))
     if result.searches:
-        tops = [search_top(name, found) for name, found in result.searches.items()]
-        maps = []
-        if result.task is not None:
-            for name, found in result.searches.items():
-                part = result.task.structure if name == "stage" else result.task.structure.equation(name)
-                own = result.task.lattice_of(part)
-                axes = {n: v for n, v in own.values(part).items() if len(v) > 1}
-                if len(axes) >= 2:  # one order alone has no landscape; its table says all
-                    maps.append(heat_map(landscape(result.task.runs, part, found, own)))
+        tops = [search_top(name, search) for name, search in result.searches.items()]
+        maps = [] if result.task is None else _maps(result.task, result.searches)
         sections.append(
             Section("Order search", tables=[search_summary(result.searches), *tops], figures=maps, small=True)
         )
@@ -207,48 +187,47 @@ def _search_sections(result: Judged) -> list[Section]:
     return sections
 
 
+def _maps(task: Task, searches: Mapping[str, SearchResult]) -> list[Figure]:
+    """Landscapes of the searches over more than one order; of one alone its table says all."""
+    maps = []
+    for name, search in searches.items():
+        part = task.structure if name == "stage" else task.structure.equation(name)
+        own = task.lattice_of(part)
+        if sum(len(v) > 1 for v in own.values(part).values()) >= 2:
+            maps.append(heat_map(landscape(task.runs, part, search, own)))
+    return maps
+
+
 def _traces(result: Judged) -> list[Figure]:
     """The recursion at the orders found, for the paper's p and the one used, where the first run starts at rest."""
     if result.task is None or result.method != "multi-innovation" or result.settings["initial"] != "rest":
         return []
     run, used = result.task.runs[0], result.settings
-    lengths = sorted({*INNOVATION_LENGTHS, int(used["innovation_length"])})
+    every = max(1, int(used["m"]) // TRACE_POINTS)
+    options = {n: used[n] for n in ("prior_covariance", "rows", "m")}
     figures = []
-    for item in result.task.structure.equations:
-        single = replace(result.task.structure.equation(item.output), coefficient_law=())
-        found = next(e for e in result.model.equations if e.output == item.output)
-        orders = {
-            o.names[0]: v.constant
-            for o, v in zip(
-                (single.equations[0].order, *(t.order for t in single.equations[0].terms)),
-                (found.order, *(t.order for t in found.terms)), strict=True,
-            )
-            if o.names
-        }  # fmt: skip
-        at = single.with_orders(orders)
-        if not at.coefficient_names:
+    for solved in result.model.equations:
+        single = result.task.structure.equation(solved.output)
+        free = (single.equations[0].order, *(t.order for t in single.equations[0].terms))
+        numbers = (solved.order, *(t.order for t in solved.terms))
+        orders = {o.names[0]: n.constant for o, n in zip(free, numbers, strict=True) if o.names}
+        at_orders = single.with_orders(orders)
+        if not at_orders.coefficient_names:
             continue
-        every = max(1, int(used["m"]) // TRACE_POINTS)
         traces = [
-            (
-                f"p = {p}",
-                multi_innovation_trace(
-                    run, at, innovation_length=p, prior_covariance=used["prior_covariance"], rows=used["rows"],
-                    m=int(used["m"]), every=every,
-                ),
-            )
-            for p in lengths
-        ]  # fmt: skip
-        figures.append(trace_chart(traces, title=f"Error (45) of {symbol(item.output)}, run {run.name}"))
+            (f"p = {p}", multi_innovation_trace(run, at_orders, innovation_length=p, every=every, **options))
+            for p in sorted({*INNOVATION_LENGTHS, int(used["innovation_length"])})
+        ]
+        figures.append(trace_chart(traces, title=f"Error (45) of {symbol(solved.output)}, run {run.name}"))
     return figures
 
 
 def lead_of(compared: Sequence[tuple[str, Comparison]]) -> str:
     """Return the fits of the free runs, in a sentence a data set."""
     sentences = []
-    for label, found in compared:
-        fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in found.fit_percent.items())
-        runs = ", ".join(name for name, _, _ in found.per_run)
+    for label, comparison in compared:
+        fits = ", ".join(f"{symbol(name)} {number(fit, 4)}\u00a0%" for name, fit in comparison.fit_percent.items())
+        runs = ", ".join(name for name, _, _ in comparison.per_run)
         sentences.append(f"Fit of the free run, {label} ({runs}): {fits}.")
     return " ".join(sentences)
 
@@ -275,11 +254,10 @@ def grouped_warnings(results: Mapping[str, Judged | None]) -> list[str]:
             # Digits of names stay: theta11 is not theta12.
             key = re.sub(r"(?<![A-Za-z\d.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", warning)
             groups.setdefault(key, (warning, []))[1].append(label)
-    found = []
-    for warning, labels in groups.values():
-        alike = "" if len(labels) == 1 else " (numbers of the first)"
-        found.append(f"{', '.join(dict.fromkeys(labels))}: {warning}{alike}")
-    return found
+    return [
+        f"{', '.join(dict.fromkeys(labels))}: {warning}{'' if len(labels) == 1 else ' (numbers of the first)'}"
+        for warning, labels in groups.values()
+    ]
 
 
 def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic starts") -> Table:
@@ -292,40 +270,20 @@ def starts_table(joint: JointFit, *, rows: int = 10, title: str = "Automatic sta
 
 def settings_table(result: Judged, *, title: str = "What the result depends on") -> Table:
     """Return what the result depends on besides the data: estimator, criterion, M, p, K₀, initial terms, runs."""
-    used, structure = result.settings, result.model.structure
-    coordinates = {"haar": "Haar coordinates", "time": "order of time"}
-    initial = {"rest": "none, the records start at rest", "caputo": "Caputo's, estimated for each run"}
+    structure, comparison = result.model.structure, result.comparison
     rows: list[list[Cell]] = [
         ["structure", structure.name],
         ["coupling in free runs", structure.coupling],
         ["estimator", result.method],
-        ["block pulses a run, M", int(used["m"])],
+        *settings_rows(result.settings, searched=bool(result.searches)),
     ]
-    if "innovation_length" in used:
-        rows += [
-            ["innovation length, p", int(used["innovation_length"])],
-            [Markup("prior covariance, K<sub>0</sub>"), Exact(used["prior_covariance"])],
-            ["rows of the recursion", coordinates.get(used["rows"], used["rows"])],
-        ]  # fmt: skip
-    if "refinement" in used:
-        rows += [
-            ["pulses a sample interval", int(used["refinement"])],
-            ["automatic starts", int(used["starts"])],
-        ]
-        for name, level in used["noise"].items():
-            rows.append([f"noise found on {symbol(name)}", float(level)])
-    rows.append(["initial terms", initial.get(str(used["initial"]), str(used["initial"]))])
-    if result.searches:
-        norm = {"l1": "sum of absolute errors (45)", "l2": "RMSE (46)"}.get(used["norm"], used["norm"])
-        rows.append(["orders ranked by", f"{used['criterion']}, {norm}"])
     rows += [[f"delay of {symbol(name)}", f"{delay:g} s"] for name, delay in structure.delay.items()]
     if structure.sensor_filter is not None:
         filtered = ", ".join(symbol(o) for o in structure.sensor_filter.outputs)
         rows.append(["known sensor filter on", filtered])
-    found = result.comparison
     rows += [
-        [Markup("run <q>{}</q>").format(name), f"{number(step * found.m)} s, pulses of {number(step * 1e3)} ms"]
-        for (name, _, _), step in zip(found.per_run, found.step, strict=True)
+        [Markup("run <q>{}</q>").format(name), f"{number(step * comparison.m)} s, pulses of {number(step * 1e3)} ms"]
+        for (name, _, _), step in zip(comparison.per_run, comparison.step, strict=True)
     ]
     return Table(title, ("setting", "used"), rows)
 

@@ -100,13 +100,10 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
         values = _physical(centre, name, amount, stage)
         slopes = []
         for i, c in enumerate(centre):
-            shift = GRADIENT_STEP * (abs(c) if c else 1.0)
-            sides = []
-            for sign in (1, -1):
-                moved = centre.copy()
-                moved[i] += sign * shift
-                sides.append(_physical(moved, name, amount, stage))
-            slopes.append((sides[0] - sides[1]) / (2 * shift))
+            step = GRADIENT_STEP * (abs(c) if c else 1.0)
+            shift = step * np.eye(centre.size)[i]
+            above, below = (_physical(centre + side, name, amount, stage) for side in (shift, -shift))
+            slopes.append((above - below) / (2 * step))
         gradient = np.array(slopes).T
         errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gradient, spread, gradient), 0.0))
         units = list(PHYSICAL_UNITS.items())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from ftlm.data.run import Run
 from ftlm.identification.judged import Judged
 from ftlm.identification.page import identification_html, identification_page
 from ftlm.identification.physical import PhysicalParameter, physical_parameters
+from ftlm.identification.settings import settings_in_words
 from ftlm.identification.warnings import validate
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.residuals import Residuals, resid
@@ -98,11 +99,7 @@ class Identification(Judged):
         return validate(self, runs)
 
     def report(
-        self,
-        path: str | os.PathLike[str],
-        *,
-        validation: Run | Sequence[Run] | None = None,
-        force: bool = False,
+        self, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
     ) -> Path:
         """Write everything about this result as one HTML file that opens offline.
 
@@ -163,13 +160,11 @@ class Identification(Judged):
         }
 
     def __str__(self) -> str:
-        lines = [f"{self.model.structure.name}: {self.method}, {_settings_in_words(self.settings)}"]
+        lines = [f"{self.model.structure.name}: {self.method}, {settings_in_words(self.settings)}"]
         lines += [f"  {numeric(e)}" for e in self.model.equations]
         reference = self.model.structure.reference
-        errors, shown = self.standard_errors, {**self.orders, **self.coefficients}
-        if self.joint is not None:
-            shown = {**self.orders, **self.joint_values, **self.coefficients}
-        for name, value in shown.items():
+        errors = self.standard_errors
+        for name, value in {**self.orders, **self.joint_values, **self.coefficients}.items():
             spread = f" ± {errors[name]:<10.3g}" if name in errors else ""
             stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
             lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
@@ -187,8 +182,7 @@ class Identification(Judged):
         for name, search in self.searches.items():
             pruned = ", ".join(f"{count} {reason}" for reason, count in search.pruned.items() if count)
             lines.append(f"order search ({name}): {search.candidates} candidates, {len(search.table)} kept, {pruned}")
-        initial = _initial_in_words(self.comparison)
-        lines += initial
+        lines += _initial_in_words(self.comparison)
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
 
@@ -196,20 +190,8 @@ class Identification(Judged):
         return identification_html(self)
 
 
-def _settings_in_words(settings: Mapping[str, Any]) -> str:
-    words = f"M = {settings['m']}"
-    if "refinement" in settings:
-        words = f"all samples, {settings['refinement']} pulses each, {settings['starts']} starts"
-    if "seeds" in settings:
-        seeds = ", ".join(map(str, settings["seeds"]))
-        words += f", seeds {seeds}, {sum(settings['evaluations'].values())} evaluations in all"
-    if "innovation_length" in settings:
-        words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
-        words += f", {settings['rows']} rows"
-    return f"{words}, initial terms: {settings['initial']}"
-
-
 def _initial_in_words(comparison: Comparison) -> list[str]:
+    """Initial terms of every run that has some, a line an output."""
     lines = []
     for (run, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True):
         for output, terms in initial.items():

@@ -10,7 +10,6 @@ from ftlm import _core
 from ftlm.base.statistics import is_white
 from ftlm.data.advice import excitation_for
 from ftlm.data.run import Run
-from ftlm.data.several import as_runs
 from ftlm.data.structures import Structure, delay_name
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
@@ -98,8 +97,8 @@ def broken_law(model: Model) -> list[str]:
         rest = math.prod(known)
         if name in values and len(free) == 1 and known and rest:
             ratios.setdefault(free[0], []).append((name, sign * values[name] / rest))
-    for ratio, found in ratios.items():
-        wrong = [(n, v) for n, v in found if not v > 1]
+    for ratio, said in ratios.items():
+        wrong = [(n, v) for n, v in said if not v > 1]
         if wrong:
             listed = ", ".join(f"{v:.4g} by {n}" for n, v in wrong)
             warnings.append(f"coefficient law: the inertia ratio {ratio} must exceed 1, but is {listed}")
@@ -130,14 +129,14 @@ def discretisation(model: Model, comparison: Comparison) -> list[str]:
 
 def growing(model: Model) -> list[str]:
     """Warn of poles with a positive real part: within one run the input may hide what they do, later nothing does."""
-    found = model.stability(coupling=model.structure.coupling)
-    if not found.unstable_poles > 0:
+    verdict = model.stability(coupling=model.structure.coupling)
+    if not verdict.unstable_poles > 0:
         return []
-    return [f"the model is {found}: its free run grows without bound, however well it fits a run of this length"]
+    return [f"the model is {verdict}: its free run grows without bound, however well it fits a run of this length"]
 
 
 def validate(result: Judged, runs: Run | Sequence[Run]) -> Comparison:
     """Both errors on other runs, with what they say against the model; see :meth:`ftlm.Identification.validate`."""
-    found = compare(result.model, as_runs(runs))
-    words = [*found.warnings, *validation_warnings(result.comparison, found), *discretisation(result.model, found)]
-    return replace(found, warnings=tuple(dict.fromkeys(words)))
+    there = compare(result.model, runs)
+    words = [*there.warnings, *validation_warnings(result.comparison, there), *discretisation(result.model, there)]
+    return replace(there, warnings=tuple(dict.fromkeys(words)))

@@ -36,32 +36,23 @@ def comparison_charts(
     points
         Most points of a line.
     """
-    figures = []
-    for k, (run, _, output_error) in enumerate(comparison.per_run):
-        for name, figures_of in output_error.items():
-            figures.append(
-                line_chart(
-                    pulse_times(comparison, k),
-                    [("measured", comparison.measured[name][k]), ("simulated", comparison.simulated[name][k])],
-                    title=f"{symbol(name)}, {f'{label}: ' if label else ''}{run}",
-                    x_label="time [s]",
-                    y_label=with_unit(symbol(name), units, name),
-                    caption=f"Free run: fit {number(figures_of.fit)}\u00a0%, NR {number(figures_of.nr)}.",
-                    points=points,
-                )
-            )
-    return figures
+    return [
+        line_chart(
+            pulse_times(comparison, k),
+            [("measured", comparison.measured[name][k]), ("simulated", comparison.simulated[name][k])],
+            title=f"{symbol(name)}, {f'{label}: ' if label else ''}{run}", x_label="time [s]",
+            y_label=with_unit(symbol(name), units, name), points=points,
+            caption=f"Free run: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}.",
+        )
+        for k, (run, _, output_error) in enumerate(comparison.per_run)
+        for name, figures in output_error.items()
+    ]  # fmt: skip
 
 
 def error_chart(
-    compared: Sequence[tuple[str, Comparison]],
-    output: str,
-    *,
-    run: int = 0,
-    title: str = "",
-    units: Mapping[str, str] | None = None,
-    points: int = POINTS,
-) -> Figure:
+    compared: Sequence[tuple[str, Comparison]], output: str, *, run: int = 0, title: str = "",
+    units: Mapping[str, str] | None = None, points: int = POINTS,
+) -> Figure:  # fmt: skip
     """Absolute error of the free runs of several models on one run, as in the paper's Figure 4(a).
 
     Parameters
@@ -83,16 +74,13 @@ def error_chart(
         raise DataError("an error chart needs at least one comparison; give (name, comparison) pairs")
     errors = [(name, np.abs(c.measured[output][run] - c.simulated[output][run])) for name, c in compared]
     return line_chart(
-        pulse_times(compared[0][1], run),
-        errors,
-        title=title or f"{symbol(output)}: absolute error of the free run",
-        x_label="time [s]",
-        y_label=with_unit("|error|", units, output),
-        points=points,
-    )
+        pulse_times(compared[0][1], run), errors, title=title or f"{symbol(output)}: absolute error of the free run",
+        x_label="time [s]", y_label=with_unit("|error|", units, output), points=points,
+    )  # fmt: skip
 
 
 def with_unit(text: str, units: Mapping[str, str] | None, name: str) -> str:
+    """Return the label of an axis with the unit of a signal, where it is known."""
     unit = (units or {}).get(name, "")
     return f"{text} [{unit}]" if unit else text
 
@@ -109,8 +97,8 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
     """
     figures = []
     suffix = f", {label}" if label else ""
-    for output, found in tests.outputs.items():
-        drawn = [("itself", found.whiteness), *found.inputs.items()]
+    for output, judged in tests.outputs.items():
+        drawn = [("itself", judged.whiteness), *judged.inputs.items()]
         for name, test in drawn:
             own = name == "itself"
             # Lag 0 of an autocorrelation is 1 and says nothing.

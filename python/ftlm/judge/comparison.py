@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from ftlm.judge.metrics import Metrics, pooled
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol_html
 from ftlm.solve.free_run import compared, respond
-from ftlm.solve.records import check_m, default_m, equation_tuple, initial_tuple, records
+from ftlm.solve.records import Record, check_m, default_m, equation_tuple, initial_tuple, records
 
 #: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
 NEAR_IDENTITY = 0.25
@@ -140,41 +140,52 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
         An m that the runs do not carry.
     """
     check_solved(model)
-    found = as_runs(runs)
-    carried = min(run.length for run in found) - 1
-    chosen = min(model.m or default_m(found, power_of_two=False), carried) if m is None else m
-    m = check_m(chosen, found, power_of_two=False)
-    simulated: dict[str, list[Floats]] = {o: [] for o in model.outputs}
-    measured: dict[str, list[Floats]] = {o: [] for o in model.outputs}
-    own: dict[str, list[Floats]] = {o: [] for o in model.outputs}
-    residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
-    per_run, initial, steps = [], [], []
-    for run in found:
+    several = as_runs(runs)
+    carried = min(run.length for run in several) - 1
+    chosen = min(model.m or default_m(several, power_of_two=False), carried) if m is None else m
+    m = check_m(chosen, several, power_of_two=False)
+    for run in several:
         run.require_outputs([o for o in model.outputs if o in run])
-    for run, rec, full in zip(found, compared(found, model, m), records(found, model.structure, m), strict=True):
-        responses, terms = respond(model, rec)
-        equation_figures, output_figures = {}, {}
-        for item in model.equations:
-            name = item.output
-            core_equation = equation_tuple(item, full.signals)
-            args = (core_equation, list(full.inputs), initial_tuple(full.initial))
-            residual = _core.equation_error(full.core(), *args)
-            y = rec.of(name)
-            simulated[name].append(responses[name])
-            measured[name].append(y)
-            own[name].append(full.of(name))
-            residuals[name].append(residual)
-            equation_figures[name] = Metrics(*_core.metrics(full.of(name), residual))
-            output_figures[name] = Metrics(*_core.metrics(y, y - responses[name]))
-        per_run.append((run.name, equation_figures, output_figures))
-        initial.append(terms)
-        steps.append(rec.step)
-    outputs = {
-        o: pooled(measured[o], [y - s for y, s in zip(measured[o], simulated[o], strict=True)]) for o in model.outputs
+    pairs = zip(compared(several, model, m), records(several, model.structure, m), strict=True)
+    parts = [_beside(model, free, full) for free, full in pairs]
+    equation_error, output_error = _figures(parts)
+    return Comparison(
+        output_error, equation_error, [(run.name, *_figures([p])) for run, p in zip(several, parts, strict=True)],
+        {o: [p.simulated[o] for p in parts] for o in model.outputs},
+        {o: [p.measured[o] for p in parts] for o in model.outputs}, [p.step for p in parts], m,
+        [p.initial for p in parts], tuple(near_identity(model.structure, equation_error, output_error)),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """A model beside one run, by output: the free run and what was measured, the equation's signal and its error."""
+
+    step: float
+    initial: dict[str, dict[float, float]]
+    simulated: dict[str, Floats]
+    measured: dict[str, Floats]
+    equated: dict[str, Floats]
+    missed: dict[str, Floats]
+
+
+def _beside(model: Solved, free: Record, full: Record) -> _Beside:
+    """Free run and equation error on one run: as it is compared, and with all signals behind the sensor filter."""
+    responses, initial = respond(model, free)
+    core, inputs, powers = full.core(), list(full.inputs), initial_tuple(full.initial)
+    missed = {
+        e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers) for e in model.equations
     }
-    equations = {o: pooled(own[o], residuals[o]) for o in model.outputs}
-    warnings = near_identity(model.structure, equations, outputs)
-    return Comparison(outputs, equations, per_run, simulated, measured, steps, m, initial, tuple(warnings))
+    measured, equated = ({o: rec.of(o) for o in model.outputs} for rec in (free, full))
+    return _Beside(free.step, initial, responses, measured, equated, missed)
+
+
+def _figures(parts: Sequence[_Beside]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
+    """Figures of the equation error and of the free run, over these runs together."""
+    outputs = parts[0].measured
+    equation = {o: pooled([p.equated[o] for p in parts], [p.missed[o] for p in parts]) for o in outputs}
+    free = {o: pooled([p.measured[o] for p in parts], [p.measured[o] - p.simulated[o] for p in parts]) for o in outputs}
+    return equation, free
 
 
 def near_identity(
@@ -210,36 +221,23 @@ def near_identity(
     return warnings
 
 
-def validation_warnings(own: Comparison, found: Comparison) -> list[str]:
-    """Say what validation runs hold against a model, or against themselves.
-
-    Parameters
-    ----------
-    own
-        On the runs that the model was identified from.
-    found
-        On the validation runs.
-
-    Returns
-    -------
-    list of str
-        Runs that validate nothing, and outputs whose fit is lost.
-    """
+def validation_warnings(own: Comparison, validation: Comparison) -> list[str]:
+    """Validation runs that are those a model was identified from, and outputs whose fit is lost on the others."""
     warnings = []
     for k, (name, _, _) in enumerate(own.per_run):
-        for j, (other, _, _) in enumerate(found.per_run):
-            if all(np.array_equal(own.measured[o][k], found.measured[o][j]) for o in own.measured):
+        for j, (other, _, _) in enumerate(validation.per_run):
+            if all(np.array_equal(own.measured[o][k], validation.measured[o][j]) for o in own.measured):
                 warnings.append(
                     f"{other}: its outputs are those of {name}, which the model was identified from; "
                     "it validates nothing"
                 )
-    return warnings + lost_fits({n: f.fit for n, f in own.output_error.items()}, found)
+    return warnings + lost_fits({n: f.fit for n, f in own.output_error.items()}, validation)
 
 
-def lost_fits(before: Mapping[str, float], found: Comparison) -> list[str]:
+def lost_fits(before: Mapping[str, float], validation: Comparison) -> list[str]:
     """Name outputs whose fit on other runs is far below that on the estimation data."""
     warnings = []
-    for other, _, figures in found.per_run:
+    for other, _, figures in validation.per_run:
         for output, f in figures.items():
             # Negated so that a fit that is not a number counts as lost.
             if np.isfinite(before.get(output, np.nan)) and not f.fit >= before[output] - LOST:
@@ -276,29 +274,20 @@ def errors_table(
         for name in output:
             unit = (units or {}).get(name, "")
             label = symbol_html(name) + (Markup(" [{}]").format(unit) if unit else Markup(""))
-            rows.append([label, *_four(equation[name]), *_four(output[name])])
+            rows.append([label, *astuple(equation[name]), *astuple(output[name])])
 
-    for label, found in compared:
-        names = [name for name, _, _ in found.per_run]
-        if len(names) == 1:
-            add(f"{label}: {names[0]}", found.equation_error, found.output_error)
-            continue
-        add(f"{label}: {len(names)} runs together", found.equation_error, found.output_error)
-        for name, equation, output in found.per_run:
+    for label, comparison in compared:
+        runs = comparison.per_run
+        if len(runs) > 1:
+            add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error)
+        for name, equation, output in runs:
             add(f"{label}: {name}", equation, output)
-    return Table(
-        title,
-        ("output", *_FIGURES, *_FIGURES),
-        rows,
-        groups=(("", 1), ("equation error", 4), ("output error (free run)", 4)),
-        headings=headings,
-        note="The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
-        "close to one another; only the free run shows what the model knows.",
+    note = (
+        "The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
+        "close to one another; only the free run shows what the model knows."
     )
-
-
-def _four(figures: Metrics) -> list[Cell]:
-    return [figures.error, figures.rmse, figures.nr, figures.fit]
+    groups = (("", 1), ("equation error", 4), ("output error (free run)", 4))
+    return Table(title, ("output", *_FIGURES, *_FIGURES), rows, groups=groups, headings=headings, note=note)
 
 
 def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms of the free runs") -> Table | None:
@@ -316,12 +305,13 @@ def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms o
 
 
 def warned(warnings: Sequence[str]) -> Markup:
+    """Return warnings as a list, or nothing."""
     if not warnings:
         return Markup("")
     items = Markup("").join(Markup("<li>{}</li>").format(w) for w in warnings)
     return Markup("<p><strong>Warnings</strong></p><ul>{}</ul>").format(items)
 
 
-def comparison_html(found: Comparison) -> str:
+def comparison_html(comparison: Comparison) -> str:
     """Return both errors of every run, warnings first."""
-    return str(warned(found.warnings) + errors_table([("compared", found)]).to_html())
+    return str(warned(comparison.warnings) + errors_table([("compared", comparison)]).to_html())

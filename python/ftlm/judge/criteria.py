@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from ftlm.base.checks import whole_number
 from ftlm.base.errors import ModelError
+from ftlm.judge.metrics import finite
 from ftlm.judge.residuals import Residuals
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact
@@ -37,8 +38,7 @@ class InformationCriteria:
 
     def to_dict(self) -> dict[str, float | int | None]:
         """For JSON."""
-        items = {n: getattr(self, n) for n in ("log_likelihood", "aic", "aicc", "bic")}
-        shown = {n: v if math.isfinite(v) else None for n, v in items.items()}
+        shown = {n: finite(getattr(self, n)) for n in ("log_likelihood", "aic", "aicc", "bic")}
         return {"parameters": self.parameters, "samples": self.samples, **shown}
 
     def __str__(self) -> str:
@@ -76,13 +76,13 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     given = whole_number(parameters)
     if given is None or given < 0:
         raise ModelError(f"parameters = {parameters!r} is no number of parameters; give a whole number, at least 0")
-    counts = {name: sum(r.size for r in found.residuals) for name, found in tests.outputs.items()}
+    counts = {name: sum(r.size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
     k = given + tests.initial_terms + len(tests.outputs)
     likelihood = 0.0
-    for name, found in tests.outputs.items():
+    for name, output in tests.outputs.items():
         # A residual of exactly nothing has no finite likelihood.
-        level = 2 * math.log(found.rms) if 0 < found.rms < math.inf else math.copysign(math.inf, found.rms - 1)
+        level = 2 * math.log(output.rms) if 0 < output.rms < math.inf else math.copysign(math.inf, output.rms - 1)
         likelihood -= 0.5 * counts[name] * (math.log(2 * math.pi) + 1 + level)
     aic = 2 * k - 2 * likelihood
     left = samples - k - 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +11,11 @@ from numpy.typing import ArrayLike
 from ftlm import _core
 from ftlm.base.arrays import Floats, as_floats
 from ftlm.base.errors import DataError
+
+
+def finite(value: float) -> float | None:
+    """For JSON, which has no infinity: None stands for a figure that is not finite."""
+    return float(value) if math.isfinite(value) else None
 
 
 @dataclass(frozen=True)
@@ -34,9 +40,8 @@ class Metrics:
     fit: float
 
     def to_dict(self) -> dict[str, float | None]:
-        """For JSON, which has no infinity: None stands for a figure that is not finite."""
-        items = {"error": self.error, "rmse": self.rmse, "nr": self.nr, "fit": self.fit}
-        return {name: value if np.isfinite(value) else None for name, value in items.items()}
+        """For JSON."""
+        return {name: finite(getattr(self, name)) for name in ("error", "rmse", "nr", "fit")}
 
 
 def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:

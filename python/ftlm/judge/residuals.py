@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any
 
@@ -20,6 +20,7 @@ from ftlm.base.statistics import LEVEL, NORMAL_99, chi_squared_99, ljung_box
 from ftlm.data.run import Run
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Solved, check_solved
+from ftlm.judge.metrics import finite
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, symbol_html
 from ftlm.solve.free_run import compared, respond
@@ -74,10 +75,8 @@ class CorrelationTest:
         """For JSON."""
         return {
             "lags": self.lags.tolist(),
-            "values": [v if math.isfinite(v) else None for v in self.values.tolist()],
-            "band": self.band if math.isfinite(self.band) else None,
-            "statistic": self.statistic if math.isfinite(self.statistic) else None,
-            "limit": self.limit if math.isfinite(self.limit) else None,
+            "values": list(map(finite, self.values.tolist())),
+            **{n: finite(getattr(self, n)) for n in ("band", "statistic", "limit")},
             "passed": self.passed,
         }
 
@@ -110,6 +109,16 @@ class OutputResiduals:
     inputs: dict[str, CorrelationTest]
     feedback: tuple[str, ...]
 
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "rms": finite(self.rms),
+            "nr": finite(self.nr),
+            "whiteness": self.whiteness.to_dict(),
+            "inputs": {n: t.to_dict() for n, t in self.inputs.items()},
+            "feedback": list(self.feedback),
+        }
+
 
 @dataclass(frozen=True)
 class Residuals:
@@ -138,12 +147,12 @@ class Residuals:
     @property
     def white(self) -> dict[str, bool]:
         """Whether the residuals of each output could be white noise."""
-        return {name: found.whiteness.passed for name, found in self.outputs.items()}
+        return {name: output.whiteness.passed for name, output in self.outputs.items()}
 
     @property
     def independent(self) -> dict[str, bool]:
         """Whether the residuals of each output could be independent of all earlier inputs."""
-        return {name: all(t.passed for t in found.inputs.values()) for name, found in self.outputs.items()}
+        return {name: all(t.passed for t in output.inputs.values()) for name, output in self.outputs.items()}
 
     @property
     def passed(self) -> bool:
@@ -156,33 +165,26 @@ class Residuals:
             "passed": self.passed,
             "runs": list(self.runs),
             "refinement": self.refinement,
-            "outputs": {
-                name: {
-                    "rms": found.rms if math.isfinite(found.rms) else None,
-                    "nr": found.nr if math.isfinite(found.nr) else None,
-                    "whiteness": found.whiteness.to_dict(),
-                    "inputs": {n: t.to_dict() for n, t in found.inputs.items()},
-                    "feedback": list(found.feedback),
-                }
-                for name, found in self.outputs.items()
-            },
+            "outputs": {name: output.to_dict() for name, output in self.outputs.items()},
         }
 
     def __str__(self) -> str:
-        names = [f"{o} and {n}" for o, found in self.outputs.items() for n in found.inputs]
-        width = max(len(n) for n in [*names, *(f"{o} alone" for o in self.outputs)]) + 2
+        tests = [
+            (f"{output} {words}", test)
+            for output, judged in self.outputs.items()
+            for words, test in [("alone", judged.whiteness), *((f"and {n}", t) for n, t in judged.inputs.items())]
+        ]
+        width = max(len(label) for label, _ in tests) + 2
         lines = [
             f"residual tests at 99 % on {', '.join(self.runs)}: {'passed' if self.passed else 'FAILED'}",
             f"{'correlation of':<{width}}{'largest':>10}{'at lag':>8}{'band':>10}{'statistic':>12}{'limit':>10}",
         ]
-        for output, found in self.outputs.items():
-            tests = [(f"{output} alone", found.whiteness), *((f"{output} and {n}", t) for n, t in found.inputs.items())]
-            for label, test in tests:
-                lag, value = test.largest
-                lines.append(
-                    f"{label:<{width}}{value:>10.3g}{lag:>8}{test.band:>10.3g}{test.statistic:>12.4g}{test.limit:>10.4g}"
-                    f"   {'passed' if test.passed else 'failed'}"
-                )
+        for label, test in tests:
+            lag, value = test.largest
+            lines.append(
+                f"{label:<{width}}{value:>10.3g}{lag:>8}{test.band:>10.3g}{test.statistic:>12.4g}{test.limit:>10.4g}"
+                f"   {_verdict(test.passed)}"
+            )
         lines += residual_sentences(self)
         return "\n".join(lines)
 
@@ -227,28 +229,27 @@ def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = 25) -> Residu
     error that passes proves nothing.
     """
     check_solved(model)
-    found = as_runs(runs)
+    several = as_runs(runs)
     count = whole_number(lags)
     if count is None or count < 1:
         raise ModelError(f"lags = {lags!r} is no number of lags; give a whole number, at least 1")
-    for run in found:
+    for run in several:
         if run.length < 2 * count + 3:
             raise DataError(
                 f"run {run.name!r} has {run.length} rows, correlations up to {count} lags need {2 * count + 3}; "
                 "give a longer run or fewer lags"
             )
         run.require_outputs([o for o in model.outputs if o in run])
-    refinement, residuals, initial_terms = _settled(model, found)
-    read = [s for s in model.structure.signals if s not in model.outputs and s in found[0]]
-    inputs = list(dict.fromkeys([*found[0].inputs, *read]))
-    signals = {n: [np.ascontiguousarray(run[n][1:-1]) for run in found] for n in inputs}
+    refinement, residuals, initial_terms = _settled(model, several)
+    read = [s for s in model.structure.signals if s not in model.outputs and s in several[0]]
+    inputs = list(dict.fromkeys([*several[0].inputs, *read]))
+    signals = {n: [np.ascontiguousarray(run[n][1:-1]) for run in several] for n in inputs}
     outputs = {}
     for name in model.outputs:
-        series = residuals[name]
-        deviation = math.sqrt(float(np.mean([np.var(run[name]) for run in found])))
-        outputs[name] = _tested(series, signals, count, deviation)
-    steps = tuple(run.step for run in found)
-    return Residuals(outputs, tuple(run.name for run in found), steps, refinement, initial_terms)
+        deviation = math.sqrt(float(np.mean([np.var(run[name]) for run in several])))
+        outputs[name] = _tested(residuals[name], signals, count, deviation)
+    steps = tuple(run.step for run in several)
+    return Residuals(outputs, tuple(run.name for run in several), steps, refinement, initial_terms)
 
 
 def _settled(model: Solved, runs: Sequence[Run]) -> tuple[int, dict[str, list[Floats]], int]:
@@ -285,60 +286,66 @@ def _residuals(model: Solved, runs: Sequence[Run], every: int) -> tuple[dict[str
 
 
 def _tested(series: list[Floats], signals: Mapping[str, list[Floats]], lags: int, deviation: float) -> OutputResiduals:
+    """Both tests of one output's residuals; all fail where these are not finite."""
     everything = np.concatenate(series)
     with np.errstate(over="ignore", invalid="ignore"):
         rms = float(np.sqrt(np.mean(everything**2)))
     nr = rms / deviation if deviation > 0 else math.inf
-    behind, around = np.arange(lags + 1), np.arange(-lags, lags + 1)
     if not math.isfinite(rms):
-        lost = CorrelationTest(behind, np.full(lags + 1, math.nan), math.nan, math.inf, math.nan, passed=False)
-        across = CorrelationTest(around, np.full(2 * lags + 1, math.nan), math.nan, math.inf, math.nan, passed=False)
+        lost, across = _lost(np.arange(lags + 1)), _lost(np.arange(-lags, lags + 1))
         return OutputResiduals(series, math.inf, math.inf, lost, dict.fromkeys(signals, across), ())
-    count = everything.size
-    own, _, _ = _core.correlation(series, series, lags)
-    own = own[lags:]
-    statistic = ljung_box(own[1:], count)
-    limit = chi_squared_99(lags)
-    whiteness = CorrelationTest(behind, own, NORMAL_99 / math.sqrt(count), statistic, limit, passed=statistic <= limit)
-    inputs, feedback = {}, []
-    together = NormalDist().inv_cdf(1 - (1 - (1 - LEVEL) ** (1 / (lags + 1))) / 2)
-    for name, values in signals.items():
-        cross, variance, _ = _core.correlation(series, values, lags)
-        spread = math.sqrt(variance)
-        after = float(np.max(np.abs(cross[lags:])))
-        before = float(np.max(np.abs(cross[:lags])))
-        test = CorrelationTest(
-            around, cross, NORMAL_99 * spread, after, together * spread, passed=after <= together * spread
-        )
-        inputs[name] = test
-        if test.passed and before > together * spread:
-            feedback.append(name)
-    return OutputResiduals(series, rms, nr, whiteness, inputs, tuple(feedback))
+    whiteness = _whiteness(series, everything.size, lags)
+    inputs = {name: _independence(series, values, lags) for name, values in signals.items()}
+    before = {name: float(np.max(np.abs(test.values[:lags]))) for name, test in inputs.items()}
+    feedback = tuple(name for name, test in inputs.items() if test.passed and before[name] > test.limit)
+    return OutputResiduals(series, rms, nr, whiteness, inputs, feedback)
+
+
+def _lost(lags: NDArray[np.int64]) -> CorrelationTest:
+    """Return a test that nothing passes: there are no correlations."""
+    return CorrelationTest(lags, np.full(lags.size, math.nan), math.nan, math.inf, math.nan, passed=False)
+
+
+def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
+    """Ljung and Box's sum against its limit."""
+    own = _core.correlation(series, series, lags)[0][lags:]
+    statistic, limit = ljung_box(own[1:], count), chi_squared_99(lags)
+    band = NORMAL_99 / math.sqrt(count)
+    return CorrelationTest(np.arange(lags + 1), own, band, statistic, limit, passed=statistic <= limit)
+
+
+def _independence(series: list[Floats], signal: list[Floats], lags: int) -> CorrelationTest:
+    """Largest correlation at lags from 0 on against the band that holds for all of them together."""
+    cross, variance, _ = _core.correlation(series, signal, lags)
+    spread, largest = math.sqrt(variance), float(np.max(np.abs(cross[lags:])))
+    limit = NormalDist().inv_cdf(1 - (1 - (1 - LEVEL) ** (1 / (lags + 1))) / 2) * spread
+    around = np.arange(-lags, lags + 1)
+    return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed=largest <= limit)
 
 
 def residual_sentences(tests: Residuals) -> list[str]:
     """Every failed test in words, and signs of feedback."""
     words = []
-    for name, found in tests.outputs.items():
-        if not math.isfinite(found.rms):
+    for name, output in tests.outputs.items():
+        if not math.isfinite(output.rms):
             words.append(f"{name}: the free run leaves the range of numbers, so its residuals cannot be tested")
             continue
-        lags = int(found.whiteness.lags[-1])
-        if not found.whiteness.passed:
+        white = output.whiteness
+        if not white.passed:
             words.append(
-                f"{name}: residuals are not white (Ljung-Box {found.whiteness.statistic:.3g} over {lags} lags, 99 % "
-                f"limit {found.whiteness.limit:.3g}): the model leaves something out"
+                f"{name}: residuals are not white (Ljung-Box {white.statistic:.3g} over {white.lags[-1]} lags, 99 % "
+                f"limit {white.limit:.3g}): the model leaves something out"
             )
-        for signal, test in found.inputs.items():
+        for signal, test in output.inputs.items():
             lag, value = test.largest
             if not test.passed:
                 words.append(
                     f"{name}: residuals still follow {signal} (correlation {value:.2g} at lag {lag}, 99 % limit "
                     f"{test.limit:.2g}): not all of what {signal} does is in the model"
                 )
-        if found.feedback:
+        if output.feedback:
             words.append(
-                f"{name}: residuals come before {', '.join(found.feedback)} and not after: the run was made in a "
+                f"{name}: residuals come before {', '.join(output.feedback)} and not after: the run was made in a "
                 "closed loop, or the input is correlated with itself"
             )
     return words
@@ -346,29 +353,22 @@ def residual_sentences(tests: Residuals) -> list[str]:
 
 def residual_warnings(tests: Residuals, *, floor: float = NEGLIGIBLE) -> list[str]:
     """Failed residual tests in words, without those of outputs that are explained to within ``floor`` of their size."""
-    kept = {name: found for name, found in tests.outputs.items() if not found.nr <= floor}
-    rest = Residuals(kept, tests.runs, tests.step, tests.refinement, tests.initial_terms)
-    return [w for w in residual_sentences(rest) if "closed loop" not in w]
+    kept = {name: output for name, output in tests.outputs.items() if not output.nr <= floor}
+    return [w for w in residual_sentences(replace(tests, outputs=kept)) if "closed loop" not in w]
 
 
 def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
     """Return every residual test with its statistic and limit."""
     rows: list[list[Cell]] = []
-    for output, found in tests.outputs.items():
-        white = found.whiteness
-        rows.append([symbol_html(output), "whiteness", white.statistic, white.limit, _verdict(white.passed)])
-        rows += [
-            [symbol_html(output), Markup("independence of {}").format(symbol_html(n)), t.statistic, t.limit,
-             _verdict(t.passed)]
-            for n, t in found.inputs.items()
-        ]  # fmt: skip
-    return Table(
-        title,
-        ("output", "test", "statistic", "limit (99 %)", "verdict"),
-        rows,
-        note="Whiteness: Ljung-Box sum over 25 lags. Independence: largest correlation at lags from 0 on. One true "
-        "model in a hundred fails each.",
+    for name, output in tests.outputs.items():
+        judged = [(Markup("whiteness"), output.whiteness)]
+        judged += [(Markup("independence of {}").format(symbol_html(n)), t) for n, t in output.inputs.items()]
+        rows += [[symbol_html(name), what, t.statistic, t.limit, _verdict(t.passed)] for what, t in judged]
+    note = (
+        "Whiteness: Ljung-Box sum over 25 lags. Independence: largest correlation at lags from 0 on. One true model in "
+        "a hundred fails each."
     )
+    return Table(title, ("output", "test", "statistic", "limit (99 %)", "verdict"), rows, note=note)
 
 
 def _verdict(passed: bool) -> str:

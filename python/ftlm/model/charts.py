@@ -43,9 +43,8 @@ def bode_charts(model: Model, w: ArrayLike | None = None) -> list[Figure]:
         Frequencies [rad/s]; by default around the model's own.
     """
     omega = response_frequencies(model) if w is None else np.asarray(w, dtype=np.float64)
-    curves = bode_curves(model, omega)
     figures = []
-    for curve in curves:
+    for curve in bode_curves(model, omega):
         title = f"{symbol(curve.output)} from {symbol(curve.input)}"
         shade = "Shade: 95 % band, from the covariance of the fit." if curve.gain_spread is not None else ""
         for kind, values, spread, label in (
@@ -81,7 +80,7 @@ def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
     if model.estimate is not None and model.estimate.covariance is not None:
         spread = response_deviation(model, omega)
     inputs = response_inputs(model, coupled=True)
-    found = []
+    curves = []
     for i, output in enumerate(model.outputs):
         for j, name in enumerate(inputs):
             h = response[i, j]
@@ -93,5 +92,5 @@ def bode_curves(model: Model, omega: Floats) -> list[BodeCurve]:
             widths: tuple[Floats | None, Floats | None] = (None, None)
             if spread is not None:
                 widths = (DECIBEL * NORMAL_95 * spread[0][i, j], np.degrees(NORMAL_95 * spread[1][i, j]))
-            found.append(BodeCurve(output, name, gain, phase, *widths))
-    return found
+            curves.append(BodeCurve(output, name, gain, phase, *widths))
+    return curves

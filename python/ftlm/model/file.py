@@ -1,16 +1,20 @@
-"""The file of a model: what stands in it, and how it is read."""
+"""The file of a model: what stands in it, and how it is read and written."""
 
 from __future__ import annotations
 
+import os
+import stat
+from pathlib import Path
 from typing import Literal
 
 import msgspec
 
-from ftlm.base.errors import ModelError
+from ftlm.base.errors import DataError, ModelError
+from ftlm.base.output import write_atomically
 from ftlm.data.equations import Equation, Term
 from ftlm.data.orders import Order
-from ftlm.data.solved import Estimate
-from ftlm.data.structures import SensorFilter
+from ftlm.data.solved import Estimate, Solved
+from ftlm.data.structures import SensorFilter, Structure, check_initial
 
 #: Largest model file read: a model is a few kilobytes.
 MAX_MODEL_BYTES = 1 << 20
@@ -18,6 +22,8 @@ SCHEMA = 2
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A term: coefficient is its number without the factor, name what it was called while it was free."""
+
     signal: str
     order: float
     coefficient: float
@@ -26,12 +32,27 @@ class TermFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
+    """An equation whose orders are numbers."""
+
     output: str
     order: float
     terms: list[TermFile]
 
+    @classmethod
+    def of(cls, item: Equation) -> EquationFile:
+        """Write an equation."""
+        terms = [TermFile(t.signal, t.order.constant, float(t.coefficient), t.factor, t.name) for t in item.terms]
+        return cls(item.output, item.order.constant, terms)
+
+    def equation(self) -> Equation:
+        """Give the equation back."""
+        terms = tuple(Term(t.signal, Order(t.order), t.coefficient, t.factor, t.name) for t in self.terms)
+        return Equation(self.output, Order(self.order), terms)
+
 
 class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A model, without what is of use only before identification."""
+
     format: Literal["ftlm-model"]
     schema: int
     name: str
@@ -46,16 +67,63 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     about: dict[str, str | float | int | bool | None]
     estimate: Estimate | None = None
 
+    @classmethod
+    def of(cls, model: Solved) -> ModelFile:
+        """Write a model."""
+        s = model.structure
+        return cls(
+            "ftlm-model", SCHEMA, s.name, [EquationFile.of(e) for e in s.equations], s.coupling, dict(s.delay),
+            s.initial if isinstance(s.initial, str) else list(s.initial), s.sensor_filter, dict(model.units),
+            dict(model.orders), model.m, dict(model.about), model.estimate,
+        )  # fmt: skip
 
-def check_estimate(read: ModelFile) -> None:
-    if read.estimate is None or read.estimate.covariance is None:
-        return
-    count = sum(1 + 2 * len(e.terms) for e in read.equations)
-    rows = read.estimate.covariance
-    if len(rows) != count or any(len(row) != count for row in rows):
-        raise ModelError(f"its covariance is not of {count} by {count} numbers, as its equations need")
+    def solved(self) -> Solved:
+        """Give the record of the model back.
+
+        Raises
+        ------
+        ModelError
+            Equations that are none, or a covariance of another size than they need.
+        """
+        structure = Structure(
+            equations=tuple(e.equation() for e in self.equations), coupling=self.coupling, delay=self.delay,
+            initial=check_initial(self.initial), sensor_filter=self.sensor_filter, name=self.name,
+        )  # fmt: skip
+        if self.estimate is not None and self.estimate.covariance is not None:
+            count = sum(1 + 2 * len(e.terms) for e in self.equations)
+            rows = self.estimate.covariance
+            if len(rows) != count or any(len(row) != count for row in rows):
+                raise ModelError(f"its covariance is not of {count} by {count} numbers, as its equations need")
+        return Solved(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 
-def equation_of(item: EquationFile) -> Equation:
-    terms = tuple(Term(t.signal, Order(t.order), t.coefficient, t.factor, t.name) for t in item.terms)
-    return Equation(item.output, Order(item.order), terms)
+def write_model(model: Solved, path: str | os.PathLike[str], *, force: bool) -> Path:
+    """Write a model as JSON, atomically."""
+    data = msgspec.json.format(msgspec.json.encode(ModelFile.of(model)), indent=2)
+    return write_atomically(path, data + b"\n", force=force)
+
+
+def read_model(path: str | os.PathLike[str]) -> Solved:
+    """Read the record of a model; the errors are those of :func:`ftlm.load_model`."""
+    file = Path(path)
+    try:
+        state = file.stat()
+        if not stat.S_ISREG(state.st_mode):
+            raise DataError(f"{file} is no regular file; give a file written by save()")
+        if state.st_size > MAX_MODEL_BYTES:
+            raise DataError(
+                f"{file} has {state.st_size} bytes, no model is larger than {MAX_MODEL_BYTES}; give a model file"
+            )
+        read = msgspec.json.decode(file.read_bytes(), type=ModelFile)
+    except OSError as error:
+        raise DataError(f"model {file} cannot be read: {error.strerror or error}; check the path") from error
+    except DataError:
+        raise
+    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+        raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
+    if read.schema > SCHEMA or read.schema < 1:
+        raise DataError(f"{file} has schema {read.schema}, this version reads up to {SCHEMA}; upgrade ftlm")
+    try:
+        return read.solved()
+    except ModelError as error:
+        raise DataError(f"{file} holds no usable model: {error}") from error

@@ -3,32 +3,19 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.errors import DataError, ModelError
-from ftlm.base.output import write_atomically
 from ftlm.data.equations import numeric
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
-from ftlm.data.structures import Structure, check_initial
 from ftlm.judge.comparison import Comparison, compare
 from ftlm.judge.residuals import Residuals, resid
-from ftlm.model.file import (
-    MAX_MODEL_BYTES,
-    SCHEMA,
-    EquationFile,
-    ModelFile,
-    TermFile,
-    check_estimate,
-    equation_of,
-)
+from ftlm.model.file import read_model, write_model
 from ftlm.model.typesetting import model_html
 from ftlm.solve.approximation import to_control
 from ftlm.solve.free_run import simulate
@@ -56,13 +43,9 @@ class Model(Solved):
     """
 
     def simulate(
-        self,
-        run: Run,
-        *,
-        tolerance: float = 1e-6,
-        initial: Mapping[str, Mapping[float, float]] | None = None,
+        self, run: Run, *, tolerance: float = 1e-6, initial: Mapping[str, Mapping[float, float]] | None = None,
         largest_m: int = 1 << 21,
-    ) -> Run:
+    ) -> Run:  # fmt: skip
         """Free run on a run's inputs; see :func:`ftlm.simulate`."""
         return simulate(self, run, tolerance=tolerance, initial=initial, largest_m=largest_m)
 
@@ -109,24 +92,7 @@ class Model(Solved):
         DataError
             The file exists and ``force`` is not set, or cannot be written.
         """
-        data = msgspec.json.format(msgspec.json.encode(self._to_file()), indent=2)
-        return write_atomically(path, data + b"\n", force=force)
-
-    def _to_file(self) -> ModelFile:
-        s = self.structure
-        equations = [
-            EquationFile(
-                e.output,
-                e.order.constant,
-                [TermFile(t.signal, t.order.constant, float(t.coefficient), t.factor, t.name) for t in e.terms],
-            )
-            for e in s.equations
-        ]
-        initial = s.initial if isinstance(s.initial, str) else list(s.initial)
-        return ModelFile(
-            "ftlm-model", SCHEMA, s.name, equations, s.coupling, dict(s.delay), initial, s.sensor_filter,
-            dict(self.units), dict(self.orders), self.m, dict(self.about), self.estimate,
-        )  # fmt: skip
+        return write_model(self, path, force=force)
 
     def __str__(self) -> str:
         return "\n".join(numeric(e) for e in self.equations)
@@ -153,30 +119,5 @@ def load_model(path: str | os.PathLike[str]) -> Model:
     DataError
         No such file, a file that is no model (with the place), one of a later schema, or one above 1 MiB.
     """
-    file = Path(path)
-    try:
-        found = file.stat()
-        if not stat.S_ISREG(found.st_mode):
-            raise DataError(f"{file} is no regular file; give a file written by save()")
-        if found.st_size > MAX_MODEL_BYTES:
-            raise DataError(
-                f"{file} has {found.st_size} bytes, no model is larger than {MAX_MODEL_BYTES}; give a model file"
-            )
-        read = msgspec.json.decode(file.read_bytes(), type=ModelFile)
-    except OSError as error:
-        raise DataError(f"model {file} cannot be read: {error.strerror or error}; check the path") from error
-    except DataError:
-        raise
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
-    if read.schema > SCHEMA or read.schema < 1:
-        raise DataError(f"{file} has schema {read.schema}, this version reads up to {SCHEMA}; upgrade ftlm")
-    try:
-        structure = Structure(
-            equations=tuple(equation_of(e) for e in read.equations), coupling=read.coupling, delay=read.delay,
-            initial=check_initial(read.initial), sensor_filter=read.sensor_filter, name=read.name,
-        )  # fmt: skip
-        check_estimate(read)
-        return Model(structure, read.orders, read.units, read.m, read.about, read.estimate)
-    except ModelError as error:
-        raise DataError(f"{file} holds no usable model: {error}") from error
+    record = read_model(path)
+    return Model(record.structure, record.orders, record.units, record.m, record.about, record.estimate)

@@ -51,11 +51,11 @@ def _number_math(value: float) -> Markup:
 
 
 def _symbol_math(name: str) -> Markup:
-    found = SYMBOL.fullmatch(name)
-    if not found:
+    parts = SYMBOL.fullmatch(name)
+    if not parts:
         return Markup("<mi>{}</mi>").format(name)
-    stem = Markup("<mi>{}</mi>").format(GREEK.get(found[1], found[1]))
-    return Markup("<msub>{}<mn>{}</mn></msub>").format(stem, found[2]) if found[2] else stem
+    stem = Markup("<mi>{}</mi>").format(GREEK.get(parts[1], parts[1]))
+    return Markup("<msub>{}<mn>{}</mn></msub>").format(stem, parts[2]) if parts[2] else stem
 
 
 def _derivative_math(order: Order, signal: str) -> Markup:
@@ -72,6 +72,7 @@ def _signed(value: float) -> Markup:
 
 
 def derivative_html(order: Order, signal: str) -> Markup:
+    """Return a derivative of a signal as a line of text."""
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return symbol_html(signal)
     text = str(order) if order.names else number(Exact(round(order.constant, ORDER_DECIMALS) + 0.0))
@@ -111,9 +112,8 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
         for term in item.terms:
             if term.name is None:
                 continue
-            place = Markup("of {} in the equation of {}").format(
-                derivative_html(term.order, term.signal), symbol_html(item.output)
-            )
+            derivative = derivative_html(term.order, term.signal)
+            place = Markup("of {} in the equation of {}").format(derivative, symbol_html(item.output))
             stated = reference.get(term.name)
             shown.add(term.name)
             # + 0.0 makes the negative zero of a product of signs a plain zero.
@@ -133,9 +133,8 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
         note += " Stated values belong to the integer orders of the maker's model."
     kept = [i for i in range(len(columns)) if i not in left_out]
     groups = (("", 3), ("95 % interval", 2), ("", len(kept) - 5)) if known else ()
-    return Table(
-        title, tuple(columns[i] for i in kept), [[row[i] for i in kept] for row in rows], groups=groups, note=note
-    )
+    shown_rows = [[cells[i] for i in kept] for cells in rows]
+    return Table(title, tuple(columns[i] for i in kept), shown_rows, groups=groups, note=note)
 
 
 def model_html(model: Solved) -> str:

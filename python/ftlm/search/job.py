@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import cast
 
 import numpy as np
+from msgspec import UNSET
 
 from ftlm import _core
 from ftlm.base.errors import ModelError
@@ -46,7 +47,9 @@ class Job:
         """As a store keeps it."""
         settings = {f.name: getattr(self.settings, f.name) for f in fields(self.settings) if f.name != "threads"}
         records = tuple(RecordFile.of(r) for r in self.records)
-        return Request(name, self.structure, dict(self.values), settings, records, self.runs, dict(self.units))
+        # Hints are not written: they tell a fit where to start and change no search.
+        structure = replace(self.structure, hints=UNSET)
+        return Request(name, structure, dict(self.values), settings, records, self.runs, dict(self.units))
 
     @classmethod
     def of(cls, request: Request, threads: int, progress: Callable[[int, int, int], None] | None) -> Job:

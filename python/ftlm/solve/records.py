@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from ftlm.base.checks import check_pulses, nearest
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.statistics import is_rest
 from ftlm.data.equations import Equation
+from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.samples import locked
 from ftlm.data.several import Runs
@@ -194,6 +195,24 @@ def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float,
     index = {name: i for i, name in enumerate(signals)}
     terms = [(index[t.signal], t.order.constant) for t in item.terms]
     return index[item.output], item.order.constant, terms
+
+
+def lattice_tuple(
+    item: Equation, signals: Sequence[str], values: Mapping[str, Sequence[float]]
+) -> tuple[int, list[float], list[tuple[int, list[float], bool]]]:
+    """Output, values of alpha, and (signal, values of the order, whether both are free) of each term."""
+
+    def axis(order: Order) -> list[float]:
+        return list(values[order.names[0]]) if order.names else [order.constant]
+
+    terms = [(signals.index(t.signal), axis(t.order), bool(t.order.names) and t.fixed is None) for t in item.terms]
+    return signals.index(item.output), axis(item.order), terms
+
+
+def affine(order: Order, names: Sequence[str]) -> tuple[float, list[float]]:
+    """Constant of an order, and its weight of each free order."""
+    weights = dict(order.weights)
+    return order.constant, [weights.get(n, 0.0) for n in names]
 
 
 def equation_tuple(

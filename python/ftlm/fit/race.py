@@ -1,0 +1,117 @@
+"""The race of starts: short fits on thinned samples, of which the best go on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ftlm.base.errors import FtlmError
+from ftlm.fit.grid import FINEST, Attempt, Grid, descend
+from ftlm.fit.problem import FreeProblem
+from ftlm.fit.simpler import LowerOrder, Simpler, lower_orders, simpler
+from ftlm.fit.starts import delayed_attempts
+
+#: Samples a run of the coarse fits that compare starts; the best ones continue on all samples.
+COARSE_SAMPLES = 1200
+#: Evaluations of every coarse fit, then of those that are ahead: one in RUNNERS, but not fewer than FEWEST.
+FIRST_LAP = 15
+SECOND_LAP = 60
+RUNNERS = 3
+FEWEST = 8
+#: All get as many as those ahead where the best is above the noise by this factor.
+ABOVE_FLOOR = 2.0
+#: Coarse fits that continue on all samples.
+FINALISTS = 3
+#: ... unless their coarse cost exceeds the best one's by this factor.
+CONTENDER = 3.0
+#: Two costs closer than this share are the same optimum.
+SAME_COST = 1e-3
+
+
+@dataclass(frozen=True)
+class Laps:
+    """Who runs how many laps at a time, and who is told."""
+
+    starts: int
+    threads: int
+    progress: Callable[[int, int], None] | None
+
+    def run(
+        self, grid: Grid, runners: Sequence[Attempt], evaluations: int, problem: FreeProblem | None = None
+    ) -> list[Attempt]:
+        """Where the runners get with so many evaluations, best first."""
+        experiments = grid.experiments
+
+        def tried(attempt: Attempt) -> Attempt | None:
+            try:
+                return descend(problem or grid.problem, experiments, attempt, evaluations=evaluations)
+            except FtlmError:
+                # A start whose free run is not finite is no start; if none is left, the fit says so.
+                return None
+
+        ended = []
+        with ThreadPoolExecutor(self.threads) as pool:
+            try:
+                for done, attempt in enumerate(pool.map(tried, runners)):
+                    if attempt is not None:
+                        ended.append(attempt)
+                    if self.progress is not None:
+                        self.progress(min(done, self.starts - 1), self.starts)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        return sorted(ended, key=lambda a: a.level)
+
+
+def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None) -> list[Attempt]:
+    """Coarse fits from all starts, best first, every output weighing alike; noise alone leaves `floor` per residual."""
+    problem, runs = alike.problem, alike.runs
+    starts = delayed_attempts(runs, problem, threads)
+    laps = Laps(len(starts), threads, progress)
+    coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
+    reached = laps.run(coarse, starts, FIRST_LAP)
+    # A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its
+    # own: once more from the same starts, on half the step.
+    while coarse.every < FINEST and (not reached or coarse.matters(reached[0])):
+        coarse = coarse.finer
+        reached = laps.run(coarse, starts, FIRST_LAP)
+    # Whatever a simpler equation reaches, this one reaches too: it starts there with the term's coefficient at 0, or
+    # with a pole too fast to see.
+    others: list[Simpler | LowerOrder] = [*simpler(problem), *lower_orders(problem, runs)]
+    for less in others if reached else []:
+        ended = laps.run(coarse, delayed_attempts(runs, less.problem, threads), FIRST_LAP, less.problem)
+        ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
+        reached = sorted(reached + [less.embedded(a, problem) for a in ended[:1]], key=lambda a: a.level)
+    ahead = max(FEWEST, len(reached) // RUNNERS)
+    rest = reached[ahead:]
+    reached = laps.run(coarse, reached[:ahead], SECOND_LAP)
+    if reached and reached[0].level > ABOVE_FLOOR * floor:
+        # Noise alone would leave less: those behind may yet be on the way to where it does.
+        rest = laps.run(coarse, rest, SECOND_LAP)
+    reached = coarse.finer.ranked(reached + rest)
+    if progress is not None:
+        progress(len(starts), len(starts))
+    return reached
+
+
+def finalists(reached: Sequence[Attempt]) -> list[Attempt]:
+    """Those that go on on all samples: the best of different optima, unless they are far behind."""
+    kept = distinct(reached)[:FINALISTS]
+    return [a for a in kept if a.level <= CONTENDER * kept[0].level]
+
+
+def distinct(reached: Sequence[Attempt]) -> list[Attempt]:
+    """Attempts, best first, without those that ended in the optimum of an earlier one."""
+    kept: list[Attempt] = []
+    for attempt in reached:
+        values = np.array(attempt.orders)
+        same = any(
+            abs(k.level - attempt.level) <= SAME_COST * k.level and np.allclose(values, k.orders, atol=0.02)
+            for k in kept
+        )
+        if not same:
+            kept.append(attempt)
+    return kept

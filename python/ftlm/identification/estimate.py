@@ -1,0 +1,223 @@
+"""From a task to a fit, by each of the estimators: by lattice, by joint output error, by the genetic algorithm."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+from collections.abc import Callable, Mapping
+from concurrent.futures import Executor
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ftlm.base.errors import FtlmError, ModelError
+from ftlm.data.settings import Settings
+from ftlm.data.structures import Initial, Structure
+from ftlm.fit.coefficients import estimate_coefficients, step_bias
+from ftlm.fit.genetic import Genetic, genetic_search
+from ftlm.fit.joint import JointFit, fit_output_error
+from ftlm.fit.problem import FreeProblem
+from ftlm.identification.judged import Task
+from ftlm.identification.warnings import broken_law, uncertain
+from ftlm.judge.comparison import compare
+from ftlm.model.model import Model
+from ftlm.search.job import run_job
+from ftlm.search.orders import make_job
+from ftlm.search.result import SearchResult
+from ftlm.search.store import Store
+from ftlm.solve.records import prepare
+
+#: Most pulses a run on which instrumental variables end where m is not given.
+MOST_PULSES = 1 << 14
+#: Seeds of the genetic algorithm whose errors differ by more than this factor have not all found the optimum.
+SCATTERED = 1.2
+Told = Callable[[int, int], None] | None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What an estimator came to, before anybody has judged it.
+
+    Parameters
+    ----------
+    task
+        What was asked, as the estimator took it.
+    method
+        The estimator.
+    model
+        Its numbers.
+    parameters
+        How many of them were free.
+    settings
+        What they depend on besides the task.
+    warnings
+        What the estimator itself knows against them.
+    searches, errors, joint, covariance
+        Order searches, standard errors of coefficients at the orders found, the joint fit, and the covariance of the
+        model's numbers, where the estimator has them.
+    """
+
+    task: Task
+    method: str
+    model: Model
+    parameters: int
+    settings: dict[str, Any]
+    warnings: list[str]
+    searches: dict[str, SearchResult] = field(default_factory=dict)
+    errors: Mapping[str, float] = field(default_factory=dict)
+    joint: JointFit | None = None
+    covariance: tuple[tuple[float, ...], ...] | None = None
+
+
+def solved(task: Task, method: str, structure: Structure, orders: Mapping[str, float], m: int, **about: Any) -> Model:
+    """The task's structure as a model, once everything in it is a number."""
+    units = {n: u for n, u in task.runs[0].units.items() if n in structure.signals}
+    told = {"method": method, "runs": ", ".join(r.name for r in task.runs), **about}
+    return Model(structure, orders=orders, units=units, m=m, about=told)
+
+
+def in_words(initial: Initial) -> str:
+    """Decided initial terms as settings name them."""
+    return initial if isinstance(initial, str) else f"t^{list(initial)}"
+
+
+def by_output_error(task: Task, m: int | None, threads: int, progress: Told) -> Fit:
+    """Orders and coefficients together by joint output error."""
+    # An order with one value is known.
+    known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
+    structure = task.structure.with_orders(known)
+    record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False)[0]
+    problem = FreeProblem.of(replace(structure, initial=record.initial))
+    joint = fit_output_error(task.runs, problem.structure, threads=threads, progress=progress)
+    orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
+    identified = structure.with_orders(joint.orders).with_coefficients(problem.named(coefficients))
+    moved = problem.number_jacobian(orders, coefficients)
+    spread = moved @ joint.covariance @ moved.T
+    return Fit(
+        Task(task.runs, structure), "output-error",
+        solved(task, "output-error", identified.with_delays(joint.delays), {**known, **joint.orders}, record.m),
+        len(joint.names),
+        {
+            "method": "output-error", "m": record.m, "initial": in_words(record.initial),
+            "refinement": joint.refinement, "starts": len(joint.starts), "noise": joint.noise,
+            "converged": joint.converged,
+        },
+        uncertain(joint, problem), joint=joint,
+        covariance=tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None,
+    )  # fmt: skip
+
+
+def by_lattice(
+    task: Task, settings: Settings, m: int | None, progress: Told, store: str | os.PathLike[str] | None,
+    executor: Executor | None,
+) -> Fit:  # fmt: skip
+    """Orders from the lattice, coefficients by the estimator that ranked them."""
+    method, structure = settings.coefficients, task.structure
+    searches = searched(task, settings, m, progress, store, executor) if structure.order_names else {}
+    orders = {n: v for search in searches.values() for n, v in search.orders.items()}
+    rank = 1
+    if "stage" in searches and method == "instrumental-variables" and structure.coupling == "simulated":
+        rank = coupled_rank(task, settings, m, searches["stage"])
+        orders = searches["stage"].table[rank - 1].orders
+    if m is None and method == "instrumental-variables":
+        # Coefficients without the bias of noise show that of the step: all samples, once the orders are found.
+        m = min(MOST_PULSES, *(run.length - 1 for run in task.runs))
+    at_orders = structure.with_orders(orders)
+    fit = estimate_coefficients(task.runs, at_orders, settings, m)
+    model = solved(task, method, at_orders.with_coefficients(fit.values), orders, fit.m, **settings.to_dict())
+    edges = [(n, v) for search in searches.values() for n, v in search.edges.items()]
+    return Fit(
+        task, method, model, len(orders) + len(fit.values),
+        {
+            **settings.to_dict(), "m": fit.m, "initial": in_words(fit.initial), **({"rank": rank} if rank > 1 else {}),
+        },
+        [
+            *fit.warnings, *step_bias(task.runs, at_orders, settings, fit), *broken_law(model),
+            *(f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in edges),
+        ],
+        searches, fit.errors,
+    )  # fmt: skip
+
+
+def searched(
+    task: Task, settings: Settings, m: int | None, progress: Told, store: str | os.PathLike[str] | None,
+    executor: Executor | None,
+) -> dict[str, SearchResult]:  # fmt: skip
+    """Order searches of all parts of a structure, by name, in one store."""
+    jobs = {
+        name: make_job(task.runs, part, task.lattice_of(part), m=m, progress=progress, **asdict(settings))
+        for name, part in task.structure.parts().items()
+    }
+    with contextlib.ExitStack() as stack:
+        requests = [job.request(name) for name, job in jobs.items()]
+        kept = None if store is None else stack.enter_context(Store(store, requests))
+        return {
+            name: run_job(job, store=kept, number=number, executor=executor)
+            for number, (name, job) in enumerate(jobs.items())
+        }
+
+
+def coupled_rank(task: Task, settings: Settings, m: int | None, search: SearchResult) -> int:
+    """Rank of the kept row whose coupled free run is the likeliest; the table ranks equations one by one.
+
+    Among orders that the equations one by one hardly tell apart, the run of the whole from the inputs alone decides:
+    by the sum of ln NR over outputs, the likelihood of white noise of unknown size.
+    """
+    best, rank = math.inf, 1
+    for row in search.table:
+        at_orders = task.structure.with_orders(row.orders)
+        try:
+            fit = estimate_coefficients(task.runs, at_orders, settings, m)
+            comparison = compare(Model(at_orders.with_coefficients(fit.values), m=fit.m), task.runs, m=fit.m)
+        except FtlmError:
+            # It has a score in the table, but no model.
+            continue
+        cost = sum(math.log(max(f.nr, 1e-300)) for f in comparison.output_error.values())
+        if cost < best:
+            best, rank = cost, row.rank
+    return rank
+
+
+def by_genetic_algorithm(task: Task, settings: Genetic, norm: str, m: int | None, threads: int, progress: Told) -> Fit:
+    """Orders and coefficients by a genetic algorithm: each equation alone, or all under their order law."""
+    structure = task.structure
+    parts = {"stage": structure} if structure.has_order_law else {o: structure.equation(o) for o in structure.outputs}
+    free = {name: (*part.order_names, *part.coefficient_names) for name, part in parts.items()}
+    names = [n for own in free.values() for n in own]
+    strange = [n for n in settings.bounds if n not in names]
+    if strange:
+        raise ModelError(f"bounds of {strange[0]!r}: there is no such number; free are {', '.join(names)}")
+    record = prepare(task.runs, structure, m, power_of_two=True)[0]
+    ends = {}
+    for name, part in parts.items():
+        own = replace(settings, bounds={n: b for n, b in settings.bounds.items() if n in free[name]})
+        records = prepare(task.runs, part, record.m, power_of_two=True)
+        ends[name] = genetic_search(
+            records, part, task.lattice_of(part), own, norm=norm, threads=threads, progress=progress
+        )
+    orders = {n: v for end in ends.values() for n, v in end.orders.items()}
+    coefficients = {n: v for end in ends.values() for n, v in end.coefficients.items()}
+    bounds = {n: b for end in ends.values() for n, b in end.bounds.items()}
+    seeds, identified = list(settings.seeds), structure.with_orders(orders).with_coefficients(coefficients)
+    model = solved(task, "genetic", identified, orders, record.m, seeds=str(seeds))
+    warnings = broken_law(model)
+    for name, (low, high) in bounds.items():
+        value = {**orders, **coefficients}[name]
+        if min(value - low, high - value) < 1e-3 * (high - low) and value not in (0.0, 2.0):
+            warnings.append(f"{name} = {value:.4g} is on its bound for the genetic algorithm; widen it")
+    for name, end in ends.items():
+        low, high = min(end.errors.values()), max(end.errors.values())
+        if high > SCATTERED * low:
+            warnings.append(
+                f"{name}: the seeds of the genetic algorithm end at errors from {low:.4g} to {high:.4g}; "
+                "it has not found the optimum of each"
+            )
+    used = {
+        "method": "genetic", "norm": norm, "m": record.m, "initial": "rest", "seeds": seeds,
+        "population": settings.population, "bounds": {n: list(b) for n, b in bounds.items()},
+        "errors": {name: {str(seed): e for seed, e in end.errors.items()} for name, end in ends.items()},
+        "evaluations": {name: sum(end.evaluations.values()) for name, end in ends.items()},
+    }  # fmt: skip
+    return Fit(task, "genetic", model, len(orders) + len(coefficients), used, warnings)
