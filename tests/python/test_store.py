@@ -644,7 +644,7 @@ def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_w
     finished, half = tmp_path / "finished.ftlm", tmp_path / "half.ftlm"
     finished.write_bytes(whole)
     half.write_bytes(whole[: len(whole) // 2])
-    monkeypatch.setattr("ftlm.search.store.ALGORITHM", 2)
+    monkeypatch.setattr("ftlm.search.frames.ALGORITHM", 2)
     assert bytes_of(ftlm.resume_search(finished)["y"]) == expected
     assert finished.read_bytes() == whole
     kept = read_store(half).end

@@ -11,24 +11,7 @@ from pathlib import Path
 import msgspec
 
 from ftlm.base.errors import DataError, ModelError
-from ftlm.search.frames import (
-    DECODER,
-    DIGEST,
-    MAGIC,
-    Begun,
-    Checkpoint,
-    Counts,
-    Failures,
-    Frame,
-    Joined,
-    Place,
-    Request,
-    Requests,
-    Rounds,
-    Row,
-    Verdicts,
-    next_frame,
-)
+from ftlm.search import frames
 
 
 @dataclass
@@ -36,13 +19,13 @@ class Half:
     """A stretch of rounds, half done, with all rows found since its start."""
 
     last: int
-    place: Place
-    rows: list[Row]
-    counts: Counts
-    failures: Failures
+    place: frames.Place
+    rows: list[frames.Row]
+    counts: frames.Counts
+    failures: frames.Failures
 
     @property
-    def checkpoint(self) -> Checkpoint:
+    def checkpoint(self) -> frames.Checkpoint:
         """Where to go on, as the core takes it."""
         return self.place, (tuple(self.rows), self.counts, self.failures)
 
@@ -55,34 +38,34 @@ class Section:
     """
 
     law: bool = False
-    done: dict[int, Rounds | Verdicts] = field(default_factory=dict)
+    done: dict[int, frames.Rounds | frames.Verdicts] = field(default_factory=dict)
     open: dict[int, Half] = field(default_factory=dict)
-    joined: Joined | None = None
+    joined: frames.Joined | None = None
     _firsts: list[int] = field(default_factory=list)
 
-    def take(self, frame: Frame) -> None:
+    def take(self, frame: frames.Frame) -> None:
         """Take a frame in; refuse one that is there already, that is no stretch, or of another kind of search."""
-        if self.joined is not None or (isinstance(frame, Joined) and not self.law):
+        if self.joined is not None or (isinstance(frame, frames.Joined) and not self.law):
             raise ModelError("a table stands where none belongs")
-        if isinstance(frame, Joined):
+        if isinstance(frame, frames.Joined):
             self.joined = frame
             return
-        if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
+        if frame.first >= frame.last or isinstance(frame, frames.Verdicts) != self.law:
             raise ModelError(f"rounds {frame.first} to {frame.last} are no stretch")
         place = bisect.bisect_left(self._firsts, frame.last)
         if place and self.done[self._firsts[place - 1]].last > frame.first:
             raise ModelError(f"rounds {frame.first} to {frame.last} are there twice")
-        if isinstance(frame, Begun):
+        if isinstance(frame, frames.Begun):
             self._take_begun(frame)
             return
         count = frame.last - frame.first
-        if isinstance(frame, Verdicts) and (len(frame.values), len(frame.kinds)) != (8 * count, count):
+        if isinstance(frame, frames.Verdicts) and (len(frame.values), len(frame.kinds)) != (8 * count, count):
             raise ModelError(f"candidates {frame.first} to {frame.last} have other verdicts")
         self.open.pop(frame.first, None)
         self.done[frame.first] = frame
         self._firsts.insert(place, frame.first)
 
-    def _take_begun(self, frame: Begun) -> None:
+    def _take_begun(self, frame: frames.Begun) -> None:
         half = self.open.get(frame.first)
         if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
             raise ModelError(f"rounds {frame.first} to {frame.last} are continued as something else")
@@ -98,13 +81,13 @@ class Section:
     @property
     def dealt(self) -> int:
         """Candidates dealt with."""
-        done = (len(f.kinds) if isinstance(f, Verdicts) else sum(f.part[1][1:]) for f in self.done.values())
+        done = (len(f.kinds) if isinstance(f, frames.Verdicts) else sum(f.part[1][1:]) for f in self.done.values())
         return sum(done) + sum(sum(half.counts[1:]) for half in self.open.values())
 
     @property
     def best(self) -> float | None:
         """Smallest raw score so far, of one equation's candidates."""
-        rows = [row for frame in self.done.values() if isinstance(frame, Rounds) for row in frame.part[0]]
+        rows = [row for frame in self.done.values() if isinstance(frame, frames.Rounds) for row in frame.part[0]]
         return min((row[1] for row in (*rows, *(r for half in self.open.values() for r in half.rows))), default=None)
 
 
@@ -112,7 +95,7 @@ class Section:
 class Contents:
     """What a store holds."""
 
-    requests: tuple[Request, ...]
+    requests: tuple[frames.Request, ...]
     sections: list[Section]
     version: str
     algorithm: int
@@ -137,13 +120,13 @@ def read_store(path: str | os.PathLike[str]) -> Contents:
 
 def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
     """Contents of a store's bytes; refuse what is none, has no first frame, or is of a later version."""
-    start = bytes(data[: len(MAGIC)])
-    if not MAGIC.startswith(start):
+    start = bytes(data[: len(frames.MAGIC)])
+    if not frames.MAGIC.startswith(start):
         raise DataError(f"{path} is no ftlm search store; give a file written with store= (--store)")
     contents: Contents | None = None
-    offset, digest = len(MAGIC), bytes(DIGEST)
+    offset, digest = len(frames.MAGIC), bytes(frames.DIGEST)
     while offset < len(data):
-        got = next_frame(data, offset, digest)
+        got = frames.next_frame(data, offset, digest)
         if isinstance(got, str):
             if contents is None:
                 why = "it ends before its first frame does" if got == "torn" else got
@@ -153,10 +136,10 @@ def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
             break
         payload, digest, end = got
         try:
-            frame = DECODER.decode(payload)
+            frame = frames.DECODER.decode(payload)
             if contents is None:
                 contents = _opened(frame, end, digest)
-            elif isinstance(frame, Requests):
+            elif isinstance(frame, frames.Requests):
                 raise ModelError("requests stand twice")
             else:
                 if frame.search >= len(contents.sections):
@@ -173,8 +156,8 @@ def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:
     return contents
 
 
-def _opened(frame: Requests | Frame, end: int, digest: bytes) -> Contents:
-    if not isinstance(frame, Requests) or not frame.requests:
+def _opened(frame: frames.Requests | frames.Frame, end: int, digest: bytes) -> Contents:
+    if not isinstance(frame, frames.Requests) or not frame.requests:
         raise ModelError("the first frame holds no request")
     sections = [Section(law=r.structure.has_order_law) for r in frame.requests]
     return Contents(frame.requests, sections, frame.version, frame.algorithm, end, digest)

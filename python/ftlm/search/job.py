@@ -21,7 +21,7 @@ from ftlm.search.frames import RecordFile, Request
 from ftlm.search.result import SearchResult, SearchRow
 from ftlm.search.rounds import search_equation, search_stage
 from ftlm.search.store import Store
-from ftlm.search.work import EquationWork, StageWork, Told
+from ftlm.search.work import CoreRecord, EquationWork, StageWork, Told
 from ftlm.solve.records import Record, initial_tuple, named_coefficients, named_signals
 
 #: Settings that tell one search from another; threads make no difference to it.
@@ -71,24 +71,28 @@ class Job:
             raise ModelError("an order has no values")
         return cls(request.runs, request.units, structure, request.values, records, settings, progress)
 
+    def _recorded(self) -> tuple[tuple[CoreRecord, ...], list[bool], tuple[bool, list[float]], Settings]:
+        record = self.records[0]
+        runs = tuple(r.core() for r in self.records)
+        return runs, list(record.inputs), initial_tuple(record.initial), self.settings
+
     def equation_work(self) -> EquationWork:
         """What the rounds of one equation are computed from."""
-        item, record = self.structure.equations[0], self.records[0]
-        signals = record.signals
+        item, signals = self.structure.equations[0], self.records[0].signals
         axes = [
             (signals.index(t.signal), axis_of(t.order, self.values), bool(t.order.names) and t.fixed is None)
             for t in item.terms
         ]
         return EquationWork(
-            tuple(r.core() for r in self.records), list(record.inputs), initial_tuple(record.initial), self.settings,
+            *self._recorded(),
             orders=(signals.index(item.output), axis_of(item.order, self.values), axes),
             fixed=[t.fixed for t in item.terms],
         )  # fmt: skip
 
     def stage_work(self) -> StageWork:
         """What the search of a stage is computed from."""
-        structure, record = self.structure, self.records[0]
-        names, signals = structure.order_names, record.signals
+        structure, signals = self.structure, self.records[0].signals
+        names = structure.order_names
 
         def affine(order: Order) -> tuple[float, list[float]]:
             weights = dict(order.weights)
@@ -100,7 +104,7 @@ class Job:
         ]
         points = sum(r.m for r in self.records)
         return StageWork(
-            tuple(r.core() for r in self.records), list(record.inputs), initial_tuple(record.initial), self.settings,
+            *self._recorded(),
             axes=[list(self.values[n]) for n in names],
             laws=laws,
             fixed=[[t.fixed for t in e.terms] for e in structure.equations],

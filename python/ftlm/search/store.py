@@ -22,7 +22,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 
@@ -32,24 +32,8 @@ from ftlm import _core
 from ftlm._core import __version__
 from ftlm.base.errors import DataError
 from ftlm.base.output import write_atomically
+from ftlm.search import frames
 from ftlm.search.contents import contents_of
-from ftlm.search.frames import (
-    ALGORITHM,
-    DIGEST,
-    ENCODER,
-    MAGIC,
-    Begun,
-    Checkpoint,
-    Failures,
-    Frame,
-    Joined,
-    Request,
-    Requests,
-    Rounds,
-    Verdicts,
-    framed,
-    next_frame,
-)
 
 #: Longest time [s] between two writes, each flushed to disk: with the time between checkpoints, under a second is lost.
 INTERVAL = 0.3
@@ -63,15 +47,15 @@ class Store:
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], requests: Sequence[Request] | None = None, *, salvage: bool = False
+        self, path: str | os.PathLike[str], requests: Sequence[frames.Request] | None = None, *, salvage: bool = False
     ) -> None:
         self.path = Path(path)
         #: What was mended, in words.
         self.notes: list[str] = []
         self._last = time.monotonic()
         #: By search and first round: what is not written yet, and the failures written last.
-        self._waiting: dict[tuple[int, int], Begun] = {}
-        self._failures: dict[tuple[int, int], Failures | None] = {}
+        self._waiting: dict[tuple[int, int], frames.Begun] = {}
+        self._failures: dict[tuple[int, int], frames.Failures | None] = {}
         flags = os.O_RDWR | (os.O_CREAT if requests is not None else 0) | getattr(os, "O_BINARY", 0)
         try:
             self._handle = os.open(self.path, flags | getattr(os, "O_CLOEXEC", 0), 0o666)
@@ -101,18 +85,18 @@ class Store:
                 f"store {self.path} is in use by another search; wait for it, stop it, or choose another file"
             ) from error
 
-    def _begin(self, requests: Sequence[Request] | None, *, salvage: bool) -> None:
+    def _begin(self, requests: Sequence[frames.Request] | None, *, salvage: bool) -> None:
         os.lseek(self._handle, 0, os.SEEK_SET)
         data = b"".join(iter(lambda: os.read(self._handle, 1 << 20), b""))
         if requests is not None and _unbegun(data):
-            payload = ENCODER.encode(Requests(ALGORITHM, __version__, tuple(requests)))
+            payload = frames.ENCODER.encode(frames.Requests(frames.ALGORITHM, __version__, tuple(requests)))
             # A payload read back must be the one asked for: what would not survive is found before any work.
-            frame, digest = framed(payload, len(MAGIC), bytes(DIGEST))
+            frame, digest = frames.framed(payload, len(frames.MAGIC), bytes(frames.DIGEST))
             self._end = 0
-            self._write(MAGIC + frame)
+            self._write(frames.MAGIC + frame)
             self._digest = digest
             self._sync_folder()
-            data = MAGIC + frame
+            data = frames.MAGIC + frame
         self.contents = held = contents_of(self.path, memoryview(data))
         if requests is not None:
             self._check_same(requests, held.requests)
@@ -122,9 +106,11 @@ class Store:
         elif held.torn:
             self.notes.append(f"{held.torn} bytes of an unfinished write at byte {held.end} were dropped")
         if held.end < len(data):
-            self._truncate()
+            with self._writing():
+                os.ftruncate(self._handle, self._end)
+                os.fsync(self._handle)
 
-    def _check_same(self, asked: Sequence[Request], held: Sequence[Request]) -> None:
+    def _check_same(self, asked: Sequence[frames.Request], held: Sequence[frames.Request]) -> None:
         if [r.name for r in asked] != [r.name for r in held]:
             names = ", ".join(r.name for r in held)
             raise DataError(f"store {self.path} holds searches of {names}; choose another file")
@@ -147,18 +133,19 @@ class Store:
         self.notes.append(f"{lost} damaged bytes from byte {self.contents.end} on were dropped; {copy} keeps them")
         self.contents.damage = None
 
-    def _truncate(self) -> None:
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Leave the store as it was where writing fails, and say so."""
         try:
-            os.ftruncate(self._handle, self._end)
-            os.fsync(self._handle)
+            yield
         except OSError as error:
-            raise self._failed(error) from error
-
-    def _failed(self, error: OSError) -> DataError:
-        return DataError(
-            f"store {self.path} cannot be written: {error.strerror or error}; what it holds is whole: make room, or "
-            "move it to another folder, and resume it"
-        )
+            # Where even that fails the next reader drops the torn frame.
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._handle, self._end)
+            raise DataError(
+                f"store {self.path} cannot be written: {error.strerror or error}; what it holds is whole: make room, "
+                "or move it to another folder, and resume it"
+            ) from error
 
     def _sync_folder(self) -> None:
         with contextlib.suppress(OSError):  # some file systems do not sync folders, and Windows opens none
@@ -169,62 +156,58 @@ class Store:
                 os.close(folder)
 
     def _write(self, data: bytes) -> None:
-        """Append and flush to disk; a write that fails leaves the store as it was."""
-        try:
+        """Append and flush to disk."""
+        with self._writing():
             os.lseek(self._handle, self._end, os.SEEK_SET)
             left = memoryview(data)
             while left:
                 left = left[os.write(self._handle, left) :]
             os.fsync(self._handle)
-        except OSError as error:
-            # Where even that fails the next reader drops the torn frame.
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._handle, self._end)
-            raise self._failed(error) from error
         self._end += len(data)
         self._last = time.monotonic()
 
-    def _append(self, frames: Sequence[Frame]) -> None:
+    def _append(self, added: Sequence[frames.Frame]) -> None:
         held = self.contents
-        if held.algorithm != ALGORITHM:
+        if held.algorithm != frames.ALGORITHM:
             # A finished search is only read, whatever made it.
             raise DataError(
                 f"store {self.path} is of ftlm {held.version}, whose rounds follow algorithm {held.algorithm}; this "
-                f"version's is {ALGORITHM}: finish the search with that version, or start it again in another file"
+                f"version's is {frames.ALGORITHM}: finish the search with that version, or start it again in another "
+                "file"
             )
         data, digest, offset = [], self._digest, self._end
-        for frame in frames:
-            payload = ENCODER.encode(frame)
-            piece, digest = framed(payload, offset, digest)
+        for frame in added:
+            payload = frames.ENCODER.encode(frame)
+            piece, digest = frames.framed(payload, offset, digest)
             data.append(piece)
             offset += len(piece)
         self._write(b"".join(data))
         self._digest = digest
-        for frame in frames:
+        for frame in added:
             self.contents.sections[frame.search].take(frame)
 
-    def save(self, search: int, first: int, last: int, checkpoint: Checkpoint | None) -> None:
+    def save(self, search: int, first: int, last: int, checkpoint: frames.Checkpoint | None) -> None:
         """Note how far a stretch of rounds is; it is written with others, or when it is time."""
         if checkpoint is not None:
             place, (rows, counts, failures) = checkpoint
             before = self._waiting.get((search, first))
             rows = (*(before.rows if before else ()), *rows)
-            self._waiting[search, first] = Begun(search, first, last, place, rows, counts, failures)
+            self._waiting[search, first] = frames.Begun(search, first, last, place, rows, counts, failures)
         if time.monotonic() - self._last >= INTERVAL:
             self.flush()
 
     def flush(self) -> None:
         """Write what waits."""
-        frames = []
+        due = []
         for key, frame in self._waiting.items():
             same = self._failures.get(key) == frame.failures
-            frames.append(msgspec.structs.replace(frame, failures=None) if same else frame)
+            due.append(msgspec.structs.replace(frame, failures=None) if same else frame)
             self._failures[key] = frame.failures
         self._waiting.clear()
-        if frames:
-            self._append(frames)
+        if due:
+            self._append(due)
 
-    def done(self, frame: Rounds | Verdicts) -> None:
+    def done(self, frame: frames.Rounds | frames.Verdicts) -> None:
         """Append a stretch that is done."""
         self._waiting.pop((frame.search, frame.first), None)
         self._failures.pop((frame.search, frame.first), None)
@@ -233,7 +216,7 @@ class Store:
     def joined(self, search: int, table: _core._FoundStage) -> None:
         """Append the table of a search under an order law."""
         frame = {"type": "joined", "search": search, **{k: table[k] for k in ("rows", "counts", "failures")}}
-        self._append([msgspec.convert(frame, Joined)])
+        self._append([msgspec.convert(frame, frames.Joined)])
 
     def close(self) -> None:
         """Write what waits and give the lock back."""
@@ -256,6 +239,6 @@ class Store:
 
 def _unbegun(data: bytes) -> bool:
     """Whether a file is empty or what is left of a store whose first frame was never finished."""
-    if len(data) < len(MAGIC):
-        return MAGIC.startswith(data)
-    return data.startswith(MAGIC) and next_frame(memoryview(data), len(MAGIC), bytes(DIGEST)) == "torn"
+    if not data.startswith(frames.MAGIC):
+        return frames.MAGIC.startswith(data)
+    return frames.next_frame(memoryview(data), len(frames.MAGIC), bytes(frames.DIGEST)) == "torn"

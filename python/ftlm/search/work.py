@@ -24,6 +24,7 @@ from ftlm.search.frames import Outcomes, Part, Span
 READY = 2
 Table = TypeVar("Table")
 Piece = TypeVar("Piece")
+CoreRecord = tuple[float, Floats, Floats | None]
 Told = Callable[[int, int, int], None]
 
 
@@ -31,7 +32,7 @@ Told = Callable[[int, int, int], None]
 class Work(ABC, Generic[Table]):
     """What every round of a search is computed from, and the table it ends in."""
 
-    runs: tuple[tuple[float, Floats, Floats | None], ...]
+    runs: tuple[CoreRecord, ...]
     inputs: list[bool]
     initial: tuple[bool, list[float]]
     settings: Settings
@@ -150,23 +151,14 @@ def some_candidates(key: str, work: StageWork | None, spans: list[Span], threads
 
 
 def _timed(key: str, work: Work[Any] | None, do: Callable[[Any], Piece]) -> tuple[float, Piece] | None:
-    search = _known(key, work)
-    if search is None:
-        return None
+    with _lock:
+        search = _ready.get(key) or (None if work is None else work.ready())
+        if search is None:
+            return None
+        _ready[key] = search
+        _ready.move_to_end(key)
+        while len(_ready) > READY:
+            _ready.popitem(last=False)
     began = time.monotonic()
     piece = do(search)
     return time.monotonic() - began, piece
-
-
-def _known(key: str, work: Work[Any] | None) -> _core.OrderSearch | _core.StageSearch | None:
-    with _lock:
-        search = _ready.get(key)
-        if search is None:
-            if work is None:
-                return None
-            search = work.ready()
-            _ready[key] = search
-            while len(_ready) > READY:
-                _ready.popitem(last=False)
-        _ready.move_to_end(key)
-        return search
