@@ -25,7 +25,7 @@ import numpy as np
 
 import ftlm
 from ftlm.paper.arm import demo_plant
-from ftlm.search.store import read_store
+from ftlm.search.contents import read_store
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 

@@ -13,7 +13,7 @@ import numpy as np
 import ftlm
 from ftlm.data.orders import Order, parse_values
 from ftlm.files import apart
-from ftlm.search import store
+from ftlm.search import frames
 
 #: Files of the fuzzers live in memory where there is such a place.
 FOLDER = Path("/dev/shm") if Path("/dev/shm").is_dir() else Path(tempfile.gettempdir())
@@ -85,16 +85,16 @@ def sealed(data):
 
     The input is a chain of payloads, each behind its length.
     """
-    frames, at, digest = [store.MAGIC], 0, bytes(store.DIGEST)
-    offset = len(store.MAGIC)
+    pieces, at, digest = [frames.MAGIC], 0, bytes(frames.DIGEST)
+    offset = len(frames.MAGIC)
     while at + 4 <= len(data):
         (length,) = struct.unpack_from("<I", data, at)
         payload = data[at + 4 : at + 4 + length]
         at += 4 + length
-        frame, digest = store._frame(payload, offset, digest)
-        frames.append(frame)
-        offset += len(frame)
-    stored(b"".join(frames))
+        piece, digest = frames.framed(payload, offset, digest)
+        pieces.append(piece)
+        offset += len(piece)
+    stored(b"".join(pieces))
 
 
 def stored(data):
@@ -115,12 +115,12 @@ SLOW = ("mat", "parquet")
 
 def unsealed(data):
     """Payloads of a store, each behind its length: what :func:`sealed` takes."""
-    at, out = len(store.MAGIC), []
+    at, out = len(frames.MAGIC), []
     while at < len(data):
         (length,) = struct.unpack_from("<I", data, at)
-        assert struct.unpack_from("<I", data, at + 4)[0] == store._check(data[at : at + 4], at) != zlib.crc32(b"")
+        assert struct.unpack_from("<I", data, at + 4)[0] == frames._check(data[at : at + 4], at) != zlib.crc32(b"")
         out.append(data[at : at + 4] + data[at + 8 : at + 8 + length])
-        at += 8 + length + store.DIGEST
+        at += 8 + length + frames.DIGEST
     return b"".join(out)
 
 
@@ -180,8 +180,8 @@ def _seeds(target, folder):
     )
     whole = (folder / "a.ftlm").read_bytes()
     halves = unsealed(whole)
-    request = store._decoder.decode(halves[4 : 4 + struct.unpack_from("<I", halves)[0]])
-    half = store.Progress(
+    request = frames.DECODER.decode(halves[4 : 4 + struct.unpack_from("<I", halves)[0]])
+    half = frames.Begun(
         0, 0, 1, (0, 1, 4, 256, float("inf")), ((0, 1.0, (1.0, 2.0), ((),)),), (0, 0, 1, 0, 0, 0, 0), ()
     )
     payloads = [msgspec.msgpack.encode(frame) for frame in (request, half)]

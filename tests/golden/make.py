@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 
 import ftlm
+from ftlm.data.settings import Settings
+from ftlm.search.frames import Rounds
 from ftlm.search.orders import make_job
 from ftlm.search.store import Store
 
@@ -41,11 +43,12 @@ def main():
     lattice = ftlm.lattice(step=0.05, beta=(0.0, 1.0), mu=(0.0, 1.0))
     options = {"m": 32, "early_stopping": False, "threads": 1, "keep": 5}
     whole = ftlm.search_orders(given, structure, lattice, store=folder / "search.ftlm", **options)
-    job = make_job(given, structure, lattice, **options)
+    settings = Settings.check("output-error", "l1", "multi-innovation", 7, 1.0, "haar", 5, 1, early_stopping=False)
+    job = make_job(given, structure, lattice, settings, m=32)
     with Store(folder / "half.ftlm", [job.request("y")]) as store:
-        work, _ = job.work()
+        work = job.equation_work()
         part = work.ready().rounds(0, 1, [], None, 1, None, None)
-        store.done(0, 0, 1, part)
+        store.done(Rounds(0, 0, 1, part))
         # A stretch that has only begun.
         store.save(0, 1, 2, ((1, 0, 0, 0, float("inf")), ((), (0,) * 7, ())))
     expected = {

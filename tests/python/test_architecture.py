@@ -1,6 +1,7 @@
 """The rules of the house, enforced: who may import what, what every file and every public name says of itself."""
 
 import ast
+import importlib
 import importlib.util
 import inspect
 import re
@@ -14,11 +15,14 @@ from pathlib import Path
 import pytest
 
 import ftlm
+import house
+from ftlm import _core
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGE = ROOT / "python" / "ftlm"
 PYTHON = sorted(PACKAGE.rglob("*.py"))
 RUST = sorted((ROOT / "rust").rglob("*.rs"))
+FUNCTIONS = [n for n in ftlm.__all__ if inspect.isfunction(getattr(ftlm, n))]
 
 
 def name_of(path):
@@ -42,6 +46,104 @@ def imports_of(path):
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
             found.add(node.module.split(".")[0])
     return found
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The storeys; `house.py` reads them, `test_house.py` tries it on small trees in which one rule is broken
+
+
+def test_an_import_goes_to_its_own_folder_or_down():
+    assert house.upward_imports(PACKAGE) == []
+
+
+def test_no_circle_of_python_files():
+    assert house.python_circles(PACKAGE) == []
+
+
+def test_no_circle_of_rust_files():
+    assert house.rust_circles(ROOT / "rust") == []
+
+
+@pytest.mark.parametrize(("folder", "suffix"), [(PACKAGE, ".py"), (ROOT / "rust", ".rs")], ids=["python", "rust"])
+def test_every_file_can_be_read_at_a_sitting(folder, suffix):
+    assert house.long_files(folder, suffix) == []
+
+
+def test_no_import_hides_in_a_function():
+    assert house.hidden_imports(PACKAGE) == []
+
+
+def test_faces_are_faces_and_nothing_inside_uses_them():
+    assert house.broken_faces(PACKAGE) == []
+    assert house.uses_of_faces(PACKAGE) == []
+
+
+def test_no_folder_takes_the_place_of_a_public_function():
+    assert house.folders_named_as(PACKAGE, FUNCTIONS) == []
+
+
+def test_every_storey_is_on_the_map():
+    table = section("The map")
+    folders = {p.parent.name for p in PACKAGE.glob("*/__init__.py")}
+    assert folders == set(house.LEVEL) - {"."} == set(re.findall(r"^\| `python/ftlm/(\w+)/` \|", table, re.MULTILINE))
+    assert all((ROOT / name).is_dir() for name in re.findall(r"^\| `([\w/]+/)` \|", table, re.MULTILINE))
+
+
+#: Calls that need no wrapper, and why.
+ATTACHED = {
+    "portable": "sets one flag, for tests",
+}
+
+
+def test_every_entry_of_the_extension_computes_detached_and_caught():
+    """A panic becomes InternalError, and other Python threads go on: each entry calls the one way into the core."""
+    bodies, _ = house.entries(ROOT / "rust" / "python")
+    reached = {name.split("::")[1] for name in bodies}
+    public = {name for name in dir(_core) if not name.startswith("__") and callable(getattr(_core, name))}
+    assert public == {name for name in reached if "." not in name} | {n.split(".")[0] for n in reached if "." in n}
+    bare = house.unwrapped(ROOT / "rust" / "python", ["detached", "attached"])
+    assert [name for name in bare if name.split("::")[1] not in ATTACHED] == []
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The walk of a run
+
+
+def section(title):
+    """A section of CONTRIBUTING.md."""
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    found = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", text, re.MULTILINE | re.DOTALL)
+    assert found is not None
+    return found[1]
+
+
+def test_the_walk_of_a_run_is_the_one_it_takes(tmp_path, small_run):
+    """Each line of the walk names one function; a run passes them in that order."""
+    lines = re.findall(r"^(\d+)\. (.*(?:\n   .*)*)", section("The walk of a run"), re.MULTILINE)
+    assert [int(number) for number, _ in lines] == list(range(1, 11))
+    walk = []
+    for _, line in lines:
+        (name,) = re.findall(r"`((?:\w+\.)+\w+)`", line)
+        module, _, function = name.rpartition(".")
+        code = inspect.unwrap(getattr(importlib.import_module(f"ftlm.{module}"), function)).__code__
+        walk.append((name, code))
+    names, passed = {code: name for name, code in walk}, []
+
+    def note(frame, event, _):
+        if event == "call" and names.get(frame.f_code, passed) not in (passed, *passed):
+            passed.append(names[frame.f_code])
+
+    small_run.to_csv(tmp_path / "run.csv")
+    before = sys.getprofile()
+    sys.setprofile(note)
+    try:
+        run = ftlm.load(tmp_path / "run.csv")
+        structure = ftlm.equation("D^alpha y = a D^beta y + b u", initial="rest")
+        options = {"method": "multi-innovation", "lattice": ftlm.lattice(step=0.25), "m": 64, "threads": 1}
+        ftlm.identify(run, structure, **options).report(tmp_path / "run.html")
+    finally:
+        sys.setprofile(before)
+    assert passed == [name for name, _ in walk]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -180,8 +282,8 @@ def loops_over_samples(source):
 @pytest.mark.parametrize("path", PYTHON, ids=name_of)
 def test_python_does_not_loop_over_samples(path):
     # Approximate: it knows the names that samples and their number go by. Exempt are the q8 loop, paced by its board,
-    # and the report, which writes the thinned points of a picture one by one.
-    if name_of(path).startswith(("python/ftlm/rig/quanser.py", "python/ftlm/report/")):
+    # and drawing, which writes the thinned points of a picture one by one.
+    if name_of(path).startswith(("python/ftlm/rig/quanser.py", "python/ftlm/paint/")):
         return
     assert loops_over_samples(path.read_text(encoding="utf-8")) == []
 
@@ -268,9 +370,6 @@ def documented(text):
     return {name.strip().lstrip("*").replace("\\", "") for head in heads for name in head.split(",")}
 
 
-FUNCTIONS = [n for n in ftlm.__all__ if inspect.isfunction(getattr(ftlm, n))]
-
-
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_every_parameter_of_every_public_function_is_documented(name):
     function = getattr(ftlm, name)
@@ -281,7 +380,12 @@ def test_every_parameter_of_every_public_function_is_documented(name):
     assert [s for s in ("Parameters", "Returns", "Raises", "Notes", "Examples") if s in sections] == sections
 
 
-@pytest.mark.parametrize("name", [n for n in ftlm.__all__ if is_dataclass(getattr(ftlm, n))])
+def is_made_of_its_fields(record):
+    """Whether a public record is made by giving its fields; a run, say, refuses to be."""
+    return is_dataclass(record) and bool(inspect.signature(record).parameters)
+
+
+@pytest.mark.parametrize("name", [n for n in ftlm.__all__ if is_made_of_its_fields(getattr(ftlm, n))])
 def test_every_field_of_every_public_record_is_documented(name):
     record = getattr(ftlm, name)
     assert documented(record.__doc__) == {f.name for f in fields(record)}

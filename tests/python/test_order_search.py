@@ -312,7 +312,7 @@ def test_progress_shows_rate_share_pruned_and_time_left(monkeypatch, run):
     shown = io.StringIO()
     shown.isatty = lambda: True
     monkeypatch.setattr(sys, "stderr", shown)
-    monkeypatch.setattr(ftlm.progress, "PATIENCE", 0.0)
+    monkeypatch.setattr("ftlm.base.progress.PATIENCE", 0.0)
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "120")
     with ftlm.progress.Progress("searching") as bar:

@@ -19,9 +19,12 @@ import pytest
 import ftlm
 import store as bench
 from ftlm import _core
+from ftlm.data.settings import Settings
 from ftlm.errors import ModelError
+from ftlm.search.contents import read_store
 from ftlm.search.frames import MAGIC, Joined, Rounds, Verdicts
-from ftlm.search.store import Store, read_store
+from ftlm.search.orders import make_job
+from ftlm.search.store import Store
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 COARSE = ftlm.lattice(step=0.1)
@@ -55,8 +58,13 @@ def whole(run, tmp_path_factory):
     return path.read_bytes()
 
 
+def job_of(run, structure, lattice, *, m, keep=20, early_stopping=True):
+    settings = Settings.check("output-error", "l1", "multi-innovation", 7, 1.0, "haar", keep, None, early_stopping)
+    return make_job(run, structure, lattice, settings, m=m)
+
+
 def rows_of(contents):
-    parts = [part for _, part in contents.sections[0].done.values()]
+    parts = [frame.part for frame in contents.sections[0].done.values()]
     parts += [half.checkpoint[1] for half in contents.sections[0].open.values()]
     return [row for rows, _, _ in parts for row in rows]
 
@@ -102,10 +110,8 @@ def test_several_runs_a_delay_and_a_sensor_filter_survive_in_a_store(run, tmp_pa
 
 def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
     """R4: any number of threads, any stretch of rounds, in any order."""
-    from ftlm.search.orders import make_job
-
-    job = make_job(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
-    work, _ = job.work()
+    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
+    work = job.equation_work()
     count, ends = work.plan()
     assert count == 19_295
     assert ends == [1, 3, 5]
@@ -287,7 +293,7 @@ def test_damage_is_reported_with_its_offset_and_salvaged_on_demand(run, whole, e
     path.write_bytes(whole)
     with Store(path) as kept:
         second = kept.contents.sections[0].done[1]
-    assert second[0] == 3
+    assert second.last == 3
     damaged = bytearray(whole)
     # Within the first round's frame: the last two frames follow it.
     at = len(whole) - len(whole) // 3
@@ -341,8 +347,8 @@ def search_stage(run, path=None, *, structure=None, lattice=None, **options):
 @pytest.fixture
 def small_pieces(monkeypatch):
     """Some candidates a frame, so that a small store has many."""
-    monkeypatch.setattr("ftlm.search.rounds.FEWEST", 16)
-    monkeypatch.setattr("ftlm.search.rounds.PIECE", 0.0)
+    monkeypatch.setattr("ftlm.search.waves.FEWEST", 16)
+    monkeypatch.setattr("ftlm.search.waves.PIECE", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -390,7 +396,7 @@ def test_the_search_of_a_stage_with_a_store_is_the_search_without(stage_run, sma
 def test_a_store_of_a_stage_cut_anywhere_holds_only_right_verdicts(stage_store, tmp_path):
     path = tmp_path / "cut.ftlm"
     path.write_bytes(stage_store)
-    right = read_store(path).sections[0].followed
+    right = read_store(path).sections[0].done
     assert len(right) > 10
     begun = 0
     for size in range(0, len(stage_store), 7):
@@ -398,7 +404,7 @@ def test_a_store_of_a_stage_cut_anywhere_holds_only_right_verdicts(stage_store, 
         with contextlib.suppress(ftlm.DataError):
             found = read_store(path)
             begun = begun or size
-            assert found.sections[0].followed.items() <= right.items()
+            assert found.sections[0].done.items() <= right.items()
             assert found.sections[0].joined is None
             assert found.damage is None
             assert found.end + found.torn == size
@@ -408,14 +414,14 @@ def test_a_store_of_a_stage_cut_anywhere_holds_only_right_verdicts(stage_store, 
 def test_a_store_of_a_stage_flipped_anywhere_never_gives_a_wrong_verdict(stage_store, tmp_path):
     path = tmp_path / "flipped.ftlm"
     path.write_bytes(stage_store)
-    right = read_store(path).sections[0].followed
+    right = read_store(path).sections[0].done
     for at in range(0, len(stage_store), 7):
         flipped = bytearray(stage_store)
         flipped[at] ^= 0x10
         path.write_bytes(flipped)
         with contextlib.suppress(ftlm.DataError):
             found = read_store(path)
-            assert found.sections[0].followed.items() <= right.items()
+            assert found.sections[0].done.items() <= right.items()
             assert found.sections[0].joined is None
             assert found.end <= at
 
@@ -514,10 +520,8 @@ def test_the_search_of_another_stage_is_refused(stage_run, stage_store, tmp_path
 
 def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_pieces, tmp_path):
     """What a forger would write: whole frames, under digests that are right."""
-    from ftlm.search.orders import make_job
-
-    job = make_job(stage_run, ftlm.flexible_link(), ftlm.Lattice(orders=STAGE), m=64, keep=8)
-    work, _ = job.stage_work()
+    job = job_of(stage_run, ftlm.flexible_link(), ftlm.Lattice(orders=STAGE), m=64, keep=8)
+    work = job.stage_work()
     wave = sum(last - first for _, first, last, _ in work.ready(keeps_course=True).wanted())
     for number, (first, last, kind, message) in enumerate(
         [
@@ -528,12 +532,12 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
     ):
         path = tmp_path / f"{number}.ftlm"
         with Store(path, [job.request("stage")]) as kept:
-            kept.followed(0, first, last, bytes(8 * (last - first)), bytes([kind]) * (last - first))
+            kept.done(Verdicts(0, first, last, bytes(8 * (last - first)), bytes([kind]) * (last - first)))
         with pytest.raises(ftlm.DataError, match=message):
             ftlm.resume_search(path)
     path = tmp_path / "nan.ftlm"
     with Store(path, [job.request("stage")]) as kept:
-        kept.followed(0, 0, wave, np.full(wave, np.nan).tobytes(), bytes(wave))
+        kept.done(Verdicts(0, 0, wave, np.full(wave, np.nan).tobytes(), bytes(wave)))
     for call in (ftlm.resume_search, ftlm.search_status):
         with pytest.raises(ftlm.DataError, match="are not those of"):
             call(path)
@@ -640,7 +644,7 @@ def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_w
     finished, half = tmp_path / "finished.ftlm", tmp_path / "half.ftlm"
     finished.write_bytes(whole)
     half.write_bytes(whole[: len(whole) // 2])
-    monkeypatch.setattr("ftlm.search.store.ALGORITHM", 2)
+    monkeypatch.setattr("ftlm.search.frames.ALGORITHM", 2)
     assert bytes_of(ftlm.resume_search(finished)["y"]) == expected
     assert finished.read_bytes() == whole
     kept = read_store(half).end
@@ -690,9 +694,7 @@ def test_a_full_disk_leaves_the_store_whole(run, expected, tmp_path, monkeypatch
 
 def _header(run, path):
     """A store whose search has only begun: its size."""
-    from ftlm.search.orders import make_job
-
-    job = make_job(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
+    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
     Store(path, [job.request("y")]).close()
     return path.stat().st_size
 
@@ -796,10 +798,8 @@ def test_paths_that_hold_no_store_are_refused(run, tmp_path):
 
 
 def test_the_core_refuses_checkpoints_and_parts_of_another_search(run):
-    from ftlm.search.orders import make_job
-
-    job = make_job(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
-    work, _ = job.work()
+    job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
+    work = job.equation_work()
     ready = work.ready()
     counts = (0, 0, 0, 0, 0, 0, 0)
     row = (3, 1.0, (1.0, 2.0, 3.0), ((),))

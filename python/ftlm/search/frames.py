@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import bisect
 import hashlib
-import math
 import struct
 import zlib
-from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
@@ -32,14 +29,12 @@ Failures = tuple[tuple[Natural, bool], ...]
 Part = tuple[tuple[Row, ...], Counts, Failures]
 #: Round, candidates followed, end and length of the batch, its limit.
 Place = tuple[Natural, Natural, Natural, Natural, float]
-
-
 #: Where to go on with a stretch that is half done.
 Checkpoint = tuple[Place, Part]
 #: Equation, first candidate, the one behind the last, limit.
 Span = tuple[int, int, int, float]
-#: What candidates came to: values and kinds (see :class:`Verdicts`).
-Found = tuple[bytes, bytes]
+#: What candidates under an order law came to: values and kinds (see :class:`Verdicts`).
+Outcomes = tuple[bytes, bytes]
 
 
 class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -62,13 +57,7 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return cls(record.signals, float(record.step), (rows, m), means, record.inputs, sensor, record.initial)
 
     def record(self) -> Record:
-        """Give the record back.
-
-        Raises
-        ------
-        ModelError
-            Sizes that do not fit one another.
-        """
+        """Give the record back, or refuse sizes that do not fit one another."""
         rows, m = self.shape
         sizes = (len(self.signals), len(self.inputs), len(self.means))
         if rows < 1 or m < 1 or sizes != (rows, rows, 8 * rows * m) or len(self.sensor or b"") % 8:
@@ -111,7 +100,7 @@ class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="req
     requests: tuple[Request, ...]
 
 
-class Progress(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
+class Begun(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
     """A stretch of rounds, half done; rows are those found since the frame before, failures None where unchanged."""
 
     search: Natural
@@ -162,131 +151,9 @@ class Joined(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="joine
     failures: tuple[StageFailure, ...]
 
 
-Frame = Progress | Rounds | Verdicts | Joined
+Frame = Begun | Rounds | Verdicts | Joined
 DECODER = msgspec.msgpack.Decoder(Requests | Frame)
 ENCODER = msgspec.msgpack.Encoder()
-
-
-@dataclass
-class Half:
-    """A stretch of rounds, half done, with all rows found since its start."""
-
-    last: int
-    place: Place
-    rows: list[Row]
-    counts: Counts
-    failures: Failures
-
-    @property
-    def checkpoint(self) -> tuple[Place, Part]:
-        """Where to go on, as the core takes it."""
-        return self.place, (tuple(self.rows), self.counts, self.failures)
-
-
-@dataclass
-class Section:
-    """What is known of one search: stretches done by their first round, and those half done.
-
-    Under an order law: stretches of candidates followed, by the first.
-    """
-
-    law: bool = False
-    done: dict[int, tuple[int, Part]] = field(default_factory=dict)
-    open: dict[int, Half] = field(default_factory=dict)
-    followed: dict[int, tuple[int, bytes, bytes]] = field(default_factory=dict)
-    joined: Joined | None = None
-    _firsts: list[int] = field(default_factory=list)
-
-    def take(self, frame: Frame) -> None:
-        """Take a frame in.
-
-        Raises
-        ------
-        ModelError
-            Rounds that are there already, a stretch that is none, or one of another kind of search.
-        """
-        if self.joined is not None or (isinstance(frame, Joined) and not self.law):
-            raise ModelError("a table stands where none belongs")
-        if isinstance(frame, Joined):
-            self.joined = frame
-            return
-        stretches: dict[int, Any] = self.followed if self.law else self.done
-        if frame.first >= frame.last or isinstance(frame, Verdicts) != self.law:
-            raise ModelError(f"rounds {frame.first} to {frame.last} are no stretch")
-        place = bisect.bisect_left(self._firsts, frame.last)
-        if place and stretches[self._firsts[place - 1]][0] > frame.first:
-            raise ModelError(f"rounds {frame.first} to {frame.last} are there twice")
-        if isinstance(frame, Verdicts):
-            count = frame.last - frame.first
-            if (len(frame.values), len(frame.kinds)) != (8 * count, count):
-                raise ModelError(f"candidates {frame.first} to {frame.last} have other verdicts")
-            self.followed[frame.first] = (frame.last, frame.values, frame.kinds)
-            self._firsts.insert(place, frame.first)
-            return
-        half = self.open.get(frame.first)
-        if isinstance(frame, Rounds):
-            self.open.pop(frame.first, None)
-            self.done[frame.first] = (frame.last, frame.part)
-            self._firsts.insert(place, frame.first)
-            return
-        if not frame.first <= frame.place[0] < frame.last or (half is not None and half.last != frame.last):
-            raise ModelError(f"rounds {frame.first} to {frame.last} are continued as something else")
-        _, followed, end, size, limit = frame.place
-        if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
-            raise ModelError(f"rounds {frame.first} to {frame.last} stand nowhere")
-        if half is None:
-            half = self.open[frame.first] = Half(frame.last, frame.place, [], frame.counts, ())
-        half.place, half.counts = frame.place, frame.counts
-        half.rows.extend(frame.rows)
-        half.failures = half.failures if frame.failures is None else frame.failures
-
-    @property
-    def dealt(self) -> int:
-        """Candidates dealt with."""
-        if self.law:
-            return sum(len(kinds) for _, _, kinds in self.followed.values())
-        counted = [part[1] for _, part in self.done.values()] + [half.counts for half in self.open.values()]
-        return sum(sum(counts[1:]) for counts in counted)
-
-    @property
-    def best(self) -> float | None:
-        """Smallest raw score so far."""
-        rows = [row for _, part in self.done.values() for row in part[0]]
-        return min((row[1] for row in (*rows, *(r for half in self.open.values() for r in half.rows))), default=None)
-
-
-@dataclass
-class Contents:
-    """What a store holds.
-
-    Parameters
-    ----------
-    requests
-        The searches.
-    sections
-        What is known of each.
-    version
-        Version of ftlm that made it.
-    algorithm
-        Number of the algorithm that its rounds follow.
-    end
-        Offset behind the last whole frame.
-    digest
-        Digest of that frame.
-    torn
-        Bytes behind it that a power cut or a kill left, or that are being written.
-    damage
-        What is damaged, with its offset, where frames or bytes follow that cannot be read; None for a whole store.
-    """
-
-    requests: tuple[Request, ...]
-    sections: list[Section]
-    version: str
-    algorithm: int
-    end: int
-    digest: bytes
-    torn: int = 0
-    damage: str | None = None
 
 
 def _check(length: bytes, offset: int) -> int:

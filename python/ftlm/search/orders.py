@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import math
+import contextlib
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from typing import Any, Literal
 
@@ -19,10 +19,13 @@ from ftlm.data.settings import Coefficients, Criterion, Settings
 from ftlm.data.several import as_runs
 from ftlm.data.structures import Structure
 from ftlm.paint.heat import Landscape
+from ftlm.search.contents import read_store
+from ftlm.search.frames import Request
 from ftlm.search.job import Job, run_job
 from ftlm.search.result import SearchResult, StoreStatus
-from ftlm.search.rounds import stage_state
-from ftlm.search.store import Store, read_store
+from ftlm.search.rounds import equation_state, stage_state
+from ftlm.search.store import Store
+from ftlm.search.work import Told
 from ftlm.solve.records import prepare
 
 
@@ -114,11 +117,11 @@ def search_orders(
     """
     if executor is not None and threads is None:
         threads = 1
-    job = make_job(
-        runs, equation, lattice, criterion=criterion, coefficients=coefficients, norm=norm,
-        innovation_length=innovation_length, prior_covariance=prior_covariance, rows=rows, m=m, keep=keep,
-        threads=threads, progress=progress, early_stopping=early_stopping,
-    )  # fmt: skip
+    checked = as_runs(runs)
+    settings = Settings.check(
+        criterion, norm, coefficients, innovation_length, prior_covariance, rows, keep, threads, early_stopping
+    )
+    job = make_job(checked, equation, lattice, settings, m=m, progress=progress)
     if store is None:
         return run_job(job, executor=executor)
     with Store(store, [job.request(job.name)]) as kept:
@@ -129,30 +132,18 @@ def make_job(
     runs: Run | Sequence[Run],
     equation: Structure,
     lattice: Lattice | None = None,
+    settings: Settings | None = None,
     *,
-    criterion: str = "output-error",
-    coefficients: str = "multi-innovation",
-    norm: str = "l1",
-    innovation_length: int = 7,
-    prior_covariance: float = 1.0,
-    rows: str = "haar",
     m: int | None = None,
-    keep: int = 20,
-    threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
-    early_stopping: bool = True,
+    **words: Any,
 ) -> Job:
     """Check what :func:`search_orders` is given, and make it what a search works on.
 
-    Raises
-    ------
-    DataError, ModelError
-        As :func:`search_orders`.
+    Settings come checked, or in the words of :meth:`.Settings.check`.
     """
-    found = as_runs(runs)
-    settings = Settings.check(
-        criterion, norm, coefficients, innovation_length, prior_covariance, rows, keep, threads, early_stopping
-    )
+    checked = as_runs(runs)
+    settings = settings or Settings.check(**words)
     if not isinstance(equation, Structure):
         raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
     if not equation.order_names:
@@ -164,9 +155,9 @@ def make_job(
         )
     check_lattice(lattice)
     values = (lattice or Lattice()).values(equation)
-    records = prepare(found, equation, m, power_of_two=settings.needs_haar)
-    units = {n: u for n, u in found[0].units.items() if n in equation.signals}
-    return Job(tuple(r.name for r in found), units, equation, values, records, settings, _told(progress))
+    records = prepare(checked, equation, m, power_of_two=settings.needs_haar)
+    units = {n: u for n, u in checked[0].units.items() if n in equation.signals}
+    return Job(tuple(r.name for r in checked), units, equation, values, records, settings, _told(progress))
 
 
 def resume_search(
@@ -221,21 +212,22 @@ def resume_job(
     progress: Callable[[int, int], None] | None,
     executor: Executor | None = None,
 ) -> SearchResult:
-    """Go on with one search of a store.
-
-    Raises
-    ------
-    DataError, ModelError, ConvergenceError, KeyboardInterrupt
-        As :func:`resume_search`.
-    """
+    """Go on with one search of a store."""
     threads = 1 if executor is not None and threads is None else check_threads(threads)
     request = store.contents.requests[number]
-    try:
+    with _usable(store.path, request):
         job = Job.of(request, threads, _told(progress))
         return run_job(job, store=store, number=number, executor=executor)
+
+
+@contextlib.contextmanager
+def _usable(path: str | os.PathLike[str], request: Request) -> Iterator[None]:
+    """Say of a search that makes no sense which one it is, and in which store."""
+    try:
+        yield
     except ModelError as error:
         raise DataError(
-            f"{store.path} holds no usable search of {request.name}: {error}; start it again in another file"
+            f"{path} holds no usable search of {request.name}: {error}; start it again in another file"
         ) from error
 
 
@@ -260,30 +252,22 @@ def search_status(path: str | os.PathLike[str]) -> dict[str, StoreStatus]:
         No store.
     """
     contents = read_store(path)
-    found = {}
+    states = {}
     for request, section in zip(contents.requests, contents.sections, strict=True):
-        try:
+        with _usable(path, request):
             job = Job.of(request, 1, None)
-            if job.structure.has_order_law:
-                candidates, best = stage_state(job.stage_work()[0], section, 1)
+            if section.law:
+                candidates, best = stage_state(job.stage_work(), section)
             else:
-                work, _ = job.work()
-                candidates, _ = work.plan()
-                best = section.best
-                if best is not None and job.settings.norm == "l2":
-                    best = math.sqrt(max(best, 0.0) / work.samples)
-        except ModelError as error:
-            raise DataError(
-                f"{path} holds no usable search of {request.name}: {error}; start it again in another file"
-            ) from error
-        found[request.name] = StoreStatus(
+                candidates, best = equation_state(job.equation_work(), section)
+        states[request.name] = StoreStatus(
             request.name, candidates, section.dealt, best, job.settings.to_dict(), request.runs, contents.version,
             contents.torn, contents.damage,
         )  # fmt: skip
-    return found
+    return states
 
 
-def _told(progress: Callable[[int, int], None] | None) -> Callable[[int, int, int], None] | None:
+def _told(progress: Callable[[int, int], None] | None) -> Told | None:
     """What the core calls: the bar shows the share pruned too, others are told what is done."""
     if progress is None or isinstance(progress, Progress):
         return progress
@@ -329,18 +313,13 @@ def landscape(
         raise ModelError(f"a landscape needs two different orders with several values each; this lattice has {free}")
     x, y = (np.array(axes[n]) for n in names)
     fixed = structure.with_orders({n: v for n, v in best.items() if n not in names})
-    settings: dict[str, Any] = {
-        n: search.settings[n]
-        for n in ("criterion", "norm", "coefficients", "innovation_length", "prior_covariance", "rows")
-        if n in search.settings
-    }
-    found = search_orders(
+    table = search_orders(
         runs, fixed, Lattice(orders={names[0]: x.tolist(), names[1]: y.tolist()}), m=search.m, keep=x.size * y.size,
-        threads=threads, **settings,
-    )  # fmt: skip
+        threads=threads, **search.settings,
+    ).table  # fmt: skip
     scores = np.full((y.size, x.size), np.inf)
-    columns = np.array([r.orders[names[0]] for r in found.table])
-    rows = np.array([r.orders[names[1]] for r in found.table])
-    values = np.array([r.score for r in found.table])
+    columns = np.array([r.orders[names[0]] for r in table])
+    rows = np.array([r.orders[names[1]] for r in table])
+    values = np.array([r.score for r in table])
     scores[np.abs(y[:, None] - rows).argmin(axis=0), np.abs(x[:, None] - columns).argmin(axis=0)] = values
     return Landscape((names[0], names[1]), x, y, scores)

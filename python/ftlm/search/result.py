@@ -103,16 +103,7 @@ class SearchResult:
             "pruned": self.pruned,
             "m": self.m,
             "settings": self.settings,
-            "table": [
-                {
-                    "rank": r.rank,
-                    "index": r.index,
-                    "score": r.score,
-                    "orders": r.orders,
-                    "coefficients": r.coefficients,
-                }
-                for r in self.table
-            ],
+            "table": [dict(vars(row)) for row in self.table],
             "failures": [{"orders": o, "reason": reason} for o, reason in self.failures],
             "edges": self.edges,
         }

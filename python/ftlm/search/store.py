@@ -10,7 +10,7 @@ length bytes          payload: one MessagePack map whose key ``type`` says what 
 ====================  =================================================================================================
 
 The first payload holds the requests (:class:`Requests`): everything a search is computed from, so that it can be
-resumed without the files it came from. Then come, for a search of one equation, :class:`Progress` (a stretch of rounds,
+resumed without the files it came from. Then come, for a search of one equation, :class:`Begun` (a stretch of rounds,
 half done) and :class:`Rounds` (a stretch, done); for one under an order law :class:`Verdicts` (a stretch of candidates,
 done) and at its end :class:`Joined` (its table). Frames are only appended; a digest covers all frames before its own,
 so that none can be lost, moved or changed unseen. A frame that reaches to or past the end of the file and is not whole
@@ -22,132 +22,40 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
 
 import msgspec
 
 from ftlm import _core
 from ftlm._core import __version__
-from ftlm.base.errors import DataError, ModelError
+from ftlm.base.errors import DataError
 from ftlm.base.output import write_atomically
-from ftlm.search.frames import (
-    ALGORITHM,
-    DECODER,
-    DIGEST,
-    ENCODER,
-    MAGIC,
-    Contents,
-    Frame,
-    Joined,
-    Part,
-    Place,
-    Progress,
-    Request,
-    Requests,
-    Rounds,
-    Section,
-    Verdicts,
-    framed,
-    next_frame,
-)
+from ftlm.search import frames
+from ftlm.search.contents import contents_of
 
 #: Longest time [s] between two writes, each flushed to disk: with the time between checkpoints, under a second is lost.
 INTERVAL = 0.3
 
 
-def read_store(path: str | os.PathLike[str]) -> Contents:
-    """Read a store as far as it is whole; it may be in use.
-
-    Raises
-    ------
-    DataError
-        No such file, no store, one without its first frame, one of a later version.
-    """
-    try:
-        data = Path(path).read_bytes()
-    except (OSError, ValueError) as error:
-        why = error.strerror if isinstance(error, OSError) else None
-        raise DataError(f"store {path} cannot be read: {why or error}; check the path") from error
-    return _parse(path, memoryview(data))
-
-
-def _parse(path: str | os.PathLike[str], data: memoryview) -> Contents:
-    start = bytes(data[: len(MAGIC)])
-    if start != MAGIC:
-        if MAGIC.startswith(start):
-            raise DataError(f"{path} ends before its first frame: its search had not begun; start it again with store=")
-        raise DataError(f"{path} is no ftlm search store; give a file written with store= (--store)")
-    found: Contents | None = None
-    offset, digest = len(MAGIC), bytes(DIGEST)
-    while offset < len(data):
-        got = next_frame(data, offset, digest)
-        if isinstance(got, str):
-            if found is None:
-                if got == "torn":
-                    got = "it ends before its first frame does"
-                raise DataError(f"{path} cannot be used: {got}; start the search again in another file")
-            found.torn = len(data) - offset if got == "torn" else 0
-            found.damage = None if got == "torn" else got
-            break
-        payload, digest, end = got
-        try:
-            frame = DECODER.decode(payload)
-            if found is None:
-                found = _opened(frame, end, digest)
-            elif isinstance(frame, Requests):
-                raise ModelError("requests stand twice")
-            else:
-                if frame.search >= len(found.sections):
-                    raise ModelError(f"there is no search {frame.search}")
-                found.sections[frame.search].take(frame)
-        except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
-            raise DataError(
-                f"{path} holds something else at byte {offset}: {error}; start the search again in another file"
-            ) from error
-        offset = end
-        found.end, found.digest = end, digest
-    if found is None:
-        raise DataError(f"{path} ends before its first frame: its search had not begun; start it again with store=")
-    return found
-
-
-def _opened(frame: Requests | Frame, end: int, digest: bytes) -> Contents:
-    if not isinstance(frame, Requests) or not frame.requests:
-        raise ModelError("the first frame holds no request")
-    sections = [Section(law=r.structure.has_order_law) for r in frame.requests]
-    return Contents(frame.requests, sections, frame.version, frame.algorithm, end, digest)
-
-
 class Store:
     """A store opened for writing: locked until it is closed; what is appended is on disk within :data:`INTERVAL`.
 
-    Parameters
-    ----------
-    path
-        The file.
-    requests
-        Searches of a new store, or what an existing one must hold; None takes what it holds.
-    salvage
-        Whether to go on with the whole frames of a damaged store; the damaged file is kept beside it.
-
-    Raises
-    ------
-    DataError
-        Another writer, another search, damage (with its offset), a file that cannot be written.
+    The requests are the searches of a new store, or what an existing one must hold; None takes what it holds. With
+    `salvage` a damaged one goes on with its whole frames, and the damaged file is kept beside it.
     """
 
     def __init__(
-        self, path: str | os.PathLike[str], requests: Sequence[Request] | None = None, *, salvage: bool = False
+        self, path: str | os.PathLike[str], requests: Sequence[frames.Request] | None = None, *, salvage: bool = False
     ) -> None:
         self.path = Path(path)
         #: What was mended, in words.
         self.notes: list[str] = []
         self._last = time.monotonic()
-        self._waiting: dict[tuple[int, int], Progress] = {}
-        self._failures: dict[tuple[int, int], Any] = {}
+        #: By search and first round: what is not written yet, and the failures written last.
+        self._waiting: dict[tuple[int, int], frames.Begun] = {}
+        self._failures: dict[tuple[int, int], frames.Failures | None] = {}
         flags = os.O_RDWR | (os.O_CREAT if requests is not None else 0) | getattr(os, "O_BINARY", 0)
         try:
             self._handle = os.open(self.path, flags | getattr(os, "O_CLOEXEC", 0), 0o666)
@@ -177,40 +85,41 @@ class Store:
                 f"store {self.path} is in use by another search; wait for it, stop it, or choose another file"
             ) from error
 
-    def _begin(self, requests: Sequence[Request] | None, *, salvage: bool) -> None:
+    def _begin(self, requests: Sequence[frames.Request] | None, *, salvage: bool) -> None:
         os.lseek(self._handle, 0, os.SEEK_SET)
         data = b"".join(iter(lambda: os.read(self._handle, 1 << 20), b""))
-        fresh = requests is not None and _unbegun(data)
-        if fresh:
-            assert requests is not None
-            payload = ENCODER.encode(Requests(ALGORITHM, __version__, tuple(requests)))
+        if requests is not None and _unbegun(data):
+            payload = frames.ENCODER.encode(frames.Requests(frames.ALGORITHM, __version__, tuple(requests)))
             # A payload read back must be the one asked for: what would not survive is found before any work.
-            frame, digest = framed(payload, len(MAGIC), bytes(DIGEST))
+            frame, digest = frames.framed(payload, len(frames.MAGIC), bytes(frames.DIGEST))
             self._end = 0
-            self._write(MAGIC + frame)
+            self._write(frames.MAGIC + frame)
             self._digest = digest
             self._sync_folder()
-            data = MAGIC + frame
-        self.contents = _parse(self.path, memoryview(data))
-        found = self.contents
+            data = frames.MAGIC + frame
+        self.contents = held = contents_of(self.path, memoryview(data))
         if requests is not None:
-            if [r.name for r in requests] != [r.name for r in found.requests]:
-                held = ", ".join(r.name for r in found.requests)
-                raise DataError(f"store {self.path} holds searches of {held}; choose another file")
-            for asked, held_request in zip(requests, found.requests, strict=True):
-                difference = asked.difference(held_request)
-                if difference is not None:
-                    raise DataError(
-                        f"store {self.path} holds another search of {asked.name} (asked is {difference}); "
-                        "choose another file"
-                    )
-        self._end, self._digest = found.end, found.digest
-        if found.damage is not None:
+            self._check_same(requests, held.requests)
+        self._end, self._digest = held.end, held.digest
+        if held.damage is not None:
             self._salvage(data, salvage=salvage)
-        elif found.torn:
-            self.notes.append(f"{found.torn} bytes of an unfinished write at byte {found.end} were dropped")
-        if found.end < len(data):
-            self._truncate()
+        elif held.torn:
+            self.notes.append(f"{held.torn} bytes of an unfinished write at byte {held.end} were dropped")
+        if held.end < len(data):
+            with self._writing():
+                os.ftruncate(self._handle, self._end)
+                os.fsync(self._handle)
+
+    def _check_same(self, asked: Sequence[frames.Request], held: Sequence[frames.Request]) -> None:
+        if [r.name for r in asked] != [r.name for r in held]:
+            names = ", ".join(r.name for r in held)
+            raise DataError(f"store {self.path} holds searches of {names}; choose another file")
+        for one, other in zip(asked, held, strict=True):
+            difference = one.difference(other)
+            if difference is not None:
+                raise DataError(
+                    f"store {self.path} holds another search of {one.name} (asked is {difference}); choose another file"
+                )
 
     def _salvage(self, data: bytes, *, salvage: bool) -> None:
         lost = len(data) - self.contents.end
@@ -224,137 +133,90 @@ class Store:
         self.notes.append(f"{lost} damaged bytes from byte {self.contents.end} on were dropped; {copy} keeps them")
         self.contents.damage = None
 
-    def _truncate(self) -> None:
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Leave the store as it was where writing fails, and say so."""
         try:
-            os.ftruncate(self._handle, self._end)
-            os.fsync(self._handle)
+            yield
         except OSError as error:
-            raise self._failed(error) from error
-
-    def _failed(self, error: OSError) -> DataError:
-        return DataError(
-            f"store {self.path} cannot be written: {error.strerror or error}; what it holds is whole: make room, or "
-            "move it to another folder, and resume it"
-        )
+            # Where even that fails the next reader drops the torn frame.
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._handle, self._end)
+            raise DataError(
+                f"store {self.path} cannot be written: {error.strerror or error}; what it holds is whole: make room, "
+                "or move it to another folder, and resume it"
+            ) from error
 
     def _sync_folder(self) -> None:
-        if os.name == "nt":
-            return
-        try:
+        with contextlib.suppress(OSError):  # some file systems do not sync folders, and Windows opens none
             folder = os.open(self.path.parent, os.O_RDONLY)
             try:
                 os.fsync(folder)
             finally:
                 os.close(folder)
-        except OSError:  # some file systems do not sync folders
-            return
 
     def _write(self, data: bytes) -> None:
-        """Append and flush to disk; a write that fails leaves the store as it was.
-
-        Raises
-        ------
-        DataError
-            A full disk, and whatever else the system says.
-        """
-        try:
+        """Append and flush to disk."""
+        with self._writing():
             os.lseek(self._handle, self._end, os.SEEK_SET)
             left = memoryview(data)
             while left:
                 left = left[os.write(self._handle, left) :]
             os.fsync(self._handle)
-        except OSError as error:
-            # Where even that fails the next reader drops the torn frame.
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._handle, self._end)
-            raise self._failed(error) from error
         self._end += len(data)
         self._last = time.monotonic()
 
-    def _append(self, frames: Sequence[Frame]) -> None:
-        found = self.contents
-        if found.algorithm != ALGORITHM:
+    def _append(self, added: Sequence[frames.Frame]) -> None:
+        held = self.contents
+        if held.algorithm != frames.ALGORITHM:
             # A finished search is only read, whatever made it.
             raise DataError(
-                f"store {self.path} is of ftlm {found.version}, whose rounds follow algorithm {found.algorithm}; this "
-                f"version's is {ALGORITHM}: finish the search with that version, or start it again in another file"
+                f"store {self.path} is of ftlm {held.version}, whose rounds follow algorithm {held.algorithm}; this "
+                f"version's is {frames.ALGORITHM}: finish the search with that version, or start it again in another "
+                "file"
             )
         data, digest, offset = [], self._digest, self._end
-        for frame in frames:
-            payload = ENCODER.encode(frame)
-            piece, digest = framed(payload, offset, digest)
+        for frame in added:
+            payload = frames.ENCODER.encode(frame)
+            piece, digest = frames.framed(payload, offset, digest)
             data.append(piece)
             offset += len(piece)
         self._write(b"".join(data))
         self._digest = digest
-        for frame in frames:
+        for frame in added:
             self.contents.sections[frame.search].take(frame)
 
-    def save(self, search: int, first: int, last: int, checkpoint: tuple[Place, Part] | None) -> None:
-        """Note how far a stretch of rounds is; it is written with others, or when it is time.
-
-        Raises
-        ------
-        DataError
-            As writing.
-        """
+    def save(self, search: int, first: int, last: int, checkpoint: frames.Checkpoint | None) -> None:
+        """Note how far a stretch of rounds is; it is written with others, or when it is time."""
         if checkpoint is not None:
             place, (rows, counts, failures) = checkpoint
             before = self._waiting.get((search, first))
             rows = (*(before.rows if before else ()), *rows)
-            self._waiting[search, first] = Progress(search, first, last, place, rows, counts, failures)
+            self._waiting[search, first] = frames.Begun(search, first, last, place, rows, counts, failures)
         if time.monotonic() - self._last >= INTERVAL:
             self.flush()
 
     def flush(self) -> None:
-        """Write what waits.
-
-        Raises
-        ------
-        DataError
-            As writing.
-        """
-        frames = []
+        """Write what waits."""
+        due = []
         for key, frame in self._waiting.items():
             same = self._failures.get(key) == frame.failures
-            frames.append(msgspec.structs.replace(frame, failures=None) if same else frame)
+            due.append(msgspec.structs.replace(frame, failures=None) if same else frame)
             self._failures[key] = frame.failures
         self._waiting.clear()
-        if frames:
-            self._append(frames)
+        if due:
+            self._append(due)
 
-    def done(self, search: int, first: int, last: int, part: Part) -> None:
-        """Append a stretch of rounds that is done.
+    def done(self, frame: frames.Rounds | frames.Verdicts) -> None:
+        """Append a stretch that is done."""
+        self._waiting.pop((frame.search, frame.first), None)
+        self._failures.pop((frame.search, frame.first), None)
+        self._append([frame])
 
-        Raises
-        ------
-        DataError
-            As writing.
-        """
-        self._waiting.pop((search, first), None)
-        self._failures.pop((search, first), None)
-        self._append([Rounds(search, first, last, part)])
-
-    def followed(self, search: int, first: int, last: int, values: bytes, kinds: bytes) -> None:
-        """Append a stretch of candidates of a search under an order law.
-
-        Raises
-        ------
-        DataError
-            As writing.
-        """
-        self._append([Verdicts(search, first, last, values, kinds)])
-
-    def joined(self, search: int, found: _core._FoundStage) -> None:
-        """Append the table of a search under an order law.
-
-        Raises
-        ------
-        DataError
-            As writing.
-        """
-        frame = {"type": "joined", "search": search, **{k: found[k] for k in ("rows", "counts", "failures")}}
-        self._append([msgspec.convert(frame, Joined)])
+    def joined(self, search: int, table: _core._FoundStage) -> None:
+        """Append the table of a search under an order law."""
+        frame = {"type": "joined", "search": search, **{k: table[k] for k in ("rows", "counts", "failures")}}
+        self._append([msgspec.convert(frame, frames.Joined)])
 
     def close(self) -> None:
         """Write what waits and give the lock back."""
@@ -377,6 +239,6 @@ class Store:
 
 def _unbegun(data: bytes) -> bool:
     """Whether a file is empty or what is left of a store whose first frame was never finished."""
-    if len(data) < len(MAGIC):
-        return MAGIC.startswith(data)
-    return data.startswith(MAGIC) and next_frame(memoryview(data), len(MAGIC), bytes(DIGEST)) == "torn"
+    if not data.startswith(frames.MAGIC):
+        return frames.MAGIC.startswith(data)
+    return frames.next_frame(memoryview(data), len(frames.MAGIC), bytes(frames.DIGEST)) == "torn"

@@ -35,12 +35,12 @@ class Stretch:
 
 def workers(executor: Executor) -> int:
     """How many tasks an executor works on at a time, as far as it tells."""
-    found = getattr(executor, "_max_workers", None)
+    count = getattr(executor, "_max_workers", None)
     client = getattr(executor, "_client", None)
-    if found is None and client is not None:
+    if count is None and client is not None:
         with contextlib.suppress(Exception):
-            found = sum(client.nthreads().values())
-    return found if isinstance(found, int) and found > 0 else os.cpu_count() or 1
+            count = sum(client.nthreads().values())
+    return count if isinstance(count, int) and count > 0 else os.cpu_count() or 1
 
 
 @dataclass
@@ -63,7 +63,7 @@ class Pace:
 def shipped(
     send: Callable[[Stretch], tuple[Any, ...]], left: list[Stretch], executor: Executor, pace: Pace
 ) -> Iterator[tuple[Stretch, Any]]:
-    """Send stretches in pieces that take about :data:`TASK` seconds each; what they came to as it comes back."""
+    """Send stretches in pieces of about :data:`TASK` seconds each; give back what they came to."""
     count = workers(executor)
     ahead = AHEAD * count + 2
     # Of a short wave every worker gets its share.
@@ -85,28 +85,22 @@ def shipped(
             done, _ = wait(pending, timeout=LOOK, return_when=FIRST_COMPLETED)
             for future in done:
                 stretch = pending.pop(future)
-                found = _result(future, stretch)
-                if found is None:
+                timed = _result(future, stretch)
+                if timed is None:
                     waiting.append(stretch)
                     continue
-                seconds, came = found
+                seconds, piece = timed
                 pace.took(seconds, stretch.last - stretch.first)
-                yield stretch, came
+                yield stretch, piece
     finally:
         for future in pending:
             future.cancel()
 
 
 def _result(future: Future[Any], stretch: Stretch) -> tuple[float, Any] | None:
-    """What a task came to; None where it must be sent (again).
-
-    Raises
-    ------
-    ConvergenceError
-        Workers that are gone, or a task that failed each time.
-    """
+    """Seconds and what a task came to; None where it must be sent (again)."""
     try:
-        found = cast("tuple[float, Any] | None", future.result())
+        timed = cast("tuple[float, Any] | None", future.result())
     except FtlmError:
         raise
     except BrokenExecutor as error:
@@ -116,9 +110,10 @@ def _result(future: Future[Any], stretch: Stretch) -> tuple[float, Any] | None:
         if stretch.attempts >= ATTEMPTS:
             raise _lost(error) from error
         return None
-    if found is None:
+    if timed is None:
+        # The worker has not got what the search is computed from: it goes along the next time.
         stretch.sent = True
-    return found
+    return timed
 
 
 def _lost(error: BaseException) -> ConvergenceError:
