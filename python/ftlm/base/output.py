@@ -96,7 +96,7 @@ def check_free(path: str | os.PathLike[str], *, force: bool) -> None:
         raise DataError(f"{file} cannot be written: {file.parent} is read-only; choose another folder")
 
 
-def check_folder(folder: Path, names: Mapping[str, Any], *, force: bool) -> dict[str, Any]:
+def check_folder(folder: Path, names: Sequence[str], *, force: bool) -> None:
     """Make a folder and refuse before any work what could not be written after it.
 
     Raises
@@ -108,10 +108,9 @@ def check_folder(folder: Path, names: Mapping[str, Any], *, force: bool) -> dict
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{folder} cannot be made: {error.strerror or error}; choose another folder") from error
-    there = [n for n in ("square.csv", "sine.csv", "tables.json", *names) if (folder / n).exists()]
+    there = [n for n in names if (folder / n).exists()]
     if there and not force:
         raise DataError(f"{folder / there[0]} exists ({len(there)} such files); choose another folder, or --force")
-    return dict(names)
 
 
 def to_frame(rows: Sequence[Mapping[str, Any]], index: Sequence[str]) -> Any:

@@ -14,7 +14,7 @@ from ftlm.arm.parameters import PARAMETERS
 from ftlm.fit.recursion import Trace
 from ftlm.judge.metrics import metrics
 from ftlm.paper import printed
-from ftlm.paper.stages import WEAK_PRIOR, Recomputed, Rival, Stage
+from ftlm.paper.records import WEAK_PRIOR, Recomputed, Rival, Stage
 
 #: A curve has converged where it stays this close to its end.
 SETTLED = 0.05
