@@ -24,31 +24,9 @@ from ftlm.paint.heat import heat_map
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, number, symbol
+from ftlm.paper import figures, tables
 from ftlm.paper.claims import claims
-from ftlm.paper.figures import (
-    convergence_chart,
-    derivative_chart,
-    fit_chart,
-    flow_chart,
-    rival_figures,
-    sine_figures,
-    stage_figures,
-)
 from ftlm.paper.records import TRACE_EVERY, Recomputed, Stage
-from ftlm.paper.tables import (
-    bounds_table,
-    fits_table,
-    genetic_table,
-    integer_table,
-    model_table,
-    near_table,
-    parameters_table,
-    rivals_table,
-    saturation_table,
-    seeds_table,
-    steps_table,
-    symbols_table,
-)
 from ftlm.search.result import search_summary
 
 PAPER = (
@@ -58,15 +36,15 @@ PAPER = (
 
 
 def stage_section(
-    heading: str, joint: Model, results: Mapping[str, Judged | None], tables: Sequence[Table],
-    figures: Sequence[Figure], *notes: str,
+    heading: str, joint: Model, results: Mapping[str, Judged | None], shown: Sequence[Table],
+    charts: Sequence[Figure], *notes: str,
 ) -> Section:  # fmt: skip
     """The joint model's equations, then tables with that of all searches, and figures."""
     searches = {f"{n}, {o}": s for n, r in results.items() if r is not None for o, s in r.searches.items()}
     words = "Joint output error, order law and coefficient law imposed:"
     return Section(
         heading, [words, *map(equation_html, joint.equations), *notes], warnings=grouped_warnings(results),
-        tables=[*tables, search_summary(searches)], figures=figures,
+        tables=[*shown, search_summary(searches)], figures=charts,
     )  # fmt: skip
 
 
@@ -87,7 +65,7 @@ def _stage_section(found: Recomputed, stage: Stage) -> Section:
     return stage_section(
         f"Stage {number} (Table {3 + number}, Figures {3 * number + 1}–{3 * number + 3})", joint.model,
         {label: c.result for label, c in stage.candidates.items()},
-        [model_table(stage, title), estimates, fits_table(stage)], stage_figures(stage),
+        [tables.model_table(stage, title), estimates, tables.fits_table(stage)], figures.stage_figures(stage),
     )  # fmt: skip
 
 
@@ -96,9 +74,10 @@ def _rival_section(found: Recomputed) -> Section:
         "Both search the same record; the genetic algorithm may evaluate as many candidates as the lattice has. It "
         "varies orders and coefficients and is judged by (45) itself."
     )
-    tables = [genetic_table(found), rivals_table(found), seeds_table(found), bounds_table(found)]
+    both = [tables.genetic_table(found), tables.rivals_table(found)]
+    how = [tables.seeds_table(found), tables.bounds_table(found)]
     heading = "The genetic algorithm (Tables 6 and 7, Figure 11)"
-    return Section(heading, [words], tables=tables, figures=rival_figures(found))
+    return Section(heading, [words], tables=[*both, *how], figures=figures.rival_figures(found))
 
 
 def _weak_section(found: Recomputed) -> Section:
@@ -107,11 +86,10 @@ def _weak_section(found: Recomputed) -> Section:
         "holds the coefficients near 0 with covariance K0. So p is a weight of the data against the prior. With a "
         "weak prior every p gives the least-squares answer, step by step."
     )
-    figures = [
-        convergence_chart(traces, f"{symbol(output)}: error (45), weak prior")
-        for stage in found.stages.values() for output, traces in stage.weak_traces.items()
-    ]  # fmt: skip
-    return Section("What p does", [words], tables=[saturation_table(found)], figures=figures, small=True)
+    charts = [
+        figures.convergence_chart(t, f"{symbol(o)}: error (45), weak prior") for o, t in found.weak_traces.items()
+    ]
+    return Section("What p does", [words], tables=[tables.saturation_table(found)], figures=charts, small=True)
 
 
 def _near_section(found: Recomputed) -> Section:
@@ -119,12 +97,12 @@ def _near_section(found: Recomputed) -> Section:
         "With α − ν small, I^(α−ν) y is nearly y itself. A few such terms reproduce any smooth signal on the "
         "right-hand side, whatever the machine is; only the free run shows what the equation knows."
     )
-    figures = []
+    charts = []
     for stage in found.stages.values():
         output, drawn = stage.outputs[1], [("printed orders", stage.near.estimation)]
         of = f"the orders of Table {3 + stage.number} with the best coefficients for this run"
-        figures.append(fit_chart(drawn, output, f"{symbol(output)}: {of}"))
-    return Section("Orders close to one another", [words], tables=[near_table(found)], figures=figures)
+        charts.append(figures.fit_chart(drawn, output, f"{symbol(output)}: {of}"))
+    return Section("Orders close to one another", [words], tables=[tables.near_table(found)], figures=charts)
 
 
 def _derivative_section(found: Recomputed) -> Section:
@@ -133,8 +111,8 @@ def _derivative_section(found: Recomputed) -> Section:
         "order α₂ − μ₂ + γ₁ − α₁, which (19) and (21) leave out. It vanishes for whole orders. "
         "flexible_link(input_order='derived') keeps it; a symbolic test derives both."
     )
-    figures = [derivative_chart(stage.derived) for stage in found.stages.values()]
-    return Section("The dropped derivative", [words], figures=figures)
+    charts = [figures.derivative_chart(stage.derived) for stage in found.stages.values()]
+    return Section("The dropped derivative", [words], figures=charts)
 
 
 def _landscape_section(found: Recomputed) -> Section:
@@ -152,12 +130,12 @@ def _landscape_section(found: Recomputed) -> Section:
 
 
 def _bode_section(found: Recomputed) -> Section:
-    figures = []
+    charts = []
     for stage in found.stages.values():
         model = stage.candidates["output error"].model
-        figures += bode_charts(model, response_frequencies(model, found.square.step, found.square.duration))
+        charts += bode_charts(model, response_frequencies(model, found.square.step, found.square.duration))
     words = "Of the joint output-error models, with 95 % bands."
-    return Section("Frequency response", [words], figures=figures, small=True)
+    return Section("Frequency response", [words], figures=charts, small=True)
 
 
 def _runs_section(found: Recomputed) -> Section:
@@ -185,13 +163,13 @@ def reproduction_page(found: Recomputed, path: str | os.PathLike[str], *, force:
         _verdict_section(found),
         Section(
             "Symbols and steps", ["Figures 1 and 3 are pictures of the authors' arm and are not shown."],
-            tables=[symbols_table(), steps_table()], figures=[flow_chart()],
+            tables=[tables.symbols_table(), tables.steps_table()], figures=[figures.flow_chart()],
         ),
-        Section("Parameters (Table 3)", tables=[parameters_table(), integer_table()]),
+        Section("Parameters (Table 3)", tables=[tables.parameters_table(), tables.integer_table()]),
         *(_stage_section(found, stage) for stage in found.stages.values()),
     ]  # fmt: skip
     if found.sine is not None:
-        sections.append(Section("The other input (Figure 10)", figures=sine_figures(found)))
+        sections.append(Section("The other input (Figure 10)", figures=figures.sine_figures(found)))
     if found.rivals:
         sections.append(_rival_section(found))
     last = _weak_section, _near_section, _derivative_section, _landscape_section, _bode_section, _runs_section

@@ -20,17 +20,7 @@ ORDERS, COEFFICIENTS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
 
 @dataclass(frozen=True)
 class Printed:
-    """One printed row.
-
-    Parameters
-    ----------
-    orders
-        ``gamma``, ``alpha``, ``beta``, ``mu``; what the table leaves out is not there.
-    coefficients
-        ``a``, ``b``, ``d``, ``g``, likewise.
-    error, rmse, nr
-        Criteria (45), (46) and (47); None where the table has none.
-    """
+    """One printed row: its numbers by letter, and criteria (45), (46), (47); None where the table has none."""
 
     orders: Mapping[str, float]
     coefficients: Mapping[str, float]

@@ -100,25 +100,13 @@ class Rival:
 
 @dataclass(frozen=True)
 class Derived:
-    """What the derivative of the current that (19) drops would change.
-
-    Parameters
-    ----------
-    output
-        The deflection.
-    order
-        The order that the current would have; 0 as published.
-    time
-        Middle of every pulse [s].
-    published, derived
-        Pulse means of the free run from the current alone, all other numbers alike.
-    """
+    """What the derivative of the current that (19) drops would change in the deflection's free run."""
 
     output: str
-    order: float
-    time: Floats
-    published: Floats
-    derived: Floats
+    order: float  # that the current would have; 0 as published
+    time: Floats  # middle of every pulse [s]
+    published: Floats  # pulse means, from the current alone
+    derived: Floats  # the same with that order, all other numbers alike
 
 
 @dataclass(frozen=True)
@@ -207,3 +195,13 @@ class Recomputed:
     def rivals(self) -> dict[str, Rival]:
         """The genetic comparisons of all stages by output."""
         return {output: rival for stage in self.stages.values() for output, rival in stage.rivals.items()}
+
+    @property
+    def traces(self) -> dict[str, dict[int, Trace]]:
+        """Convergence of all stages by output and p."""
+        return {output: each for stage in self.stages.values() for output, each in stage.traces.items()}
+
+    @property
+    def weak_traces(self) -> dict[str, dict[int, Trace]]:
+        """The same with the weak prior."""
+        return {output: each for stage in self.stages.values() for output, each in stage.weak_traces.items()}

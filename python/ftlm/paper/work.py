@@ -40,22 +40,13 @@ MOST_ROWS, JOINT_ROWS = 6000, 2500
 
 @dataclass(frozen=True)
 class Preset:
-    """What the reproduction and the demonstration do differently.
-
-    Parameters
-    ----------
-    lattice, keep
-        Of the order searches.
-    trace_every
-        Steps between two points of a convergence curve.
-    alike
-        Whether all models are judged alike, on the paper's pulses and from the currents alone as well (a sum over other
-        pulses is another number), or each as its method worked.
-    """
+    """What the reproduction and the demonstration do differently."""
 
     lattice: Lattice
-    keep: int
-    trace_every: int
+    keep: int  # rows of an order search
+    trace_every: int  # steps between two points of a convergence curve
+    # Whether all models are judged alike, on the paper's pulses (a sum over other pulses is another number) and from
+    # the currents alone as well, or each as its method worked.
     alike: bool
 
 
