@@ -102,21 +102,10 @@ class _Chart:
 
 
 def line_chart(
-    x: ArrayLike,
-    lines: Sequence[tuple[str, ArrayLike]],
-    *,
-    title: str,
-    x_label: str,
-    y_label: str,
-    width: int = 720,
-    height: int = 260,
-    log_x: bool = False,
-    log_y: bool = False,
-    caption: str = "",
-    points: int = POINTS,
-    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (),
-    stems: bool = False,
-) -> Figure:
+    x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], *, title: str, x_label: str, y_label: str, width: int = 720,
+    height: int = 260, log_x: bool = False, log_y: bool = False, caption: str = "", points: int = POINTS,
+    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (), stems: bool = False,
+) -> Figure:  # fmt: skip
     """Chart of one or several lines over a common axis.
 
     Parameters
@@ -174,6 +163,12 @@ def line_chart(
     return Figure(title, wide, small, " ".join(([caption] if caption else []) + notes))
 
 
+def _logarithms(values: Floats) -> Floats:
+    """Places on a logarithmic axis; not a number where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log10(np.where(values > 0, values, np.nan))
+
+
 def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
     """Edges of a band behind a line; where an edge is not finite there is none."""
     edges = []
@@ -181,11 +176,8 @@ def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
         values = np.array(edge, dtype=np.float64)
         if values.shape != line.x.shape:
             raise DataError(f"a band of {line.name!r} has shape {values.shape}, x {line.x.shape}; give one length")
-        if log_y:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                values = np.log10(values)
-        values[~(np.isfinite(values) & (np.abs(values) < HUGE))] = np.nan
-        edges.append(values)
+        values = _logarithms(values) if log_y else values
+        edges.append(np.where(np.abs(values) < HUGE, values, np.nan))
     return _Shade(line.style, line.x, *edges)
 
 
@@ -196,9 +188,7 @@ def _checked(
     if not lines:
         raise DataError("a chart needs at least one line; give (name, values) pairs")
     across = np.array(x, dtype=np.float64)
-    if log_x:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            across = np.where(across > 0, np.log10(np.where(across > 0, across, 1.0)), np.nan)
+    across = _logarithms(across) if log_x else across
     drawn, notes, coloured = [], [], 0
     for name, values in lines:
         y = np.array(values, dtype=np.float64)
@@ -214,8 +204,7 @@ def _checked(
             below = ~bad & (y <= 0)
             if np.any(below):
                 notes.append(f"{name}: {np.sum(below)} values of 0 or less have no place on a logarithmic axis.")
-            with np.errstate(divide="ignore", invalid="ignore"):
-                y = np.where(below, np.nan, np.log10(np.where(below, np.nan, y)))
+            y = _logarithms(y)
         neutral = name.startswith(NEUTRAL)
         style = 0 if neutral else 1 + coloured % (len(LINES) - 1)
         coloured += not neutral

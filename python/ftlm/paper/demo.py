@@ -126,16 +126,10 @@ def rows_of(candidate: Candidate) -> list[StageRow]:
 
 
 def run_demo(
-    folder: Path,
-    *,
-    step: float = 0.1,
-    noise: float = 1e-4,
-    seed: int = 1,
-    threads: int | None = None,
-    force: bool = False,
-    say: Callable[[str], None] = lambda _: None,
+    folder: Path, *, step: float = 0.1, noise: float = 1e-4, seed: int = 1, threads: int | None = None,
+    force: bool = False, say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
-) -> Demo:
+) -> Demo:  # fmt: skip
     """Simulate, identify every equation with p = 1, 3, 5, 7, by least squares and by output error, compare, save.
 
     Parameters

@@ -27,7 +27,8 @@ from ftlm.paper.work import Preset, StageWork
 #: Rows that an order search keeps; the tables need the best alone.
 KEEP = 1
 #: What is saved whatever the stages hold.
-ALWAYS_SAVED = ("square.csv", "sine.csv", "tables.json")
+TABLES = "tables.json"
+ALWAYS_SAVED = ("square.csv", "sine.csv", TABLES)
 #: Seconds between two looks for Ctrl-C.
 LOOK = 0.1
 
@@ -91,15 +92,14 @@ class Reproduction(Recomputed):
             for output, rival in stage.rivals.items():
                 models |= {f"{output}-genetic.json": rival.genetic.model, f"{output}-rival.json": rival.lattice.model}
         check_folder(where, [*ALWAYS_SAVED, *models], force=force)
-        *names, tables = ALWAYS_SAVED
-        written = [where / name for name in (*names[: len(self.runs)], *models, tables)]
-        for run, file in zip(self.runs, written, strict=False):
-            run.to_csv(file, force=force)
+        runs = dict(zip(ALWAYS_SAVED, self.runs, strict=False))
+        for name, run in runs.items():
+            run.to_csv(where / name, force=force)
         for name, model in models.items():
             model.save(where / name, force=force)
         text = json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
-        write_atomically(where / tables, text.encode(), force=force)
-        return written
+        write_atomically(where / TABLES, text.encode(), force=force)
+        return [where / name for name in (*runs, *models, TABLES)]
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: every number of every table, and the verdicts."""
@@ -119,17 +119,10 @@ def slug(label: str) -> str:
 
 
 def reproduce(
-    square: Run | None = None,
-    sine: Run | None = None,
-    *,
-    step: float = 0.05,
-    noise: float = 1e-4,
-    seed: int = 1,
-    genetic: Genetic | None = None,
-    threads: int | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    square: Run | None = None, sine: Run | None = None, *, step: float = 0.05, noise: float = 1e-4, seed: int = 1,
+    genetic: Genetic | None = None, threads: int | None = None, say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
-) -> Reproduction:
+) -> Reproduction:  # fmt: skip
     """Recompute section 5 of the paper, on the virtual rig or on runs of one's own.
 
     Parameters
