@@ -14,7 +14,7 @@ import ftlm
 from ftlm import report
 from ftlm.paint import axes
 from ftlm.paint import text as words
-from ftlm.paint.lines import LINE
+from ftlm.paint.figure import LINE
 
 HOSTILE = "</script><script>alert(1)</script>\"><svg onload=alert(1)> & 'x'"
 VOID = {"meta", "link", "br", "hr", "img", "input"}

@@ -16,7 +16,7 @@ from ftlm.paper import printed
 from ftlm.paper.claims import claims, settled_at, table_3_coefficients
 from ftlm.paper.page import reproduction_text
 from ftlm.paper.reproduction import stages_of
-from ftlm.paper.stages import thinned
+from ftlm.paper.work import thinned
 from test_cli import ftlm_command
 from test_derivation import STIFFNESS_PAIRS, TABLE_3
 from test_oracles import PRINTED_CRITERIA, PRINTED_RIVALS
@@ -245,8 +245,8 @@ def test_a_long_run_that_does_not_start_at_rest(reproduction, tmp_path, monkeypa
     own = ["I2", "theta21", "theta22"]
     moving = reproduction.square.select(own).slice(1.3, 7.3)
     other = reproduction.sine.select(own).slice(0.7, 6.7)
-    monkeypatch.setattr("ftlm.paper.stages.MOST_ROWS", 2000)
-    monkeypatch.setattr("ftlm.paper.stages.JOINT_ROWS", 1000)
+    monkeypatch.setattr("ftlm.paper.work.MOST_ROWS", 2000)
+    monkeypatch.setattr("ftlm.paper.work.JOINT_ROWS", 1000)
     found = ftlm.reproduce(moving, other, step=0.5)
     words = " ".join(found.notes)
     assert "does not start at rest: every model is fitted and compared with initial terms" in words

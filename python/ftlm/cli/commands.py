@@ -88,7 +88,7 @@ from ftlm.data.inspection import inspect_run
 from ftlm.paper.demo import run_demo
 from ftlm.paper.demo_page import demo_page, demo_text
 from ftlm.paper.page import reproduction_text
-from ftlm.paper.reproduction import SAVED
+from ftlm.paper.reproduction import ALWAYS_SAVED
 from ftlm.report import plots
 from ftlm.report.model_page import model_page
 from ftlm.rig.quanser import driver_state
@@ -536,7 +536,7 @@ def reproduce(
     """Recompute the tables and figures of the paper, on the virtual rig or on measured runs, as one page."""
     check_free(out, force=force, words=COMMAND)
     if save is not None:
-        check_folder(Path(save), SAVED, force=force)
+        check_folder(Path(save), ALWAYS_SAVED, force=force)
     if sine is not None and square is None:
         raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
     options = load_options(time, sampling, inputs, outputs, units, columns, between, resample)

@@ -15,7 +15,8 @@ from ftlm.base.errors import DataError, InternalError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Structure
-from ftlm.paint.lines import Figure, line_chart
+from ftlm.paint.figure import Figure
+from ftlm.paint.lines import line_chart
 from ftlm.solve.records import prepare, structure_tuple
 
 

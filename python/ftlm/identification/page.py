@@ -27,8 +27,8 @@ from ftlm.model.charts import bode_charts, response_frequencies
 from ftlm.model.model import Model
 from ftlm.model.typesetting import equation_html, parameter_table
 from ftlm.paint.axes import POINTS
+from ftlm.paint.figure import Figure
 from ftlm.paint.heat import heat_map
-from ftlm.paint.lines import Figure
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, number, symbol, symbol_html

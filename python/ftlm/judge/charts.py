@@ -11,7 +11,8 @@ from ftlm.base.errors import DataError
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.residuals import Residuals
 from ftlm.paint.axes import POINTS
-from ftlm.paint.lines import SMALL, Figure, line_chart
+from ftlm.paint.figure import SMALL, Figure
+from ftlm.paint.lines import line_chart
 from ftlm.paint.text import number, symbol
 
 

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 from ftlm.base.arrays import Floats
 from ftlm.base.statistics import NORMAL_95
 from ftlm.model.model import Model
-from ftlm.paint.lines import SMALL, Figure, line_chart
+from ftlm.paint.figure import SMALL, Figure
+from ftlm.paint.lines import line_chart
 from ftlm.paint.text import symbol
 from ftlm.solve.frequency import frequency_response, response_deviation, response_inputs, transfer_functions
 from ftlm.solve.records import COULOMB

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.base.arrays import Floats
+from ftlm.paint.text import SUPERSCRIPTS
 
 #: Points of one line in the wide chart: two for every pixel column of its plot, so no peak is lost on any screen.
 POINTS = 1500
@@ -27,9 +28,6 @@ class Ticks:
     labels: list[str]
     factor: str = ""
     power: int = 0
-
-
-SUPERSCRIPTS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def ticks(low: float, high: float, most: int = 6) -> Ticks:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import unicodedata
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from markupsafe import Markup
@@ -13,18 +12,13 @@ from numpy.typing import ArrayLike
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError
 from ftlm.paint.axes import POINTS, STRAY, Ticks, decimate, limits, log_ticks, snapped, ticks
-from ftlm.paint.text import number
+from ftlm.paint.figure import LETTER, LINE, NARROW, Figure, svg, svg_text, text_width
+from ftlm.paint.text import number, shortened
 
-#: Width of the drawing for telephones; its text stays as large as the wide one's.
-NARROW = 360
 #: Values beyond this are drawn as gaps: differences of two of them leave the range of double precision.
 HUGE = 1e300
 #: Coordinates inside the plot are whole tenths of a pixel.
 SUB = 10
-#: Width of charts that stand side by side.
-SMALL = 520
-#: Text at 12 px: width of a letter, height of a line.
-LETTER, LINE = 6.7, 15
 #: Letters of a label beside its line; the legend above the narrow chart has room for more.
 MOST_LETTERS = 22
 #: (light, dark, dashes). Vermilion, blue, green, purple after Okabe and Ito, darkened to a contrast of 3:1 on white and
@@ -38,33 +32,6 @@ LINES = (
     ("#7a6300", "#e6cb4f", "14 4"),
 )
 NEUTRAL = "measured"
-
-
-@dataclass(frozen=True)
-class Figure:
-    """A chart of a report; `line_chart` makes them.
-
-    Parameters
-    ----------
-    title
-        What is shown.
-    svg
-        The drawing, trusted markup.
-    narrow
-        The same for narrow screens, or empty.
-    caption
-        What the eye cannot see in the drawing, such as values that are not finite.
-    """
-
-    title: str
-    svg: Markup
-    narrow: Markup = field(default_factory=Markup)
-    caption: str = ""
-
-    def _repr_html_(self) -> str:
-        return str(
-            Markup("<figure>{}<figcaption>{}. {}</figcaption></figure>").format(self.svg, self.title, self.caption)
-        )
 
 
 @dataclass(frozen=True)
@@ -85,13 +52,11 @@ class _Plot:
         _, _, low, high = self.frame
         return np.asarray(self.top + self.height * (high - np.asarray(y)) / (high - low))
 
-
-@dataclass(frozen=True)
-class _Words:
-    title: str
-    described: str
-    x_label: str
-    y_label: str
+    def tenths(self, x: Floats, y: Floats) -> tuple[list[int], list[int]]:
+        """Places in whole tenths of a pixel; far outside they no longer matter, and the bound keeps them short."""
+        down = np.clip(self.down(y) - self.top, -self.height, 2 * self.height)
+        xs, ys = (np.rint(places * SUB).astype(np.int64).tolist() for places in (self.across(x) - self.left, down))
+        return xs, ys
 
 
 @dataclass(frozen=True)
@@ -111,29 +76,36 @@ class _Shade:
 
 
 @dataclass(frozen=True)
-class _How:
+class _Chart:
+    """What both drawings show."""
+
+    title: str
+    described: str
+    x_label: str
+    y_label: str
+    lines: list[_Line]
+    shades: list[_Shade]
+    frame: tuple[float, float, float, float]
     log_x: bool
     log_y: bool
     stems: bool
-    shades: tuple[_Shade, ...]
+
+    @property
+    def named(self) -> list[_Line]:
+        return [line for line in self.lines if line.name]
+
+    def ticks(self, *, narrow: bool) -> tuple[Ticks, Ticks]:
+        """Round numbers across and upward."""
+        x_low, x_high, y_low, y_high = self.frame
+        across = (log_ticks if self.log_x else ticks)(x_low, x_high, 4 if narrow else 9)
+        return across, log_ticks(y_low, y_high, 6) if self.log_y else ticks(y_low, y_high, 5)
 
 
 def line_chart(
-    x: ArrayLike,
-    lines: Sequence[tuple[str, ArrayLike]],
-    *,
-    title: str,
-    x_label: str,
-    y_label: str,
-    width: int = 720,
-    height: int = 260,
-    log_x: bool = False,
-    log_y: bool = False,
-    caption: str = "",
-    points: int = POINTS,
-    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (),
-    stems: bool = False,
-) -> Figure:
+    x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], *, title: str, x_label: str, y_label: str, width: int = 720,
+    height: int = 260, log_x: bool = False, log_y: bool = False, caption: str = "", points: int = POINTS,
+    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (), stems: bool = False,
+) -> Figure:  # fmt: skip
     """Chart of one or several lines over a common axis.
 
     Parameters
@@ -173,22 +145,28 @@ def line_chart(
     if not (log_x or stems):
         x_low, x_high = snapped(x_low, x_high)
     shades = [_shade(drawn[k], low, high, log_y) for k, (low, high) in enumerate(bands[: len(drawn)])]
-    around = [_Line("", 0, b.x, edge) for b in shades for edge in (b.low, b.high)]
-    y_low, y_high, strays = _y_limits(drawn if stems or not around else [*drawn, *_unnamed(around)])
+    # Edges of shades widen the axis and are never told to have left it, so they are lines of no name and no neutral.
+    edges = [_Line("", 1, b.x, y) for b in shades for y in (b.low, b.high) if np.isfinite(y).any()]
+    y_low, y_high, strays = _y_limits(drawn if stems else [*drawn, *edges])
     if stems:
         around_zero = [0.0, *(float(np.nanmax(b.high)) for b in shades), *(float(np.nanmin(b.low)) for b in shades)]
         y_low, y_high = min(y_low, *(1.1 * v for v in around_zero)), max(y_high, *(1.1 * v for v in around_zero))
-    notes += [f"{name} leaves the axis ({place})." for name, place in _in_words(strays, log_y)]
-    about = f"{y_label} against {x_label}" + ("; logarithmic vertical axis" if log_y else "")
-    about += "; logarithmic horizontal axis" if log_x else ""
-    described = f"Line chart. {about}. " + " ".join(_described(line, log_y) for line in drawn)
-    frame = (x_low, x_high, y_low, y_high)
-    words = _Words(title, described, x_label, y_label)
-    how = _How(log_x, log_y, stems, tuple(shades))
-    wide = _drawing(drawn, frame, words, how, size=(width, height), points=points, narrow=False)
-    half = max(4, points // 2)
-    narrow = _drawing(drawn, frame, words, how, size=(NARROW, 240), points=half, narrow=True)
-    return Figure(title, wide, narrow, " ".join(([caption] if caption else []) + notes))
+    notes += [f"{name} leaves the axis (to {number(10.0**far if log_y else far, 3)})." for name, far in strays]
+    described = f"Line chart. {y_label} against {x_label}" + ("; logarithmic vertical axis" if log_y else "")
+    described += "; logarithmic horizontal axis. " if log_x else ". "
+    described += " ".join(_described(line, log_y) for line in drawn)
+    chart = _Chart(
+        title, described, x_label, y_label, drawn, shades, (x_low, x_high, y_low, y_high), log_x, log_y, stems
+    )
+    wide = _drawing(chart, width, height, points, narrow=False)
+    small = _drawing(chart, NARROW, 240, max(4, points // 2), narrow=True)
+    return Figure(title, wide, small, " ".join(([caption] if caption else []) + notes))
+
+
+def _logarithms(values: Floats) -> Floats:
+    """Places on a logarithmic axis; not a number where there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.log10(np.where(values > 0, values, np.nan))
 
 
 def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
@@ -198,17 +176,9 @@ def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
         values = np.array(edge, dtype=np.float64)
         if values.shape != line.x.shape:
             raise DataError(f"a band of {line.name!r} has shape {values.shape}, x {line.x.shape}; give one length")
-        if log_y:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                values = np.log10(values)
-        values[~(np.isfinite(values) & (np.abs(values) < HUGE))] = np.nan
-        edges.append(values)
+        values = _logarithms(values) if log_y else values
+        edges.append(np.where(np.abs(values) < HUGE, values, np.nan))
     return _Shade(line.style, line.x, *edges)
-
-
-def _unnamed(lines: list[_Line]) -> list[_Line]:
-    """Lines that widen an axis and are never told to have left it."""
-    return [_Line(line.name, 1, line.x, line.y) for line in lines if np.isfinite(line.y).any()]
 
 
 def _checked(
@@ -218,9 +188,7 @@ def _checked(
     if not lines:
         raise DataError("a chart needs at least one line; give (name, values) pairs")
     across = np.array(x, dtype=np.float64)
-    if log_x:
-        with np.errstate(divide="ignore", invalid="ignore"):
-            across = np.where(across > 0, np.log10(np.where(across > 0, across, 1.0)), np.nan)
+    across = _logarithms(across) if log_x else across
     drawn, notes, coloured = [], [], 0
     for name, values in lines:
         y = np.array(values, dtype=np.float64)
@@ -236,8 +204,7 @@ def _checked(
             below = ~bad & (y <= 0)
             if np.any(below):
                 notes.append(f"{name}: {np.sum(below)} values of 0 or less have no place on a logarithmic axis.")
-            with np.errstate(divide="ignore", invalid="ignore"):
-                y = np.where(below, np.nan, np.log10(np.where(below, np.nan, y)))
+            y = _logarithms(y)
         neutral = name.startswith(NEUTRAL)
         style = 0 if neutral else 1 + coloured % (len(LINES) - 1)
         coloured += not neutral
@@ -264,10 +231,6 @@ def _y_limits(lines: list[_Line]) -> tuple[float, float, list[tuple[str, float]]
     return max(low, floor), min(high, ceiling), strays
 
 
-def _in_words(strays: list[tuple[str, float]], log_y: bool) -> list[tuple[str, str]]:
-    return [(name, f"to {number(10.0**far if log_y else far, 3)}") for name, far in strays]
-
-
 def _described(line: _Line, log_y: bool) -> str:
     finite = line.y[np.isfinite(line.y)]
     if finite.size == 0:
@@ -277,104 +240,86 @@ def _described(line: _Line, log_y: bool) -> str:
     return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
 
 
-def _text_width(text: str) -> float:
-    return LETTER * sum(2 if unicodedata.east_asian_width(c) in "WF" else 1 for c in text)
-
-
-def _short(name: str, most: int) -> str:
-    return name if len(name) <= most else name[: most - 1] + "…"
-
-
-def _drawing(
-    lines: list[_Line],
-    frame: tuple[float, float, float, float],
-    words: _Words,
-    how: _How,
-    *,
-    size: tuple[int, int],
-    points: int,
-    narrow: bool,
-) -> Markup:
-    width, height = size
-    x_low, x_high, y_low, y_high = frame
-    across = log_ticks(x_low, x_high, 4 if narrow else 9) if how.log_x else ticks(x_low, x_high, 4 if narrow else 9)
-    upward = log_ticks(y_low, y_high, 6) if how.log_y else ticks(y_low, y_high, 5)
-    legend = _legend([line for line in lines if line.name], width) if narrow else []
-    left = max(30.0, 10 + max(_text_width(t) for t in upward.labels))
-    named = [line for line in lines if line.name]
-    side = max((_text_width(_short(line.name, MOST_LETTERS)) for line in named), default=0.0)
+def _drawing(chart: _Chart, width: int, height: int, points: int, *, narrow: bool) -> Markup:
+    across, upward = chart.ticks(narrow=narrow)
+    named = chart.named
+    legend = _legend(named, width) if narrow else []
+    left = max(30.0, 10 + max(map(text_width, upward.labels)))
     # Beside the lines: a gap, a swatch, the label.
+    side = max((text_width(shortened(line.name, MOST_LETTERS)) for line in named), default=0.0)
     right = 14.0 if narrow or not named else 34 + side
     top = 26.0 + (LINE * (legend[-1][2] + 1) + 5 if legend else 0)
-    bottom = 40.0
     if narrow:
         height += int(top - 26)
-    w, h = width - left - right, height - top - bottom
-    plot = _Plot(left, top, w, h, frame)
+    plot = _Plot(left, top, width - left - right, height - top - 40.0, chart.frame)
+    parts = [*_grid(plot, across, upward), *_curves(chart, plot, points)]
+    parts += [Markup('<g font-size="12" fill="currentColor">'), *_labels(chart, plot, across, upward, width)]
+    if named:
+        parts += _legend_marks(legend) if narrow else _end_labels(named, plot)
+    parts.append(Markup("</g>"))
+    zoom = "" if chart.log_x or chart.log_y or chart.stems else _zoomable(plot, across, upward)
+    return svg(width, height, chart.title, chart.described, parts, narrow=narrow, attributes=zoom)
 
-    out = [
-        Markup('<svg class="chart {}" role="img" viewBox="0 0 {} {}" width="{}" height="{}"{}>').format(
-            "narrow" if narrow else "wide", width, height, width, height, _zoomable(plot, how, across, upward)
-        ),
-        Markup("<title>{}</title><desc>{}</desc>").format(words.title, words.described),
+
+def _grid(plot: _Plot, across: Ticks, upward: Ticks) -> list[Markup]:
+    """A line for every round number, and both axes."""
+    left, top, w, h = plot.left, plot.top, plot.width, plot.height
+    along, up = Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>'), Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>')
+    axes = Markup(
+        '</g><path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}h{:.1f}"/>'
+    )
+    return [
         Markup('<g class="grid" fill="none" stroke="currentColor" stroke-opacity="0.14">'),
+        *(along.format(left, float(plot.down(v)), w) for v in upward.values),
+        *(up.format(float(plot.across(v)), top, h) for v in across.values),
+        axes.format(left, top, h, w),
     ]
-    out += [Markup('<path d="M{:.1f} {:.1f}h{:.1f}"/>').format(left, float(plot.down(v)), w) for v in upward.values]
-    out += [Markup('<path d="M{:.1f} {:.1f}v{:.1f}"/>').format(float(plot.across(v)), top, h) for v in across.values]
-    out.append(Markup("</g>"))
-    axes = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M{:.1f} {:.1f}v{:.1f}h{:.1f}"/>')
-    out.append(axes.format(left, top, h, w))
-    # The inner drawing cuts off what leaves the axes and has whole numbers for coordinates.
-    out.append(
+
+
+def _curves(chart: _Chart, plot: _Plot, points: int) -> list[Markup]:
+    """Shades and lines in a drawing of their own, which cuts off what leaves the axes and has whole coordinates."""
+    out = [
         Markup(
             '<svg class="plot" preserveAspectRatio="none" x="{:.1f}" y="{:.1f}" width="{:.1f}" height="{:.1f}" '
             'viewBox="0 0 {:.0f} {:.0f}">'
-        ).format(left, top, w, h, w * SUB, h * SUB)
-    )
-    for shade in how.shades:
-        d = _outline(shade, plot, points)
-        if d:
-            out.append(
-                Markup('<path class="shade{}" fill="{}" fill-opacity="0.2" d="{}"/>').format(
-                    shade.style, LINES[shade.style][0], d
-                )
-            )
-    if how.stems:
+        ).format(plot.left, plot.top, plot.width, plot.height, plot.width * SUB, plot.height * SUB)
+    ]
+    shaded = Markup('<path class="shade{}" fill="{}" fill-opacity="0.2" d="{}"/>')
+    for shade in chart.shades:
+        if d := _outline(shade, plot, points):
+            out.append(shaded.format(shade.style, LINES[shade.style][0], d))
+    if chart.stems:
         zero = float(plot.down(0.0) - plot.top) * SUB
-        out.append(
-            Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {:.0f}h{:.0f}"/>').format(
-                zero, w * SUB
-            )
-        )
-    for line in sorted(lines, key=lambda item: item.style != 0):
-        d = _stem_path(line, plot) if how.stems else _path(line, plot, points)
-        if d:
+        axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {:.0f}h{:.0f}"/>')
+        out.append(axis.format(zero, plot.width * SUB))
+    # The neutral line lies beneath the others.
+    for line in sorted(chart.lines, key=lambda item: item.style != 0):
+        if d := _stem_path(line, plot) if chart.stems else _path(line, plot, points):
             out.append(Markup('<path vector-effect="non-scaling-stroke" {} d="{}"/>').format(_stroke(line.style), d))
-    out.append(Markup("</svg>"))
+    return [*out, Markup("</svg>")]
 
-    out.append(Markup('<g font-size="12" fill="currentColor"><g class="ticks">'))
+
+def _labels(chart: _Chart, plot: _Plot, across: Ticks, upward: Ticks, width: int) -> list[Markup]:
+    """Numbers and names of both axes."""
+    left, bottom, w = plot.left, plot.top + plot.height, plot.width
+    out = [Markup('<g class="ticks">')]
     for v, label in zip(upward.values, upward.labels, strict=True):
         out.append(svg_text(left - 6, float(plot.down(v)) + 4, label, "end"))
     for v, label in zip(across.values, across.labels, strict=True):
-        out.append(svg_text(float(plot.across(v)), top + h + 16, label, "middle"))
+        out.append(svg_text(float(plot.across(v)), bottom + 16, label, "middle"))
     out.append(Markup("</g>"))
-    room = int((width - 8) / LETTER)
-    y_text = f"{words.y_label} ({upward.factor})" if upward.factor else words.y_label
-    x_text = f"{words.x_label} ({across.factor})" if across.factor else words.x_label
-    out.append(svg_text(4, top - 12, _short(y_text, room), "start"))
-    out.append(svg_text(left + w, top + h + 34, _short(x_text, room), "end"))
-    if not any(np.isfinite(line.y).any() for line in lines):
-        out.append(svg_text(left + w / 2, top + h / 2, "no finite value to draw", "middle"))
-    if named:
-        out += _legend_marks(legend, named) if narrow else _end_labels(named, plot)
-    out.append(Markup("</g></svg>"))
-    return Markup("").join(out)
+    y_text, x_text = (
+        shortened(f"{label} ({axis.factor})" if axis.factor else label, int((width - 8) / LETTER))
+        for label, axis in ((chart.y_label, upward), (chart.x_label, across))
+    )
+    out += [svg_text(4, plot.top - 12, y_text, "start"), svg_text(left + w, bottom + 34, x_text, "end")]
+    if not any(np.isfinite(line.y).any() for line in chart.lines):
+        out.append(svg_text(left + w / 2, plot.top + plot.height / 2, "no finite value to draw", "middle"))
+    return out
 
 
-def _zoomable(plot: _Plot, how: _How, across: Ticks, upward: Ticks) -> Markup:
+def _zoomable(plot: _Plot, across: Ticks, upward: Ticks) -> Markup:
     """What the page's script needs to zoom: data at the edges, place of the plot, powers of ten left out of labels."""
-    if how.log_x or how.log_y or how.stems:
-        return Markup("")
     frame = " ".join(repr(float(v)) for v in plot.frame)
     place = f"{plot.left:.1f} {plot.top:.1f} {plot.width:.1f} {plot.height:.1f}"
     return Markup(' data-frame="{}" data-plot="{}" data-powers="{} {}"').format(
@@ -388,36 +333,28 @@ def _outline(shade: _Shade, plot: _Plot, points: int) -> str:
     if good.size < 2:
         return ""
     good = good[:: max(1, good.size // points)]
-    xs = np.rint((plot.across(shade.x[good]) - plot.left) * SUB).astype(np.int64)
-    edges = [np.clip(plot.down(e[good]) - plot.top, -plot.height, 2 * plot.height) for e in (shade.high, shade.low)]
-    top, bottom = (np.rint(e * SUB).astype(np.int64) for e in edges)
-    there = [f"{x} {y}" for x, y in zip(xs.tolist(), top.tolist(), strict=True)]
-    back = [f"{x} {y}" for x, y in zip(xs[::-1].tolist(), bottom[::-1].tolist(), strict=True)]
+    xs, top = plot.tenths(shade.x[good], shade.high[good])
+    _, bottom = plot.tenths(shade.x[good], shade.low[good])
+    there = [f"{x} {y}" for x, y in zip(xs, top, strict=True)]
+    back = [f"{x} {y}" for x, y in zip(xs[::-1], bottom[::-1], strict=True)]
     return "M" + "L".join([*there, *back]) + "Z"
 
 
 def _stem_path(line: _Line, plot: _Plot) -> str:
     kept = np.flatnonzero(np.isfinite(line.y) & np.isfinite(line.x))
-    xs = np.rint((plot.across(line.x[kept]) - plot.left) * SUB).astype(np.int64)
-    ys = np.rint((plot.down(line.y[kept]) - plot.top) * SUB).astype(np.int64)
     zero = round(float(plot.down(0.0) - plot.top) * SUB)
-    return "".join(f"M{x} {zero}V{y}" for x, y in zip(xs.tolist(), ys.tolist(), strict=True))
+    return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[kept], line.y[kept]), strict=True))
 
 
 def _stroke(style: int) -> Markup:
     light, _, dashes = LINES[style]
     # The measured line is wide enough to show on both sides of one that follows it exactly.
     thickness = 3.4 if style == 0 else 1.5
-    dashed = dashes
-    dash = Markup(' stroke-dasharray="{}"').format(dashed) if dashed else Markup("")
+    dash = Markup(' stroke-dasharray="{}"').format(dashes) if dashes else ""
     # The page's style sheet replaces the colour in the dark; the attribute serves wherever there is no page.
     return Markup(
         'class="line{}" fill="none" stroke="{}" stroke-width="{:g}" stroke-linejoin="round" stroke-linecap="{}"{}'
-    ).format(style, light, thickness, "butt" if dashed else "round", dash)
-
-
-def svg_text(x: float, y: float, text: str, anchor: str) -> Markup:
-    return Markup('<text x="{:.1f}" y="{:.1f}" text-anchor="{}">{}</text>').format(x, y, anchor, text)
+    ).format(style, light, thickness, "butt" if dashes else "round", dash)
 
 
 def _path(line: _Line, plot: _Plot, points: int) -> str:
@@ -425,10 +362,7 @@ def _path(line: _Line, plot: _Plot, points: int) -> str:
     kept = decimate(line.y, points)
     if kept.size == 0:
         return ""
-    # Far outside, a point's place no longer matters; the bound keeps the numbers short.
-    y = np.clip(plot.down(line.y[kept]) - plot.top, -plot.height, 2 * plot.height)
-    xs = np.rint((plot.across(line.x[kept]) - plot.left) * SUB).astype(np.int64)
-    ys = np.rint(y * SUB).astype(np.int64)
+    xs, ys = plot.tenths(line.x[kept], line.y[kept])
     missing = np.cumsum(~np.isfinite(line.y))[kept]
     parts: list[str] = []
     for i in range(kept.size):
@@ -459,28 +393,28 @@ def _end_labels(lines: list[_Line], plot: _Plot) -> list[Markup]:
     out = []
     for i, y in zip(order, places, strict=True):
         out.append(Markup('<path {} d="M{:.1f} {:.1f}h16"/>').format(_stroke(lines[i].style), x + 8, y))
-        out.append(svg_text(x + 28, y + 4, _short(lines[i].name, MOST_LETTERS), "start"))
+        out.append(svg_text(x + 28, y + 4, shortened(lines[i].name, MOST_LETTERS), "start"))
     return out
 
 
-def _legend(lines: list[_Line], width: int) -> list[tuple[int, float, int]]:
+def _legend(lines: list[_Line], width: int) -> list[tuple[_Line, float, int]]:
     """Place of every entry above a narrow chart: (line, x, row)."""
     entries, x, row = [], 4.0, 0
-    for i, line in enumerate(lines):
-        needed = 26 + _text_width(_short(line.name, 2 * MOST_LETTERS)) + 14
+    for line in lines:
+        needed = 26 + text_width(shortened(line.name, 2 * MOST_LETTERS)) + 14
         if x > 4 and x + needed > width:
             x, row = 4.0, row + 1
-        entries.append((i, x, row))
+        entries.append((line, x, row))
         x += needed
     return entries
 
 
-def _legend_marks(entries: list[tuple[int, float, int]], lines: list[_Line]) -> list[Markup]:
+def _legend_marks(entries: list[tuple[_Line, float, int]]) -> list[Markup]:
     out = []
-    for i, x, row in entries:
+    for line, x, row in entries:
         y = 8.0 + LINE * row
-        out.append(Markup('<path {} d="M{:.1f} {:.1f}h20"/>').format(_stroke(lines[i].style), x, y))
-        out.append(svg_text(x + 26, y + 4, _short(lines[i].name, 2 * MOST_LETTERS), "start"))
+        out.append(Markup('<path {} d="M{:.1f} {:.1f}h20"/>').format(_stroke(line.style), x, y))
+        out.append(svg_text(x + 26, y + 4, shortened(line.name, 2 * MOST_LETTERS), "start"))
     return out
 
 

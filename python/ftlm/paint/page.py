@@ -16,7 +16,8 @@ from markupsafe import Markup
 
 from ftlm._core import __version__
 from ftlm.base.output import write_atomically
-from ftlm.paint.lines import Figure, chart_css
+from ftlm.paint.figure import Figure
+from ftlm.paint.lines import chart_css
 from ftlm.paint.table import Table
 
 

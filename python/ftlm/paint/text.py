@@ -58,3 +58,8 @@ def number(value: float, digits: int = DIGITS) -> str:
     mantissa, _, exponent = text.partition("e")
     mantissa = mantissa.removesuffix(".").replace("-", "−")
     return f"{mantissa}×10{str(int(exponent)).translate(SUPERSCRIPTS)}" if exponent else mantissa
+
+
+def shortened(text: str, most: int) -> str:
+    """A text of at most so many letters, with an ellipsis for the rest."""
+    return text if len(text) <= most else text[: most - 1] + "…"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 
 from ftlm.arm.link import link_model
@@ -10,6 +12,8 @@ from ftlm.data.run import Run
 from ftlm.model.model import Model
 from ftlm.rig.experiment import record
 
+StageNumber = Literal[1, 2]
+STAGES: tuple[StageNumber, StageNumber] = (1, 2)
 #: The paper's inputs and their amplitudes [A].
 AMPLITUDES = {"square": 0.3, "sine": 0.6}
 #: The demonstration's arm: the effective coefficients, with fractional damping and friction in the link.
@@ -32,6 +36,12 @@ def demo_plant(stage: int) -> Model:
     law = {f"a{d}": -free[f"a{h}"] * r, f"b{d}": -free[f"b{h}"], f"d{d}": -free[f"d{h}"] * r, f"g{d}": -free[f"g{h}"]}
     coefficients = {name: value for name, value in free.items() if name != "r"} | law
     return link_model(stage=1 if stage == 1 else 2, orders=orders, coefficients=coefficients)
+
+
+def truth_of(stage: int) -> dict[str, float]:
+    """Orders and free coefficients of the simulated arm."""
+    orders, free = PLANTS[stage]
+    return orders | {(f"r{stage}" if name == "r" else name): value for name, value in free.items()}
 
 
 def demo_run(shape: str, *, duration: float = 10.0, step: float = 0.002, noise: float = 1e-4, seed: int = 1) -> Run:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -13,13 +13,19 @@ from ftlm.arm.link import order_law
 from ftlm.arm.parameters import PARAMETERS
 from ftlm.fit.recursion import Trace
 from ftlm.judge.metrics import metrics
+from ftlm.paint.text import symbol
 from ftlm.paper import printed
-from ftlm.paper.stages import WEAK_PRIOR, Recomputed, Rival, Stage
+from ftlm.paper.arm import STAGES
+from ftlm.paper.records import WEAK_PRIOR, Recomputed, Rival, Stage
 
 #: A curve has converged where it stays this close to its end.
 SETTLED = 0.05
 #: Differences of two errors below this share of them are none.
 ALIKE = 0.02
+#: A free run this many times worse than the equation error, or with a larger NR than this, describes nothing.
+FLATTERY, EXPLAINS = 5.0, 0.5
+#: Digits of RMSE and NR in Table 7 allow this much between two standard deviations of one record.
+MIXED = 0.15
 
 
 @dataclass(frozen=True)
@@ -44,30 +50,24 @@ class Claim:
 def claims(found: Recomputed) -> list[Claim]:
     """Hold the paper's claims, and its slips, against computed numbers.
 
-    Parameters
-    ----------
-    found
-        The reproduction.
-
-    Returns
-    -------
-    list of Claim
-        Every verdict follows from numbers by a rule; none is written down.
+    Every verdict follows from numbers by a rule; none is written down.
     """
-    return [
-        *_claims_of_p(found), *_claims_of_orders(found), _claim_of_table_3(), *_claims_of_rivals(found),
+    each = (
+        _claim_of_smaller_errors(found), _claim_of_p_itself(found), _claim_of_convergence(found),
+        *_claims_of_orders(found), _claim_of_table_3(), _claim_of_one_record(), _claim_of_rivals(found),
         _claim_of_the_derivative(found), _claim_of_the_impossible_row(),
-    ]  # fmt: skip
+    )  # fmt: skip
+    return [claim for claim in each if claim is not None]
 
 
-def angle(name: str) -> str:
-    """An angle as the paper writes it, in plain text."""
-    return "θ" + name.removeprefix("theta").translate(str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉"))
-
-
-def numbers_listed(values: Sequence[float], digits: int = 4) -> str:
+def numbers_listed(values: Iterable[float], digits: int = 4) -> str:
     """Numbers in a row."""
     return ", ".join("∞" if math.isinf(v) else f"{v:.{digits}g}" for v in values)
+
+
+def listed(numbers: Mapping[str, Iterable[float]], digits: int = 4) -> str:
+    """The numbers of every angle."""
+    return "; ".join(f"{symbol(name)} {numbers_listed(values, digits)}" for name, values in numbers.items())
 
 
 def settled_at(trace: Trace) -> int:
@@ -97,54 +97,46 @@ def weak_spread(stage: Stage, output: str) -> float:
     return max(abs(c[n] / first[n] - 1) for c in each.values() for n in first if first[n])
 
 
-def _claims_of_p(found: Recomputed) -> list[Claim]:
-    lengths = printed.INNOVATION_LENGTHS
+def _claim_of_smaller_errors(found: Recomputed) -> Claim:
     errors = {
-        o: [s.candidates[f"p = {p}"].estimation.output_error[o].error for p in lengths]
-        for s in found.stages.values() for o in s.outputs
-    }  # fmt: skip
-    falls = {o: all(b <= a for a, b in pairwise(e)) for o, e in errors.items()}
-    away = {o: printed_saturation(o)[2] for o in printed.OUTPUTS}
-    curve = "the printed a lie on x·p / (p + c), the curve of a prior, within " + ", ".join(
-        f"{100 * v:.2g} % ({angle(o)})" for o, v in away.items()
+        o: [s.candidates[f"p = {p}"].estimation.output_error[o].error for p in printed.INNOVATION_LENGTHS]
+        for s, o in found.angles
+    }
+    return Claim(
+        "A larger innovation length p gives a smaller error (45): Tables 4 and 5.",
+        all(b <= a for each in errors.values() for a, b in pairwise(each)),
+        f"error of the free run for p = 1, 3, 5, 7 at K0 = 1: {listed(errors)}.",
     )
-    words = "; ".join(f"{angle(o)} {numbers_listed(e)}" for o, e in errors.items())
-    out = [
-        Claim(
-            "A larger innovation length p gives a smaller error (45): Tables 4 and 5.",
-            all(falls.values()),
-            f"error of the free run for p = 1, 3, 5, 7 at K0 = 1: {words}.",
+
+
+def _claim_of_p_itself(found: Recomputed) -> Claim:
+    away = ", ".join(f"{100 * printed_saturation(o)[2]:.2g} % ({symbol(o)})" for o in printed.OUTPUTS)
+    curve = f"the printed a lie on x·p / (p + c), the curve of a prior, within {away}."
+    spread = [weak_spread(s, o) for s in found.stages.values() for o in s.weak]
+    words = ""
+    if spread:
+        words = (
+            f"with a weak prior (K0 = {WEAK_PRIOR:.0e}) the coefficients of p = 1, 3, 5, 7 at the same orders differ "
+            f"by at most {100 * max(spread):.2g} %: p is a weight of the data against the prior, which pulls to 0; "
         )
-    ]
-    spread = {o: weak_spread(s, o) for s in found.stages.values() for o in s.weak}
-    out.append(
-        Claim(
-            "p itself improves the estimate.",
-            not all(v < ALIKE for v in spread.values()) if spread else None,
-            (
-                f"with a weak prior (K0 = {WEAK_PRIOR:.0e}) the coefficients of p = 1, 3, 5, 7 at the same orders "
-                f"differ by at most {100 * max(spread.values()):.2g} %: p is a weight of the data against the prior, "
-                "which pulls to 0; "
-                if spread
-                else ""
-            )
-            + curve
-            + ".",
-        )
+    return Claim(
+        "p itself improves the estimate.", not all(v < ALIKE for v in spread) if spread else None, words + curve
     )
-    steps = {o: [settled_at(t[p]) for p in lengths] for s in found.stages.values() for o, t in s.traces.items()}
-    weak = {o: [settled_at(t[p]) for p in lengths] for s in found.stages.values() for o, t in s.weak_traces.items()}
-    if steps:
-        out.append(
-            Claim(
-                "A larger p converges faster: Figures 4(b), 5(b), 7(b), 8(b).",
-                all(b <= a for each in steps.values() for a, b in pairwise(each)),
-                "steps until the error stays within 5 % of its end, for p = 1, 3, 5, 7: at K0 = 1 "
-                + "; ".join(f"{angle(o)} {numbers_listed(s)}" for o, s in steps.items())
-                + f"; with the weak prior {'; '.join(f'{angle(o)} {numbers_listed(s)}' for o, s in weak.items())}.",
-            )
-        )
-    return out
+
+
+def _claim_of_convergence(found: Recomputed) -> Claim | None:
+    strong, weak = (
+        {o: [settled_at(each[p]) for p in printed.INNOVATION_LENGTHS] for o, each in traces.items()}
+        for traces in (found.traces, found.weak_traces)
+    )
+    if not strong:
+        return None
+    return Claim(
+        "A larger p converges faster: Figures 4(b), 5(b), 7(b), 8(b).",
+        all(b <= a for each in strong.values() for a, b in pairwise(each)),
+        "steps until the error stays within 5 % of its end, for p = 1, 3, 5, 7: at K0 = 1 "
+        f"{listed(strong)}; with the weak prior {listed(weak)}.",
+    )
 
 
 def _fits(found: Recomputed, label: str) -> dict[str, float]:
@@ -154,7 +146,7 @@ def _fits(found: Recomputed, label: str) -> dict[str, float]:
         candidate = s.candidates[label]
         for name, comparison in (("square", candidate.estimation), ("sine", candidate.validation)):
             if comparison is not None:
-                fits |= {f"{angle(o)} on the {name}": comparison.output_error[o].fit for o in s.outputs}
+                fits |= {f"{symbol(o)} on the {name}": comparison.output_error[o].fit for o in s.outputs}
     return fits
 
 
@@ -162,43 +154,32 @@ def _claims_of_orders(found: Recomputed) -> list[Claim]:
     last = f"p = {printed.INNOVATION_LENGTHS[-1]}"
     labels = ", ".join(sorted({s.manual for s in found.stages.values()}))
     manual = {
-        o: (s.candidates[s.manual].estimation.output_error[o].nr,
-            s.candidates[last].estimation.output_error[o].nr)
-        for s in found.stages.values() for o in s.outputs
-    }  # fmt: skip
+        o: [s.candidates[label].estimation.output_error[o].nr for label in (s.manual, last)] for s, o in found.angles
+    }
     whole, fractional = _fits(found, "integer, identified"), _fits(found, "output error")
-    better = [fractional[k] > whole[k] for k in whole]
-    near = {
-        o: (s.near.estimation.equation_error[o].nr, s.near.estimation.output_error[o].nr)
-        for s in found.stages.values() for o in s.outputs
-    }  # fmt: skip
+    near = {o: (s.near.estimation.equation_error[o].nr, s.near.estimation.output_error[o].nr) for s, o in found.angles}
     return [
         Claim(
             "The fractional model (p = 7) is closer to the run than the manual's integer-order model: Figures 6 and 9.",
             all(f < i for i, f in manual.values()),
-            f"NR of the manual's model ({labels}) and of p = 7: "
-            + "; ".join(f"{angle(o)} {numbers_listed(pair, 3)}" for o, pair in manual.items()) + ".",
+            f"NR of the manual's model ({labels}) and of p = 7: {listed(manual, 3)}.",
         ),
         Claim(
             "Fractional orders describe the arm better than whole ones.",
-            all(better),
+            all(fractional[k] > whole[k] for k in whole),
             "both identified by output error from the same run; fit in percent of whole orders, even driven by the "
             "measured other angle, and of fractional ones from the current alone: "
-            + "; ".join(f"{k} {numbers_listed([whole[k], fractional[k]])}" for k in whole)
+            + "; ".join(f"{k} {numbers_listed((whole[k], fractional[k]))}" for k in whole)
             + ". The manual's model is no measure of whole orders: its parameters were not identified from this run.",
         ),
         Claim(
             "The orders of Tables 4 and 5 (2; 1.95 to 1.8) describe the arm.",
             all(output < FLATTERY * equation and output < EXPLAINS for equation, output in near.values()),
             "with these orders and the best coefficients for them, NR of the equation error and of the free run: "
-            + "; ".join(f"{angle(o)} {numbers_listed(pair, 3)}" for o, pair in near.items())
-            + ". So close to α, I^(α−ν) y is nearly y, and the equation says that a signal equals itself.",
+            f"{listed(near, 3)}. So close to α, I^(α−ν) y is nearly y, and the equation says that a signal equals "
+            "itself.",
         ),
-    ]  # fmt: skip
-
-
-#: A free run this many times worse than the equation error, or with a larger NR than this, describes nothing.
-FLATTERY, EXPLAINS = 5.0, 0.5
+    ]
 
 
 def table_3_coefficients() -> dict[str, tuple[float, float, float]]:
@@ -234,72 +215,51 @@ def implied_spreads() -> dict[str, tuple[float, float]]:
     return {o: (g[1] / g[2], m[1] / m[2]) for o, (g, m) in printed.RIVALS.items()}
 
 
-def _claims_of_rivals(found: Recomputed) -> list[Claim]:
+def _claim_of_one_record() -> Claim:
     spreads = implied_spreads()
-    mixed = {o: pair for o, pair in spreads.items() if abs(pair[0] / pair[1] - 1) > MIXED}
-    out = [
-        Claim(
-            "Table 7 compares both algorithms on one record.",
-            not mixed,
-            "standard deviation of the angle that RMSE / NR implies, genetic algorithm and multi-innovation: "
-            + "; ".join(f"{angle(o)} {numbers_listed(pair, 3)}" for o, pair in spreads.items())
-            + " rad. One record has one standard deviation.",
-        )
-    ]
-    rivals = {o: r for s in found.stages.values() for o, r in s.rivals.items()}
-    if rivals:
-        pairs = {
-            o: (r.genetic.estimation.output_error[o].error, r.lattice.estimation.output_error[o].error)
-            for o, r in rivals.items()
-        }
-        out.append(
-            Claim(
-                "Multi-innovation has a smaller error than the genetic algorithm.",
-                all(m < g for g, m in pairs.values()),
-                "the same record, "
-                + ", ".join(sorted({_budget(r) for r in rivals.values()}))
-                + "; error (45) of the genetic algorithm's best seed and of p = 7: "
-                + "; ".join(f"{angle(o)} {numbers_listed(pair)}" for o, pair in pairs.items())
-                + ". The genetic algorithm minimises (45) over the coefficients, too; multi-innovation takes those of "
-                "the equation error, pulled towards 0.",
-            )
-        )
-    return out
+    return Claim(
+        "Table 7 compares both algorithms on one record.",
+        all(abs(genetic / lattice - 1) <= MIXED for genetic, lattice in spreads.values()),
+        "standard deviation of the angle that RMSE / NR implies, genetic algorithm and multi-innovation: "
+        f"{listed(spreads, 3)} rad. One record has one standard deviation.",
+    )
+
+
+def _claim_of_rivals(found: Recomputed) -> Claim | None:
+    if not found.rivals:
+        return None
+    pairs = {
+        o: [candidate.estimation.output_error[o].error for candidate in (rival.genetic, rival.lattice)]
+        for o, rival in found.rivals.items()
+    }
+    budgets = ", ".join(sorted({_budget(rival) for rival in found.rivals.values()}))
+    return Claim(
+        "Multi-innovation has a smaller error than the genetic algorithm.",
+        all(lattice < genetic for genetic, lattice in pairs.values()),
+        f"the same record, {budgets}; error (45) of the genetic algorithm's best seed and of p = 7: {listed(pairs)}. "
+        "The genetic algorithm minimises (45) over the coefficients, too; multi-innovation takes those of the equation "
+        "error, pulled towards 0.",
+    )
 
 
 def _budget(rival: Rival) -> str:
     """How many evaluations a seed of the genetic algorithm had for how many candidates of the lattice."""
-    settings = {} if rival.genetic.result is None else rival.genetic.result.settings
-    each = sum(settings["evaluations"].values()) / len(settings["seeds"])
+    each = sum(rival.settings["evaluations"].values()) / len(rival.settings["seeds"])
     return f"{each:.0f} evaluations a seed for {rival.candidates} candidates"
 
 
-#: Digits of RMSE and NR in Table 7 allow this much between two standard deviations of one record.
-MIXED = 0.15
-
-
 def _claim_of_the_derivative(found: Recomputed) -> Claim:
-    dropped = {}
-    for stage in (1, 2):
-        row = {n: v for k in (1, 2) for n, v in _paper_orders(stage, k).items()}
-        dropped[stage] = order_law(stage, "derived")["input"].at(row)
-    nr = {
-        s.derived.output: metrics(s.derived.published, s.derived.derived).nr for s in found.stages.values()
-    }  # fmt: skip
-    orders = ", ".join(f"{s.derived.order:.3g}" for s in found.stages.values())
+    hub_and_link = {n: printed.last_orders(f"theta{n}1") | printed.last_orders(f"theta{n}2") for n in STAGES}
+    dropped = [order_law(n, "derived")["input"].at(orders) for n, orders in hub_and_link.items()]
+    parts = [stage.derived for stage in found.stages.values()]
+    orders = ", ".join(f"{part.order:.3g}" for part in parts)
+    changed = ", ".join(f"{metrics(p.published, p.derived).nr:.3g} ({symbol(p.output)})" for p in parts)
     return Claim(
         "Eliminating the other angle leaves the current as it is: (19), (21).",
-        all(abs(v) < 1e-9 for v in dropped.values()),
-        f"the elimination differentiates the current as well, by the order {numbers_listed([*dropped.values()], 2)} at "
-        f"the printed orders and {orders} at those identified here, where it changes the deflection's free run by NR "
-        + ", ".join(f"{v:.3g} ({angle(o)})" for o, v in nr.items()) + ".",
-    )  # fmt: skip
-
-
-def _paper_orders(stage: int, k: int) -> dict[str, float]:
-    index = 2 * stage - 2 + k
-    row = printed.FRACTIONAL[f"theta{stage}{k}"][printed.INNOVATION_LENGTHS[-1]]
-    return {f"{n}{index}": v for n, v in row.orders.items()}
+        all(abs(v) < 1e-9 for v in dropped),
+        f"the elimination differentiates the current as well, by the order {numbers_listed(dropped, 2)} at the printed "
+        f"orders and {orders} at those identified here, where it changes the deflection's free run by NR {changed}.",
+    )
 
 
 def _claim_of_the_impossible_row() -> Claim:

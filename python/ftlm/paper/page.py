@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -12,43 +13,20 @@ from markupsafe import Markup
 
 from ftlm.base.output import check_free
 from ftlm.data.equations import numeric
-from ftlm.fit.recursion import trace_chart
+from ftlm.identification.judged import Judged
 from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.page import estimates_table, grouped_warnings
-from ftlm.judge.metrics import metrics
 from ftlm.model.charts import bode_charts, response_frequencies
+from ftlm.model.model import Model
 from ftlm.model.typesetting import equation_html
+from ftlm.paint.figure import Figure
 from ftlm.paint.heat import heat_map
-from ftlm.paint.lines import line_chart
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
-from ftlm.paint.text import Cell, Exact, number, symbol, symbol_html
+from ftlm.paint.text import Cell, Exact, number, symbol
+from ftlm.paper import figures, tables
 from ftlm.paper.claims import claims
-from ftlm.paper.figures import (
-    LINE_POINTS,
-    fit_chart,
-    flow_chart,
-    rival_figures,
-    sine_figures,
-    stage_figures,
-    unit_label,
-)
-from ftlm.paper.stages import TRACE_EVERY, Recomputed, Stage
-from ftlm.paper.tables import (
-    LETTERS,
-    bounds_table,
-    fits_table,
-    genetic_table,
-    integer_table,
-    model_table,
-    numbers_of,
-    parameters_table,
-    rivals_table,
-    saturation_table,
-    seeds_table,
-    steps_table,
-    symbols_table,
-)
+from ftlm.paper.records import TRACE_EVERY, Recomputed, Stage
 from ftlm.search.result import search_summary
 
 PAPER = (
@@ -57,222 +35,147 @@ PAPER = (
 )
 
 
-def verdicts(found: Recomputed) -> list[str]:
+def stage_section(
+    heading: str, joint: Model, results: Mapping[str, Judged | None], shown: Sequence[Table],
+    charts: Sequence[Figure], *notes: str,
+) -> Section:  # fmt: skip
+    """The joint model's equations, then tables with that of all searches, and figures."""
+    searches = {f"{n}, {o}": s for n, r in results.items() if r is not None for o, s in r.searches.items()}
+    words = "Joint output error, order law and coefficient law imposed:"
+    return Section(
+        heading, [words, *map(equation_html, joint.equations), *notes], warnings=grouped_warnings(results),
+        tables=[*shown, search_summary(searches)], figures=charts,
+    )  # fmt: skip
+
+
+def _verdict_section(found: Recomputed) -> Section:
     """What holds and what does not, a paragraph each."""
     words = {True: "Holds.", False: "Does not hold.", None: "Cannot be told."}
-    return [
-        Markup('<span class="verdict"><strong>{} {}</strong><span class="note">{}</span></span>').format(
-            words[c.holds], c.claim, c.evidence[0].upper() + c.evidence[1:]
-        )
-        for c in claims(found)
-    ]
+    verdict = Markup('<span class="verdict"><strong>{} {}</strong><span class="note">{}</span></span>')
+    verdicts = [verdict.format(words[c.holds], c.claim, c.evidence[0].upper() + c.evidence[1:]) for c in claims(found)]
+    missing = "No second run was given: nothing is validated, Figure 10 is left out."
+    warnings = [missing] * (found.sine is None) + list(found.notes)
+    return Section("What holds and what does not", verdicts, warnings=warnings)
 
 
 def _stage_section(found: Recomputed, stage: Stage) -> Section:
-    number = stage.number
-    table = 4 if number == 1 else 5
-    joint = stage.candidates["output error"]
-    searches = {
-        f"{label}, {o}": s
-        for label, c in stage.candidates.items()
-        if c.result is not None
-        for o, s in c.result.searches.items()
-    }
-    return Section(
-        f"Stage {number} (Table {table}, Figures {3 * number + 1}–{3 * number + 3})",
-        paragraphs=[
-            "Joint output error, order law and coefficient law imposed:",
-            *(equation_html(e) for e in joint.model.equations),
-        ],
-        warnings=grouped_warnings({label: c.result for label, c in stage.candidates.items()}),
-        tables=[
-            model_table(stage, f"Table {table}. Identified models of stage {number}, square input"),
-            estimates_table(joint.result, found.truth.get(stage.number, {})),
-            fits_table(stage),
-            search_summary(searches),
-        ],
-        figures=stage_figures(stage),
+    number, joint = stage.number, stage.candidates["output error"]
+    title = f"Table {3 + number}. Identified models of stage {number}, square input"
+    estimates = estimates_table(joint.result, found.truth.get(number, {}))
+    return stage_section(
+        f"Stage {number} (Table {3 + number}, Figures {3 * number + 1}–{3 * number + 3})", joint.model,
+        {label: c.result for label, c in stage.candidates.items()},
+        [tables.model_table(stage, title), estimates, tables.fits_table(stage)], figures.stage_figures(stage),
+    )  # fmt: skip
+
+
+def _rival_section(found: Recomputed) -> Section:
+    words = (
+        "Both search the same record; the genetic algorithm may evaluate as many candidates as the lattice has. It "
+        "varies orders and coefficients and is judged by (45) itself."
     )
+    both = [tables.genetic_table(found), tables.rivals_table(found)]
+    how = [tables.seeds_table(found), tables.bounds_table(found)]
+    heading = "The genetic algorithm (Tables 6 and 7, Figure 11)"
+    return Section(heading, [words], tables=[*both, *how], figures=figures.rival_figures(found))
 
 
 def _weak_section(found: Recomputed) -> Section:
-    figures = []
-    for stage in found.stages.values():
-        for output, traces in stage.weak_traces.items():
-            named = [(f"p = {p}", trace) for p, trace in traces.items()]
-            figures.append(trace_chart(named, title=f"{symbol(output)}: error (45), weak prior", log_x=True))
-    return Section(
-        "What p does",
-        paragraphs=[
-            "Recursion (44) is least squares with weights: row i counts min(p, M − i + 1) times, against a prior that "
-            "holds the coefficients near 0 with covariance K0. So p is a weight of the data against the prior. With a "
-            "weak prior every p gives the least-squares answer, step by step.",
-        ],
-        tables=[saturation_table(found)],
-        figures=figures,
-        small=True,
+    words = (
+        "Recursion (44) is least squares with weights: row i counts min(p, M − i + 1) times, against a prior that "
+        "holds the coefficients near 0 with covariance K0. So p is a weight of the data against the prior. With a "
+        "weak prior every p gives the least-squares answer, step by step."
     )
+    charts = [
+        figures.convergence_chart(t, f"{symbol(o)}: error (45), weak prior") for o, t in found.weak_traces.items()
+    ]
+    return Section("What p does", [words], tables=[tables.saturation_table(found)], figures=charts, small=True)
 
 
 def _near_section(found: Recomputed) -> Section:
-    rows: list[list[Cell]] = []
-    figures = []
-    for stage in found.stages.values():
-        for label, candidate in (("printed", stage.near), ("smallest equation error", stage.by_equation)):
-            for output in stage.outputs:
-                orders, _ = numbers_of(candidate, output)
-                rows.append(
-                    [Markup("{}, {}").format(symbol_html(output), label), *(Exact(orders[n]) for n in LETTERS[0]),
-                     candidate.estimation.equation_error[output].nr, candidate.estimation.output_error[output].nr]
-                )  # fmt: skip
-        output = stage.outputs[1]
-        figures.append(
-            fit_chart(
-                stage.near.estimation, [("printed orders", stage.near.estimation)], output,
-                f"{symbol(output)}: the orders of Table {3 + stage.number} with the best coefficients for this run",
-            )
-        )  # fmt: skip
-    table = Table(
-        "Orders close to α: equation error and free run",
-        ("angle, orders", *(symbol_html(n) for n in LETTERS[0]), "NR of the equation error", "NR of the free run"),
-        rows,
-        note="Coefficients by least squares. “Smallest equation error”: the orders that the lattice gives when the "
-        "equation error (RMSE) ranks its candidates.",
-    )
     words = (
         "With α − ν small, I^(α−ν) y is nearly y itself. A few such terms reproduce any smooth signal on the "
         "right-hand side, whatever the machine is; only the free run shows what the equation knows."
     )
-    return Section("Orders close to one another", [words], tables=[table], figures=figures)
+    charts = []
+    for stage in found.stages.values():
+        output, drawn = stage.outputs[1], [("printed orders", stage.near.estimation)]
+        of = f"the orders of Table {3 + stage.number} with the best coefficients for this run"
+        charts.append(figures.fit_chart(drawn, output, f"{symbol(output)}: {of}"))
+    return Section("Orders close to one another", [words], tables=[tables.near_table(found)], figures=charts)
 
 
 def _derivative_section(found: Recomputed) -> Section:
-    figures = []
-    for stage in found.stages.values():
-        part = stage.derived
-        nr = metrics(part.published, part.derived).nr
-        figures.append(
-            line_chart(
-                part.time, [("as published", part.published), ("as derived", part.derived)],
-                title=f"{symbol(part.output)} from the current alone, order of the current 0 and {part.order:.3g}",
-                x_label="time [s]", y_label=unit_label(part.output), points=LINE_POINTS,
-                caption=f"All other numbers alike. NR between the two: {nr:.3g}.",
-            )
-        )  # fmt: skip
     words = (
         "Eliminating the hub angle's highest derivative from (15) by (17) differentiates the current as well, by the "
         "order α₂ − μ₂ + γ₁ − α₁, which (19) and (21) leave out. It vanishes for whole orders. "
         "flexible_link(input_order='derived') keeps it; a symbolic test derives both."
     )
-    return Section("The dropped derivative", [words], figures=figures)
+    charts = [figures.derivative_chart(stage.derived) for stage in found.stages.values()]
+    return Section("The dropped derivative", [words], figures=charts)
 
 
 def _landscape_section(found: Recomputed) -> Section:
-    figures, words = [], []
-    fits = [(stage, stage.candidates["output error"].result) for stage in found.stages.values()]
-    joint = [(stage, result) for stage, result in fits if result is not None and result.joint is not None]
+    fits = {n: stage.candidates["output error"].result for n, stage in found.stages.items()}
+    joint = {n: result for n, result in fits.items() if result is not None and result.joint is not None}
     with ThreadPoolExecutor(max(1, len(joint))) as pool:
-        landscapes = list(pool.map(output_error_landscape, [result for _, result in joint]))
-    for (stage, _), drawn in zip(joint, landscapes, strict=True):
-        if drawn is not None:
-            figures.append(heat_map(drawn))
-            words.append(
-                f"Stage {stage.number}: the two orders that this run tells apart least are {symbol(drawn.names[0])} "
-                f"and {symbol(drawn.names[1])} (correlation {number(drawn.correlation, 3)})."
-            )
-    return Section("Order landscape", words, figures=figures, small=True)
+        drawn = dict(zip(joint, pool.map(output_error_landscape, joint.values()), strict=True))
+    present = {n: landscape for n, landscape in drawn.items() if landscape is not None}
+    words = [
+        f"Stage {n}: the two orders that this run tells apart least are {symbol(landscape.names[0])} "
+        f"and {symbol(landscape.names[1])} (correlation {number(landscape.correlation, 3)})."
+        for n, landscape in present.items()
+    ]
+    return Section("Order landscape", words, figures=[*map(heat_map, present.values())], small=True)
 
 
 def _bode_section(found: Recomputed) -> Section:
-    figures = []
+    charts = []
     for stage in found.stages.values():
         model = stage.candidates["output error"].model
-        omega = response_frequencies(model, found.square.step, found.square.duration)
-        figures += bode_charts(model, omega)
-    return Section(
-        "Frequency response", ["Of the joint output-error models, with 95 % bands."], figures=figures, small=True
-    )
+        charts += bode_charts(model, response_frequencies(model, found.square.step, found.square.duration))
+    words = "Of the joint output-error models, with 95 % bands."
+    return Section("Frequency response", [words], figures=charts, small=True)
 
 
 def _runs_section(found: Recomputed) -> Section:
     rows: list[list[Cell]] = []
-    for run in (found.square, found.sine):
-        if run is not None:
-            rows.append(
-                [run.name, run.length, Exact(run.step), run.duration,
-                 ", ".join(f"{symbol(n)} ±{np.max(np.abs(run[n])):.3g} {run.units[n]}" for n in run.inputs)]
-            )  # fmt: skip
+    for run in found.runs:
+        currents = (f"{symbol(n)} ±{np.max(np.abs(run[n])):.3g} {run.units[n]}" for n in run.inputs)
+        rows.append([run.name, run.length, Exact(run.step), run.duration, ", ".join(currents)])
     first = next(iter(found.stages.values()))
-    m = first.candidates["p = 7"].estimation.m
     notes = [
-        f"M = {m} block pulses, order lattice in steps of {found.lattice.step:g}, α from {found.lattice.alpha[0]:g} to "
-        f"{found.lattice.alpha[1]:g}, K0 = 1, rows in Haar coordinates from coarse to fine. Convergence is drawn at "
-        f"every {TRACE_EVERY}th step. Instrumental variables are searched two steps around the "
-        "orders of least squares.",
+        f"M = {first.candidates['p = 7'].estimation.m} block pulses, order lattice in steps of {found.lattice.step:g}, "
+        f"α from {found.lattice.alpha[0]:g} to {found.lattice.alpha[1]:g}, K0 = 1, rows in Haar coordinates from "
+        f"coarse to fine. Convergence is drawn at every {TRACE_EVERY}th step. Instrumental variables are searched two "
+        "steps around the orders of least squares.",
         "Explicit Euler steps at the step of the run, 0.002 s on the virtual rig, as in the paper.",
         *found.notes,
     ]
-    return Section(
-        "Runs and settings", notes, tables=[Table("Runs", ("run", "rows", "step [s]", "length [s]", "currents"), rows)]
-    )
+    runs = Table("Runs", ("run", "rows", "step [s]", "length [s]", "currents"), rows)
+    return Section("Runs and settings", notes, tables=[runs])
 
 
 def reproduction_page(found: Recomputed, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-    """Write the reproduction as one page.
-
-    Parameters
-    ----------
-    found
-        From :func:`ftlm.reproduce`.
-    path
-        File to write.
-    force
-        Whether to overwrite.
-
-    Returns
-    -------
-    pathlib.Path
-        The file.
-
-    Raises
-    ------
-    DataError
-        The file exists and ``force`` is not set, or cannot be written.
-    """
+    """Write the reproduction as one page; see :meth:`ftlm.Reproduction.page`."""
     check_free(path, force=force)
-    missing = (
-        [] if found.sine is not None else ["No second run was given: nothing is validated, Figure 10 is left out."]
-    )
     sections = [
-        Section("What holds and what does not", verdicts(found), warnings=[*missing, *found.notes]),
+        _verdict_section(found),
         Section(
-            "Symbols and steps",
-            ["Figures 1 and 3 are pictures of the authors' arm and are not shown."],
-            tables=[symbols_table(), steps_table()],
-            figures=[flow_chart()],
+            "Symbols and steps", ["Figures 1 and 3 are pictures of the authors' arm and are not shown."],
+            tables=[tables.symbols_table(), tables.steps_table()], figures=[figures.flow_chart()],
         ),
-        Section("Parameters (Table 3)", tables=[parameters_table(), integer_table()]),
-        *(_stage_section(found, s) for s in found.stages.values()),
-    ]
-    if found.sine is not None:
-        sections.append(Section("The other input (Figure 10)", figures=sine_figures(found)))
-    if any(s.rivals for s in found.stages.values()):
-        words = (
-            "Both search the same record; the genetic algorithm may evaluate as many candidates as the lattice has. It "
-            "varies orders and coefficients and is judged by (45) itself."
-        )
-        sections.append(
-            Section(
-                "The genetic algorithm (Tables 6 and 7, Figure 11)", [words],
-                tables=[genetic_table(found), rivals_table(found), seeds_table(found), bounds_table(found)],
-                figures=rival_figures(found),
-            )
-        )  # fmt: skip
-    sections += [
-        _weak_section(found), _near_section(found), _derivative_section(found), _landscape_section(found),
-        _bode_section(found), _runs_section(found),
+        Section("Parameters (Table 3)", tables=[tables.parameters_table(), tables.integer_table()]),
+        *(_stage_section(found, stage) for stage in found.stages.values()),
     ]  # fmt: skip
-    origin = "a simulated arm whose truth is known" if found.simulated else f"the runs {_names(found)}"
+    if found.sine is not None:
+        sections.append(Section("The other input (Figure 10)", figures=figures.sine_figures(found)))
+    if found.rivals:
+        sections.append(_rival_section(found))
+    last = _weak_section, _near_section, _derivative_section, _landscape_section, _bode_section, _runs_section
+    sections += [section(found) for section in last]
+    names = " and ".join(f"“{run.name}”" for run in found.runs)
+    origin = "a simulated arm whose truth is known" if found.simulated else f"the runs {names}"
     lead = (
         f"Section 5 of the paper, recomputed on {origin}, beside what the paper prints. {PAPER}. Numbers in rows "
         "marked “printed” are the paper's; every other number, figure and verdict on this page is computed."
@@ -280,30 +183,32 @@ def reproduction_page(found: Recomputed, path: str | os.PathLike[str], *, force:
     return write_page(path, title="The paper reproduced", sections=sections, lead=lead, force=force)
 
 
-def _names(found: Recomputed) -> str:
-    return " and ".join(f"“{r.name}”" for r in (found.square, found.sine) if r is not None)
+def fits_text(fits: Mapping[str, Sequence[float]], label: int, widths: Sequence[int]) -> list[str]:
+    """Fits in percent, a line for each model, in columns of these widths."""
+    lines = []
+    for name, values in fits.items():
+        shown = ("–" if math.isnan(fit) else f"{fit:.2f}" for fit in values)
+        lines.append(name.ljust(label) + "".join(text.rjust(w) for text, w in zip(shown, widths, strict=True)))
+    return lines
 
 
 def reproduction_text(found: Recomputed) -> str:
     """Verdicts and fits for a terminal."""
-    words = {True: "holds", False: "does not hold", None: "cannot be told"}
+    words = {True: "HOLDS", False: "DOES NOT HOLD", None: "CANNOT BE TOLD"}
     lines = []
     for claim in claims(found):
-        lines += [f"{words[claim.holds].upper()}: {claim.claim}", f"    {claim.evidence}"]
+        lines += [f"{words[claim.holds]}: {claim.claim}", f"    {claim.evidence}"]
     for stage in found.stages.values():
         lines += ["", f"Stage {stage.number}: fit of the free run in percent, driven as identified"]
-        heads = [f"{o} {run}" for o in stage.outputs for run in ("square", "sine")]
-        lines.append(" " * 26 + "".join(f"{h:>16}" for h in heads))
-        for label, candidate in stage.candidates.items():
-            cells = ""
-            for o in stage.outputs:
-                other = candidate.validation
-                fits = (
-                    candidate.estimation.output_error[o].fit,
-                    math.nan if other is None else other.output_error[o].fit,
-                )
-                cells += "".join(f"{'–' if math.isnan(f) else f'{f:.2f}':>16}" for f in fits)
-            lines.append(f"{label:<26}{cells}")
+        lines.append(" " * 26 + "".join(f"{o + run:>16}" for o in stage.outputs for run in (" square", " sine")))
+        fits = {
+            label: [
+                math.nan if part is None else part.output_error[o].fit
+                for o in stage.outputs for part in (c.estimation, c.validation)
+            ]
+            for label, c in stage.candidates.items()
+        }  # fmt: skip
+        lines += fits_text(fits, 26, [16] * 4)
         lines += [f"  {numeric(e)}" for e in stage.candidates["output error"].model.equations]
     lines += [f"note: {n}" for n in found.notes]
     return "\n".join(lines)

@@ -8,25 +8,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ftlm.paint.text import Exact
+
 #: The paper's p, its number of pulses, and its four angles in the order n = 1 … 4.
 INNOVATION_LENGTHS = (1, 3, 5, 7)
 POINTS = 2048
 OUTPUTS = ("theta11", "theta12", "theta21", "theta22")
+#: Letters of the orders and of the coefficients, in the order of the tables' columns.
+ORDERS, COEFFICIENTS = ("gamma", "alpha", "beta", "mu"), ("a", "b", "d", "g")
 
 
 @dataclass(frozen=True)
 class Printed:
-    """One printed row.
-
-    Parameters
-    ----------
-    orders
-        ``gamma``, ``alpha``, ``beta``, ``mu``; what the table leaves out is not there.
-    coefficients
-        ``a``, ``b``, ``d``, ``g``, likewise.
-    error, rmse, nr
-        Criteria (45), (46) and (47); None where the table has none.
-    """
+    """One printed row: its numbers by letter, and criteria (45), (46), (47); None where the table has none."""
 
     orders: Mapping[str, float]
     coefficients: Mapping[str, float]
@@ -35,23 +29,21 @@ class Printed:
     nr: float | None = None
 
 
-def _row(orders: tuple[float, ...], coefficients: tuple[float | None, ...], *criteria: float) -> Printed:
-    named = {n: c for n, c in zip("abdg", coefficients, strict=True) if c is not None}
-    return Printed(dict(zip(("gamma", "alpha", "beta", "mu"), orders, strict=True)), named, *criteria)
+def _row(orders: tuple[float | None, ...], coefficients: tuple[float | None, ...], *criteria: float) -> Printed:
+    def present(letters: tuple[str, ...], values: tuple[float | None, ...]) -> dict[str, float]:
+        return {letter: Exact(v) for letter, v in zip(letters, values, strict=True) if v is not None}
+
+    return Printed(present(ORDERS, orders), present(COEFFICIENTS, coefficients), *map(Exact, criteria))
 
 
-def _integer(coefficients: tuple[float | None, ...], *criteria: float) -> Printed:
-    named = {n: c for n, c in zip("abdg", coefficients, strict=True) if c is not None}
-    return Printed({"gamma": 1.0, "alpha": 2.0, "mu": 1.0}, named, *criteria)
-
-
+_WHOLE = (1.0, 2.0, None, 1.0)
 _HUB, _LINK = (1.9, 2.0, 1.85, 1.8), (1.95, 2.0, 1.9, 1.85)
 #: Integer-order rows of Tables 4 and 5.
 INTEGER: dict[str, Printed] = {
-    "theta11": _integer((628.89, -62.956, None, 140.47), 640.31, 0.3829, 4.2028),
-    "theta12": _integer((-863.33, 62.956, None, -140.47), 23.764, 0.0205, 3.4665),
-    "theta21": _integer((2271.12, -496.76, 28.35, 288.12), 242.16, 0.2312, 1.6330),
-    "theta22": _integer((-3336.18, 496.76, -41.65, -288.12), 244.79, 0.1045, 29.967),
+    "theta11": _row(_WHOLE, (628.89, -62.956, None, 140.47), 640.31, 0.3829, 4.2028),
+    "theta12": _row(_WHOLE, (-863.33, 62.956, None, -140.47), 23.764, 0.0205, 3.4665),
+    "theta21": _row(_WHOLE, (2271.12, -496.76, 28.35, 288.12), 242.16, 0.2312, 1.6330),
+    "theta22": _row(_WHOLE, (-3336.18, 496.76, -41.65, -288.12), 244.79, 0.1045, 29.967),
 }
 #: Fractional rows of Tables 4 and 5, by angle and innovation length.
 FRACTIONAL: dict[str, dict[int, Printed]] = {
@@ -111,3 +103,9 @@ TABLE_3: dict[str, tuple[float, str]] = {
     "K_τ1": (0.119, "Nm²"),
     "K_τ2": (0.0234, "Nm²"),
 }
+
+
+def last_orders(output: str) -> dict[str, float]:
+    """Orders of an angle's row of p = 7 by name, such as alpha1."""
+    index = 1 + OUTPUTS.index(output)
+    return {f"{n}{index}": v for n, v in FRACTIONAL[output][INNOVATION_LENGTHS[-1]].orders.items()}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import threading
-from collections.abc import Callable, Mapping
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,17 @@ from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.fit.genetic import Genetic
 from ftlm.model.model import Model
-from ftlm.paper.arm import demo_run
+from ftlm.paper.arm import STAGES, StageNumber, demo_run
 from ftlm.paper.claims import Claim, claims
 from ftlm.paper.page import reproduction_page
-from ftlm.paper.stages import Recomputed, Stage, StageWork, stage_dict
+from ftlm.paper.records import TRACE_EVERY, Recomputed, Stage
+from ftlm.paper.work import Preset, StageWork
 
-#: Files of :meth:`Reproduction.save` beside the models.
-SAVED = ("square.csv", "sine.csv", "tables.json")
+#: Rows that an order search keeps; the tables need the best alone.
+KEEP = 1
+#: What is saved whatever the stages hold.
+TABLES = "tables.json"
+ALWAYS_SAVED = ("square.csv", "sine.csv", TABLES)
 #: Seconds between two looks for Ctrl-C.
 LOOK = 0.1
 
@@ -82,38 +86,29 @@ class Reproduction(Recomputed):
             A file is there already, or the folder cannot be written.
         """
         where = Path(folder)
-        models = self._models()
-        check_folder(where, (*SAVED, *models), force=force)
-        written = []
-        for run, name in ((self.square, "square.csv"), (self.sine, "sine.csv")):
-            if run is not None:
-                run.to_csv(where / name, force=force)
-                written.append(where / name)
+        models: dict[str, Model] = {}
+        for number, stage in self.stages.items():
+            models |= {f"stage{number}-{slug(label)}.json": c.model for label, c in stage.candidates.items()}
+            for output, rival in stage.rivals.items():
+                models |= {f"{output}-genetic.json": rival.genetic.model, f"{output}-rival.json": rival.lattice.model}
+        check_folder(where, [*ALWAYS_SAVED, *models], force=force)
+        runs = dict(zip(ALWAYS_SAVED, self.runs, strict=False))
+        for name, run in runs.items():
+            run.to_csv(where / name, force=force)
         for name, model in models.items():
             model.save(where / name, force=force)
-            written.append(where / name)
         text = json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False)
-        write_atomically(where / "tables.json", text.encode(), force=force)
-        return [*written, where / "tables.json"]
-
-    def _models(self) -> dict[str, Model]:
-        found = {}
-        for number, stage in self.stages.items():
-            for label, candidate in stage.candidates.items():
-                found[f"stage{number}-{slug(label)}.json"] = candidate.model
-            for output, rival in stage.rivals.items():
-                found[f"{output}-genetic.json"] = rival.genetic.model
-                found[f"{output}-rival.json"] = rival.lattice.model
-        return found
+        write_atomically(where / TABLES, text.encode(), force=force)
+        return [where / name for name in (*runs, *models, TABLES)]
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON: every number of every table, and the verdicts."""
         return {
-            "runs": [r.name for r in (self.square, self.sine) if r is not None],
+            "runs": [run.name for run in self.runs],
             "simulated": self.simulated,
             "lattice": {"step": self.lattice.step, "alpha": list(self.lattice.alpha)},
             "claims": [{"claim": c.claim, "holds": c.holds, "evidence": c.evidence} for c in self.claims],
-            "stages": {str(n): stage_dict(s) for n, s in self.stages.items()},
+            "stages": {str(n): s.to_dict() for n, s in self.stages.items()},
             "notes": list(self.notes),
         }
 
@@ -124,17 +119,10 @@ def slug(label: str) -> str:
 
 
 def reproduce(
-    square: Run | None = None,
-    sine: Run | None = None,
-    *,
-    step: float = 0.05,
-    noise: float = 1e-4,
-    seed: int = 1,
-    genetic: Genetic | None = None,
-    threads: int | None = None,
-    say: Callable[[str], None] = lambda _: None,
+    square: Run | None = None, sine: Run | None = None, *, step: float = 0.05, noise: float = 1e-4, seed: int = 1,
+    genetic: Genetic | None = None, threads: int | None = None, say: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
-) -> Reproduction:
+) -> Reproduction:  # fmt: skip
     """Recompute section 5 of the paper, on the virtual rig or on runs of one's own.
 
     Parameters
@@ -176,37 +164,35 @@ def reproduce(
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     numbers = stages_of(square, sine)
     lattice = Lattice(step=step)
-    works = {n: StageWork(n, square, sine, lattice, genetic, threads, say, progress, []) for n in numbers}
-    stages = {n: work.stage() for n, work in works.items()} if len(works) == 1 or threads == 1 else side_by_side(works)
-    notes = [note for work in works.values() for note in work.notes]
-    return Reproduction(square, sine, simulated, stages, lattice, tuple(dict.fromkeys(notes)))
+    preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True)
+    works = [StageWork(n, square, sine, preset, threads, say, progress) for n in numbers]
+    one_by_one = len(works) == 1 or threads == 1
+    stages = [w.reproduced(genetic) for w in works] if one_by_one else side_by_side(works, genetic)
+    notes = dict.fromkeys(note for work in works for note in work.notes)
+    return Reproduction(square, sine, simulated, {s.number: s for s in stages}, lattice, tuple(notes))
 
 
-def side_by_side(works: Mapping[int, StageWork]) -> dict[int, Stage]:
+def side_by_side(works: Sequence[StageWork], genetic: Genetic | None) -> list[Stage]:
     """All stages at once: while one fits on one core, another uses the rest."""
     stop = threading.Event()
     with ExitStack() as stack:
-        for work in works.values():
-            told = work.progress
-            if isinstance(told, Progress):
-                told = stack.enter_context(told.beside())
-                work.say = _both(work.say, told.name)
-            work.progress = Stoppable(told, stop)
+        for work in works:
+            bar = work.progress
+            if isinstance(bar, Progress):
+                bar = stack.enter_context(bar.beside())
+                work.say = _both(work.say, bar.name)
+            work.progress = Stoppable(bar, stop)
         pool = stack.enter_context(ThreadPoolExecutor(len(works), thread_name_prefix="ftlm-stage"))
-        under_way = {n: pool.submit(work.stage) for n, work in works.items()}
+        under_way = [pool.submit(work.reproduced, genetic) for work in works]
         try:
+            done: set[Future[Stage]] = set()
             # A wait without an end would not be interrupted by Ctrl-C everywhere.
-            while wait(under_way.values(), timeout=LOOK, return_when=FIRST_EXCEPTION).not_done:
-                if any(f.done() and f.exception() is not None for f in under_way.values()):
-                    break
-        except BaseException:
+            while len(done) < len(works) and not any(f.exception() for f in done):
+                done, _ = wait(under_way, timeout=LOOK, return_when=FIRST_EXCEPTION)
+        finally:
             stop.set()
-            raise
-        stop.set()
-        failed = [f.exception() for f in under_way.values() if f.done() and f.exception() is not None]
-        if failed and failed[0] is not None:
-            raise failed[0]
-        return {n: f.result() for n, f in under_way.items()}
+        # Where one has failed the others end in KeyboardInterrupt, which says nothing.
+        return [f.result() for f in under_way if f in done]
 
 
 def _both(first: Callable[[str], None], second: Callable[[str], None]) -> Callable[[str], None]:
@@ -217,7 +203,7 @@ def _both(first: Callable[[str], None], second: Callable[[str], None]) -> Callab
     return told
 
 
-def stages_of(square: Run, sine: Run | None) -> list[int]:
+def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
     """Stages whose signals a run has.
 
     Raises
@@ -225,7 +211,7 @@ def stages_of(square: Run, sine: Run | None) -> list[int]:
     DataError
         No stage is whole, or the sine run lacks a signal of one.
     """
-    wanted = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in (1, 2)}
+    wanted = {n: (f"I{n}", f"theta{n}1", f"theta{n}2") for n in STAGES}
     found = [n for n, names in wanted.items() if all(s in square.signals for s in names)]
     if not found:
         listed = ", ".join(square.signals)

@@ -7,11 +7,21 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ftlm.base.errors import ModelError
-from ftlm.judge.comparison import _FIGURES, Comparison
+from ftlm.data.equations import Equation
+from ftlm.judge.comparison import Comparison
 from ftlm.judge.metrics import Metrics
 from ftlm.model.model import Model
 from ftlm.paint.table import NOT_IN_MODEL, Table
-from ftlm.paint.text import DIGITS, DIVERGED, Cell, Exact, symbol, symbol_html
+from ftlm.paint.text import DIGITS, DIVERGED, Cell, Exact, shortened, symbol, symbol_html
+from ftlm.paper.printed import COEFFICIENTS, ORDERS
+
+#: The order that each coefficient's term has in the paper's equations (22)-(25).
+ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
+#: Heads of the columns of an equation's numbers and of its criteria, and the groups that the former stand in.
+ORDER_HEADS = tuple(map(symbol_html, ORDERS))
+HEADS = (*ORDER_HEADS, *map(symbol_html, COEFFICIENTS))
+CRITERIA = ("error (45)", "RMSE", "NR")
+GROUPS = (("", 1), ("orders", 4), ("coefficients", 4))
 
 
 @dataclass(frozen=True)
@@ -40,10 +50,36 @@ class PaperRow:
     output_error: Metrics | None
 
 
-#: The order that each coefficient's term has in the paper's equations (22)-(25).
-_ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
-_ORDERS = ("gamma", "alpha", "beta", "mu")
-_COEFFICIENTS = ("a", "b", "d", "g")
+def letter_of(name: str) -> str:
+    """A name of the paper without its index: alpha1 is alpha."""
+    return name.rstrip("0123456789")
+
+
+def letters_of(item: Equation) -> tuple[dict[str, float], dict[str, float]]:
+    """Orders and coefficients of an equation of the arm by letter."""
+    orders, coefficients = {"alpha": item.order.constant}, {}
+    for term in item.terms:
+        letter = letter_of(term.name or "")
+        if letter in COEFFICIENTS:
+            coefficients[letter] = float(term.coefficient) + 0.0
+        if letter in ORDER_OF:
+            orders[ORDER_OF[letter]] = term.order.constant
+    return orders, coefficients
+
+
+def four_digits(orders: Mapping[str, float]) -> dict[str, float]:
+    """Orders with the digits of the paper's Table 6."""
+    return {name: round(order, 4) + 0.0 for name, order in orders.items()}
+
+
+def number_cells(orders: Mapping[str, float], coefficients: Mapping[str, float]) -> list[Cell]:
+    """The cells under `HEADS`: orders as they are, coefficients as estimates."""
+    return [*(Exact(orders[n]) if n in orders else None for n in ORDERS), *map(coefficients.get, COEFFICIENTS)]
+
+
+def criteria_cells(figures: Metrics | None) -> list[Cell]:
+    """The cells under `CRITERIA`."""
+    return [None] * 3 if figures is None else [figures.error, figures.rmse, figures.nr]
 
 
 def paper_row(label: str, model: Model, comparison: Comparison, output: str) -> PaperRow:
@@ -57,21 +93,12 @@ def paper_row(label: str, model: Model, comparison: Comparison, output: str) -> 
     item = next((e for e in model.equations if e.output == output), None)
     if item is None:
         raise ModelError(f"the model has no output {output!r}; it has {', '.join(model.outputs)}")
-    orders: dict[str, float] = {"alpha": item.order.constant}
-    coefficients: dict[str, float] = {}
-    for term in item.terms:
-        letter = (term.name or "").rstrip("0123456789")
-        if letter in _COEFFICIENTS:
-            coefficients[letter] = float(term.coefficient) + 0.0
-        if letter in _ORDER_OF:
-            orders[_ORDER_OF[letter]] = term.order.constant
-    return PaperRow(
-        label, output, orders, coefficients, comparison.equation_error.get(output), comparison.output_error.get(output)
-    )
+    errors = comparison.equation_error.get(output), comparison.output_error.get(output)
+    return PaperRow(label, output, *letters_of(item), *errors)
 
 
-def _halves(rows: Sequence[PaperRow]) -> dict[int, str]:
-    """Return the output that begins at each row index."""
+def _beginnings(rows: Sequence[PaperRow]) -> dict[int, str]:
+    """The output that begins at each row index."""
     return {i: r.output for i, r in enumerate(rows) if i == 0 or rows[i - 1].output != r.output}
 
 
@@ -85,22 +112,16 @@ def paper_table(rows: Sequence[PaperRow], *, title: str = "Identified models") -
     title
         Caption.
     """
-    cells: list[list[Cell]] = []
-    for row in rows:
-        orders = [Exact(row.orders[n]) if n in row.orders else None for n in _ORDERS]
-        coefficients = [row.coefficients.get(n) for n in _COEFFICIENTS]
-        cells.append([row.label, *orders, *coefficients, *three(row.equation_error), *three(row.output_error)])
+    cells = [
+        [row.label, *number_cells(row.orders, row.coefficients), *criteria_cells(row.equation_error),
+         *criteria_cells(row.output_error)]
+        for row in rows
+    ]  # fmt: skip
     return Table(
-        title,
-        ("model", *(symbol_html(n) for n in (*_ORDERS, *_COEFFICIENTS)), *_FIGURES[:3], *_FIGURES[:3]),
-        cells,
-        groups=(("", 1), ("orders", 4), ("coefficients", 4), ("equation error", 3), ("output error (free run)", 3)),
-        headings={i: symbol_html(output) for i, output in _halves(rows).items()},
-    )
-
-
-def three(figures: Metrics | None) -> list[Cell]:
-    return [None] * 3 if figures is None else [figures.error, figures.rmse, figures.nr]
+        title, ("model", *HEADS, *CRITERIA, *CRITERIA), cells,
+        groups=(*GROUPS, ("equation error", 3), ("output error (free run)", 3)),
+        headings={i: symbol_html(output) for i, output in _beginnings(rows).items()},
+    )  # fmt: skip
 
 
 #: Widths of the columns in text: label, four orders, four coefficients, twice error, RMSE, NR. Together 119 of 120.
@@ -109,32 +130,27 @@ _LABEL, _TEXT_WIDTHS = 17, (5,) * 4 + (9,) * 4 + (8, 8, 7) * 2
 
 def paper_table_text(rows: Sequence[PaperRow]) -> str:
     """Return the same table for a terminal of 120 columns; a number loses digits where its column is too narrow."""
-    table = paper_table(rows)
-    heads = [symbol(n) for n in (*_ORDERS, *_COEFFICIENTS)] + ["error", "RMSE", "NR"] * 2
+    heads = [*map(symbol, (*ORDERS, *COEFFICIENTS)), *("error", "RMSE", "NR") * 2]
     left, right = sum(_TEXT_WIDTHS[:8]) + _LABEL, sum(_TEXT_WIDTHS[8:11])
+    groups = (f" {words} ".center(right - 1, "-").rjust(right) for words in ("equation error", "free run"))
     lines = [
-        " " * left
-        + " equation error ".center(right - 1, "-").rjust(right)
-        + " free run ".center(right - 1, "-").rjust(right),
+        " " * left + "".join(groups),
         "model".ljust(_LABEL) + "".join(h.rjust(w) for h, w in zip(heads, _TEXT_WIDTHS, strict=True)),
     ]
-    starts, infinite = _halves(rows), False
-    for i, cells in enumerate(table.rows):
+    starts, infinite = _beginnings(rows), False
+    for i, (label, *cells) in enumerate(paper_table(rows).rows):
         if i in starts:
             lines.append(symbol(starts[i]))
-        label = rows[i].label
-        line = f"  {label if len(label) <= _LABEL - 3 else label[: _LABEL - 4] + '…'}".ljust(_LABEL)
-        for value, width in zip(cells[1:], _TEXT_WIDTHS, strict=True):
-            infinite = infinite or (isinstance(value, float) and not math.isfinite(value))
-            line += _fitted(value, width - 1).rjust(width)
-        lines.append(line)
+        numbers = "".join(_fitted(v, width - 1).rjust(width) for v, width in zip(cells, _TEXT_WIDTHS, strict=True))
+        lines.append(f"  {shortened(str(label), _LABEL - 3)}".ljust(_LABEL) + numbers)
+        infinite = infinite or any(isinstance(v, float) and not math.isfinite(v) for v in cells)
     if infinite:
         lines.append(f"∞: {DIVERGED}, the response leaves the range of numbers")
     return "\n".join(lines)
 
 
 def _fitted(value: Cell, width: int) -> str:
-    """Return a number with as many of its five digits as fit."""
+    """A number with as many of its five digits as fit."""
     if value is None or isinstance(value, str):
         return NOT_IN_MODEL
     if not math.isfinite(value):

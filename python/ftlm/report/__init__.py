@@ -7,8 +7,9 @@ from ftlm.judge.charts import comparison_charts, error_chart, pulse_times, resid
 from ftlm.judge.comparison import errors_table, initial_terms_table
 from ftlm.model.charts import bode_charts
 from ftlm.model.typesetting import equation_html, parameter_table
+from ftlm.paint.figure import Figure
 from ftlm.paint.heat import Landscape, heat_map
-from ftlm.paint.lines import Figure, line_chart
+from ftlm.paint.lines import line_chart
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
 from ftlm.paint.text import Exact, symbol

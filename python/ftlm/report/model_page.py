@@ -20,11 +20,7 @@ from ftlm.paint.text import Cell, symbol_html
 
 
 def model_page(
-    model: Model,
-    path: str | os.PathLike[str],
-    *,
-    validation: Run | Sequence[Run] | None = None,
-    force: bool = False,
+    model: Model, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
 ) -> Path:
     """Write the report of a saved model: what its file knows of its identification, and validation runs.
 
@@ -50,16 +46,15 @@ def model_page(
     known = model.estimate
     warnings = [] if known is None else list(known.warnings)
     validated = [compare(model, run) for run in others]
-    for run, found in zip(others, validated, strict=True):
-        words = [*found.warnings, *run.warnings]
+    for run, comparison in zip(others, validated, strict=True):
+        words = [*comparison.warnings, *run.warnings]
         if known is not None:
-            words += lost_fits({n: f for n, f in known.fit.items() if f is not None}, found)
+            words += lost_fits({n: f for n, f in known.fit.items() if f is not None}, comparison)
             words += ["it has the name of a run that the model was identified from"] * (run.name in known.runs)
         warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in words]
-    compared = [("validation", c) for c in validated]
+    compared = [("validation", comparison) for comparison in validated]
     sections = first_sections(model, warnings, compared, bool(others), None)
-    tests = tests_on(model, others)
-    if tests:
+    if tests := tests_on(model, others):
         sections.append(residual_section(tests, None))
     sections.append(frequency_section(model, [(r.step, r.duration) for r in others]))
     about: list[list[Cell]] = [["structure", model.structure.name], ["coupling in free runs", model.structure.coupling]]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from ftlm.base.errors import ModelError
 from ftlm.data.run import Run
 from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.result import Identification
-from ftlm.judge.charts import pulse_times
+from ftlm.judge.charts import pulse_times, with_unit
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.residuals import Residuals
 from ftlm.model.charts import bode_curves, response_frequencies
@@ -33,13 +33,7 @@ BENEATH = 0.4
 
 
 def _figure(rows: int, columns: int = 1, *, row: float = ROW, **options: Any) -> tuple[Any, Any]:
-    """A figure with a grid of axes, made without pyplot so that nothing is kept or shown.
-
-    Raises
-    ------
-    ModelError
-        matplotlib is not installed.
-    """
+    """A figure with a grid of axes, made without pyplot so that nothing is kept or shown."""
     try:
         module = importlib.import_module("matplotlib.figure")
     except ImportError:
@@ -62,9 +56,8 @@ def _plain(text: str) -> str:
     return text.replace("$", r"\$")
 
 
-def _unit(name: str, units: Any) -> str:
-    unit = (units or {}).get(name, "")
-    return _plain(f"{symbol(name)} [{unit}]" if unit else symbol(name))
+def _unit(name: str, units: Mapping[str, str]) -> str:
+    return _plain(with_unit(symbol(name), units, name))
 
 
 def fit(result: Identification | Model | Comparison, runs: Run | Sequence[Run] | None = None) -> Any:
@@ -89,8 +82,14 @@ def fit(result: Identification | Model | Comparison, runs: Run | Sequence[Run] |
     DataError
         Runs that do not fit the model.
     """
-    units: Any = {}
-    if isinstance(result, (Identification, Model)):
+    units: Mapping[str, str] = {}
+    if isinstance(result, Comparison):
+        comparison = result
+    elif not isinstance(result, (Identification, Model)):
+        raise ModelError(
+            f"result is {type(result).__name__}; give an identification, a model with runs or a comparison"
+        )
+    else:
         model = result.model if isinstance(result, Identification) else result
         units = model.units
         if runs is not None:
@@ -99,12 +98,6 @@ def fit(result: Identification | Model | Comparison, runs: Run | Sequence[Run] |
             comparison = result.comparison
         else:
             raise ModelError("a model alone has nothing to be compared with; give runs")
-    elif isinstance(result, Comparison):
-        comparison = result
-    else:
-        raise ModelError(
-            f"result is {type(result).__name__}; give an identification, a model with runs or a comparison"
-        )
     pairs = [(k, name) for k in range(len(comparison.per_run)) for name in comparison.output_error]
     figure, axes = _figure(2 * len(pairs), row=ROW * 0.75, height_ratios=[1.0, BENEATH] * len(pairs))
     for i, (k, name) in enumerate(pairs):
@@ -116,15 +109,14 @@ def fit(result: Identification | Model | Comparison, runs: Run | Sequence[Run] |
         upper.plot(time, simulated, color=LINES[1][0], linewidth=1.0, label=f"simulated, fit {figures[name].fit:.4g} %")
         # A run that runs away would flatten what it is to be compared with.
         height = float(np.ptp(measured)) or 1.0
-        upper.set_ylim(float(np.min(measured)) - 0.5 * height, float(np.max(measured)) + 0.5 * height)
-        upper.set_ylabel(_unit(name, units))
+        low, high = float(np.min(measured)) - 0.5 * height, float(np.max(measured)) + 0.5 * height
+        upper.set(ylim=(low, high), ylabel=_unit(name, units))
         upper.set_title(_plain(run), fontsize="medium", loc="left")
         upper.legend(loc="upper right", fontsize="small", ncols=2)
         upper.tick_params(labelbottom=False)
         lower.sharex(upper)
         lower.plot(time, measured - simulated, color=LINES[2][0], linewidth=0.7)
-        lower.set_ylabel("residual")
-        lower.set_xlabel("time [s]")
+        lower.set(ylabel="residual", xlabel="time [s]")
     return figure
 
 
@@ -151,11 +143,11 @@ def residuals(tests: Residuals | Identification) -> Any:
         raise ModelError("the runs were too short for residual tests, so there is nothing to draw")
     if not isinstance(found, Residuals):
         raise ModelError(f"tests is {type(found).__name__}; give what resid returns, or an identification")
-    columns = 1 + max(len(o.inputs) for o in found.outputs.values())
-    figure, axes = _figure(len(found.outputs), columns)
-    for i, (output, part) in enumerate(found.outputs.items()):
-        for j, (name, test) in enumerate([("itself", part.whiteness), *part.inputs.items()]):
-            axis = axes[i, j]
+    drawn = {output: [("itself", part.whiteness), *part.inputs.items()] for output, part in found.outputs.items()}
+    columns = max(map(len, drawn.values()))
+    figure, axes = _figure(len(drawn), columns)
+    for row, (output, correlations) in zip(axes, drawn.items(), strict=True):
+        for axis, (name, test) in zip(row, correlations, strict=False):
             keep = test.lags != 0 if name == "itself" else np.ones(test.lags.size, dtype=bool)
             axis.axhspan(-test.band, test.band, color=LINES[1][0], alpha=0.2, linewidth=0)
             axis.vlines(test.lags[keep], 0, test.values[keep], color=LINES[1][0], linewidth=1.2)
@@ -164,9 +156,9 @@ def residuals(tests: Residuals | Identification) -> Any:
             verdict = "passed" if test.passed else "failed"
             axis.set_title(_plain(f"{symbol(output)} with {other}: {verdict}"), fontsize="small")
             axis.set_xlabel("lag [samples]")
-        axes[i, 0].set_ylabel("correlation")
-        for j in range(1 + len(part.inputs), columns):
-            axes[i, j].set_axis_off()
+        row[0].set_ylabel("correlation")
+        for axis in row[len(correlations) :]:
+            axis.set_axis_off()
     return figure
 
 
@@ -213,12 +205,11 @@ def landscape(result: Identification | Landscape, output: str | None = None) -> 
     norm = importlib.import_module("matplotlib.colors").LogNorm()
     drawn = axis.pcolormesh(found.x, found.y, scores, norm=norm, cmap="viridis", shading="nearest")
     axis.set_facecolor("0.8")
-    best = np.unravel_index(int(np.nanargmin(scores)), scores.shape)
-    axis.plot(
-        found.x[best[1]], found.y[best[0]], "o", markersize=9, fillstyle="none", color=LINES[1][0], markeredgewidth=2
-    )
-    axis.set_xlabel(_plain(f"order {symbol(found.names[0])}"))
-    axis.set_ylabel(_plain(f"order {symbol(found.names[1])}"))
+    row, column = divmod(int(np.nanargmin(scores)), scores.shape[1])
+    ring = {"markersize": 9, "fillstyle": "none", "color": LINES[1][0], "markeredgewidth": 2}
+    axis.plot(found.x[column], found.y[row], "o", **ring)
+    xlabel, ylabel = (_plain(f"order {symbol(name)}") for name in found.names)
+    axis.set(xlabel=xlabel, ylabel=ylabel)
     figure.colorbar(drawn, ax=axis, label=f"{found.score} (grey: no candidate, or diverged)")
     return figure
 
@@ -257,8 +248,7 @@ def bode(model: Model | Identification, w: ArrayLike | None = None) -> Any:
             axis.semilogx(omega, values, color=LINES[1][0], linewidth=1.2)
             if spread is not None:
                 axis.fill_between(omega, values - spread, values + spread, color=LINES[1][0], alpha=0.25, linewidth=0)
-            axis.set_ylabel(label)
-            axis.set_xlabel("frequency [rad/s]")
+            axis.set(ylabel=label, xlabel="frequency [rad/s]")
             axis.grid(visible=True, alpha=0.3)
             axis.set_title(_plain(f"{symbol(curve.output)} from {symbol(curve.input)}"), fontsize="small")
     return figure

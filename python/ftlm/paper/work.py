@@ -1,0 +1,290 @@
+"""One stage of the arm under way: every model that the reproduction and the demonstration make of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.arm.link import flexible_link, link_model, order_law
+from ftlm.arm.parameters import INTEGER_ORDERS
+from ftlm.base.errors import ConvergenceError, ModelError
+from ftlm.data.lattice import Lattice
+from ftlm.data.orders import Order
+from ftlm.data.run import Run
+from ftlm.data.structures import Structure
+from ftlm.fit.genetic import Genetic
+from ftlm.fit.recursion import Trace, multi_innovation_trace
+from ftlm.identification.identify import identify
+from ftlm.identification.result import Identification
+from ftlm.judge.charts import pulse_times
+from ftlm.judge.comparison import Comparison, compare
+from ftlm.judge.metrics import metrics
+from ftlm.model.model import Model
+from ftlm.paper import printed
+from ftlm.paper.arm import StageNumber
+from ftlm.paper.records import RIVAL_ALPHA, WEAK_PRIOR, Candidate, Derived, Rival, Stage
+from ftlm.solve.free_run import explicit_euler
+from ftlm.solve.records import default_m, prepare
+
+#: Instrumental variables are searched so many steps of the lattice around the orders of least squares: every candidate
+#: costs several free runs.
+AROUND = 2
+#: Runs with more rows than the first are thinned to at most the second for joint fits, whose cost and whose grid's
+#: refinement grow with the rows; the arm's modes are two decades below the rate that is left.
+MOST_ROWS, JOINT_ROWS = 6000, 2500
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What the reproduction and the demonstration do differently."""
+
+    lattice: Lattice
+    keep: int  # rows of an order search
+    trace_every: int  # steps between two points of a convergence curve
+    # Whether all models are judged alike, on the paper's pulses (a sum over other pulses is another number) and from
+    # the currents alone as well, or each as its method worked.
+    alike: bool
+
+
+@dataclass
+class StageWork:
+    """One stage under way: runs, settings, whom to tell, and notes of what was left out and why."""
+
+    number: StageNumber
+    square: Run
+    sine: Run | None
+    preset: Preset
+    threads: int | None
+    say: Callable[[str], None]
+    progress: Callable[[int, int], None] | None
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.measured = flexible_link(stage=self.number, coupling="measured", laws=())
+        self.coupled = flexible_link(stage=self.number)
+        own = list(self.measured.signals)
+        self.on = self.square.select(own)
+        self.off = None if self.sine is None else self.sine.select(own)
+
+    def reproduced(self, genetic: Genetic | None) -> Stage:
+        """Everything that section 5 says of a stage."""
+        exact = self.manual("integer, exact")
+        candidates = {"integer, Euler": self.stepped("integer, Euler", exact), "integer, exact": exact}
+        whole = {n: INTEGER_ORDERS.get(n.rstrip("0123456789"), 2.0) for n in self.measured.order_names}
+        candidates["integer, identified"] = self.joint(
+            "integer, identified", self.measured.with_orders(whole),
+            "whole orders, each equation driven by the measured other angle, by output error",
+        )  # fmt: skip
+        candidates |= self.searches()
+        candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
+        candidates["output error"] = self.best()
+        traces: dict[str, dict[int, Trace]] = {}
+        weak: dict[str, dict[int, Trace]] = {}
+        if prepare([self.on], self.measured, None, power_of_two=True)[0].initial == "rest":
+            traces = self.traces(candidates)
+            # All p at the orders of the largest.
+            last = candidates[f"p = {printed.INNOVATION_LENGTHS[-1]}"]
+            weak = self.traces(dict.fromkeys(candidates, last), WEAK_PRIOR)
+        else:
+            self.notes.append(
+                f"run {self.on.name} does not start at rest: every model is fitted and compared with initial terms; "
+                "explicit Euler, which steps from rest as in the paper, is not, and its errors hold that; convergence "
+                "of the recursion, and with it Figures 4(b) to 8(b), and the weak prior are left out"
+            )
+        ends = {
+            o: {p: {n: float(c[-1]) for n, c in trace.coefficients.items()} for p, trace in each.items()}
+            for o, each in weak.items()
+        }
+        return Stage(
+            self.number, candidates, traces, weak, ends, self.rivals(genetic), self.near(), self.by_equation(),
+            self.derived(candidates["output error"].model),
+        )  # fmt: skip
+
+    def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
+        """Both errors of a model on both runs, and its free run from the currents alone."""
+        alike = self.preset.alike
+        m = default_m([self.on], power_of_two=True) if alike else model.m
+        model = model if model.m == m else replace(model, m=m)
+        own = () if result is None or result.task is None else result.task.runs
+        known = result.comparison if result is not None and any(run is self.on for run in own) else None
+        estimation = known if known is not None and known.m == m else compare(model, self.on)
+        validation = None if self.off is None else compare(model, self.off)
+        alone = {}
+        if alike and len(model.equations) > 1:
+            coupled = replace(model, structure=replace(model.structure, coupling="simulated"))
+            runs = [run for run in (self.on, self.off) if run is not None]
+            alone = {run.name: compare(coupled, run).output_error for run in runs}
+        return Candidate(label, model, estimation, validation, alone, result)
+
+    def identified(self, label: str, run: Run, structure: Structure, **options: Any) -> Candidate:
+        """A candidate by one of the methods."""
+        result = identify(run, structure, threads=self.threads, progress=self.progress, **options)
+        return self.candidate(label, result.model, result)
+
+    def manual(self, label: str) -> Candidate:
+        """The maker's integer-order model."""
+        return self.candidate(label, link_model(stage=self.number))
+
+    def stepped(self, label: str, exact: Candidate) -> Candidate:
+        """The same model stepped by explicit Euler, as the paper ran it."""
+        on = self._by_euler(exact.model, self.on, exact.estimation)
+        alone = {self.on.name: on.output_error}
+        off = None
+        if self.off is not None and exact.validation is not None:
+            off = self._by_euler(exact.model, self.off, exact.validation)
+            alone[self.off.name] = off.output_error
+        return replace(exact, label=label, estimation=on, validation=off, alone=alone)
+
+    def _by_euler(self, model: Model, run: Run, exact: Comparison) -> Comparison:
+        """The comparison with Euler's response in place of the exact one."""
+        responses = explicit_euler(model, run)
+        means = {}
+        for name, samples in responses.items():
+            with np.errstate(over="ignore", invalid="ignore"):
+                finite = bool(np.all(np.isfinite(samples)))
+            means[name] = _core.pulse_means(samples, exact.m, False) if finite else np.full(exact.m, np.inf)
+        if self.preset.alike:
+            errors = {n: metrics(exact.measured[n][0], mean) for n, mean in means.items()}
+        else:
+            errors = {n: metrics(run[n], samples) for n, samples in responses.items()}
+        return replace(
+            exact, simulated={n: [mean] for n, mean in means.items()}, output_error=errors,
+            per_run=[(run.name, exact.equation_error, errors)], warnings=(),
+        )  # fmt: skip
+
+    def searches(self) -> dict[str, Candidate]:
+        """Multi-innovation with the paper's p, and least squares, on the whole lattice."""
+        methods: dict[str, dict[str, Any]] = {
+            f"p = {p}": {"method": "multi-innovation", "innovation_length": p} for p in printed.INNOVATION_LENGTHS
+        }
+        methods["least squares"] = {"method": "least-squares"}
+        found = {}
+        for label, options in methods.items():
+            self.say(f"stage {self.number}: searching the orders of both equations, {label}")
+            found[label] = self.identified(
+                label, self.on, self.measured, lattice=self.preset.lattice, keep=self.preset.keep, **options
+            )
+        return found
+
+    def instrumental(self, start: Candidate) -> Candidate:
+        """Instrumental variables on the part of the lattice around the orders of another model."""
+        self.say(f"stage {self.number}: searching the orders by instrumental variables")
+        step, top = self.preset.lattice.step, self.preset.lattice.alpha[1]
+        axes = {}
+        for name, value in start.model.orders.items():
+            around = 1 if name.startswith("alpha") else AROUND
+            near = [round(value + k * step, 9) for k in range(-around, around + 1)]
+            axes[name] = [v for v in near if 0 <= v <= top]
+        return self.identified(
+            "instrumental variables", self.on, self.measured, method="instrumental-variables",
+            lattice=Lattice(step=step, orders=axes), keep=self.preset.keep,
+        )  # fmt: skip
+
+    def joint(self, label: str, structure: Structure, words: str) -> Candidate:
+        """Joint output error on the run as it is, or on every so many rows of it."""
+        self.say(f"stage {self.number}: {words}")
+        run = self.on
+        if run.length > MOST_ROWS:
+            every = -(-run.length // JOINT_ROWS)
+            self.notes.append(
+                f"run {run.name} has {run.length} rows: joint fits by output error take one of {every} rows, "
+                f"{every * run.step:.6g} s apart, with the means of held currents in between; all models are compared "
+                "on the same block pulses of the whole run"
+            )
+            run = thinned(run, every)
+        return self.identified(label, run, structure)
+
+    def best(self) -> Candidate:
+        """Joint output error from the current alone, or driven by the measured other angle where that has no start."""
+        words = "all orders and coefficients together, "
+        try:
+            return self.joint("output error", self.coupled, f"{words}from the current alone, by output error")
+        except ConvergenceError as error:
+            self.notes.append(
+                f"stage {self.number}: from the current alone, {error}; the row of output error is driven by the "
+                "measured other angle instead"
+            )
+        return self.joint("output error", replace(self.coupled, coupling="measured"), f"{words}by output error")
+
+    def traces(self, candidates: Mapping[str, Candidate], prior: float = 1.0) -> dict[str, dict[int, Trace]]:
+        """Convergence of every equation with every p, at the orders of the model of that p."""
+        return {
+            output: {p: self._trace(output, candidates[f"p = {p}"], p, prior) for p in printed.INNOVATION_LENGTHS}
+            for output in self.measured.outputs
+        }
+
+    def _trace(self, output: str, at: Candidate, p: int, prior: float) -> Trace:
+        single = self.measured.equation(output)
+        single = single.with_orders({n: at.model.orders[n] for n in single.order_names})
+        return multi_innovation_trace(
+            self.on, single, innovation_length=p, prior_covariance=prior, every=self.preset.trace_every
+        )
+
+    def rivals(self, genetic: Genetic | None) -> dict[str, Rival]:
+        """Genetic algorithm and lattice on one equation each: same record, same number of candidates."""
+        lattice = Lattice(step=self.preset.lattice.step, alpha=RIVAL_ALPHA)
+        found = {}
+        for output in self.measured.outputs:
+            single = self.measured.equation(output)
+            self.say(f"{output}: a genetic algorithm with as many evaluations as the lattice has candidates")
+            paper = self.identified(
+                "p = 7", self.on, single, method="multi-innovation", lattice=lattice, keep=self.preset.keep
+            )
+            count = 0 if paper.result is None else paper.result.searches[output].candidates
+            settings = genetic or Genetic()
+            if not settings.evaluations:
+                settings = replace(settings, evaluations=max(count, 2 * settings.population))
+            try:
+                rival = self.identified("genetic", self.on, single, method="genetic", lattice=lattice, genetic=settings)
+            except ModelError as error:
+                self.notes.append(f"Tables 6 and 7 and Figure 11 are left out: {error}")
+                return {}
+            found[output] = Rival(count, rival, paper)
+        return found
+
+    def near(self) -> Candidate:
+        """The orders that the paper prints, with the best coefficients that this run gives them."""
+        orders: dict[str, float] = {}
+        for output in self.measured.outputs:
+            orders |= printed.last_orders(output)
+        return self.identified("printed orders", self.on, self.measured.with_orders(orders), method="least-squares")
+
+    def by_equation(self) -> Candidate:
+        """Least squares at the orders whose equation error is smallest."""
+        self.say(f"stage {self.number}: searching the orders with the smallest equation error")
+        return self.identified(
+            "smallest equation error", self.on, self.measured, method="least-squares", criterion="equation-error",
+            norm="l2", lattice=self.preset.lattice,
+        )  # fmt: skip
+
+    def derived(self, model: Model) -> Derived:
+        """The deflection with the current's order as published and as derived, all other numbers alike."""
+        output = self.measured.outputs[1]
+        order = order_law(self.number, "derived")["input"].at(model.orders)
+        equations = []
+        for item in model.equations:
+            terms = [replace(t, order=Order(order)) if t.signal in self.on.inputs else t for t in item.terms]
+            equations.append(replace(item, terms=tuple(terms)) if item.output == output else item)
+        other = replace(model, structure=replace(model.structure, equations=tuple(equations)))
+        published, derived = (compare(m, self.on) for m in (model, other))
+        return Derived(
+            output, order, pulse_times(published), published.simulated[output][0], derived.simulated[output][0]
+        )
+
+
+def thinned(run: Run, every: int) -> Run:
+    """Every so manieth row of a run, held inputs by their means until the next one, which act alike."""
+    rows = run.length // every
+    data = {}
+    for name in run.signals:
+        samples = run[name][: rows * every].reshape(rows, every)
+        held = name in run.inputs and run.intersample[name] == "zoh"
+        data[name] = samples.mean(axis=1) if held else samples[:, 0]
+    return Run.from_arrays(
+        step=run.step * every, inputs={n: data[n] for n in run.inputs}, outputs={n: data[n] for n in run.outputs},
+        units=dict(run.units), intersample=dict(run.intersample), name=run.name,
+    )  # fmt: skip
