@@ -21,7 +21,7 @@ from ftlm.cli.words import numbers, several
 from ftlm.data.language import equation
 from ftlm.fit.streaming import Streaming
 from ftlm.rig import experiment
-from ftlm.rig.virtual import ArmParameters
+from ftlm.rig.parameters import ArmParameters
 
 
 @dataclass(frozen=True)
