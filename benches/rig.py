@@ -21,8 +21,9 @@ import ftlm
 from ftlm import rig
 from ftlm.paper.arm import demo_plant
 from ftlm.rig import watchdog
+from ftlm.rig.parameters import SUBSTEP
 from ftlm.rig.rig import Limits, Rig
-from ftlm.rig.virtual import SUBSTEP, VirtualBoard
+from ftlm.rig.virtual import VirtualBoard
 
 PATIENT = Limits(late=60.0, missed=10**9, standstill=1e9)
 CHILD = """

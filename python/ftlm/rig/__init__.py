@@ -3,8 +3,9 @@
 from ftlm.fit.streaming import Streaming
 from ftlm.rig.excitation import SHAPES, Excitation
 from ftlm.rig.experiment import record
+from ftlm.rig.parameters import ArmParameters, StageParameters
 from ftlm.rig.rig import Board, Limits, Rig
-from ftlm.rig.virtual import INJECTIONS, ArmParameters, StageParameters, VirtualBoard
+from ftlm.rig.virtual import INJECTIONS, VirtualBoard
 
 __all__ = ["INJECTIONS", "SHAPES", "ArmParameters", "Board", "Excitation", "Limits", "Rig", "StageParameters",
            "Streaming", "VirtualBoard", "record"]  # fmt: skip

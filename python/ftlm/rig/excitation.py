@@ -13,7 +13,7 @@ import numpy as np
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError, ModelError
 from ftlm.files.load import column_names, load
-from ftlm.rig.rig import COLUMNS, CURRENT_LIMIT, LONGEST
+from ftlm.rig.rig import CURRENT_LIMIT
 
 SHAPES = ("square", "sine", "chirp", "multisine", "prbs", "doublet", "csv")
 INPUTS = ("I1", "I2")
@@ -69,20 +69,20 @@ class Excitation:
         if not (isinstance(self.ramp, (int, float)) and 0 <= self.ramp <= duration):
             raise ModelError(f"ramp = {self.ramp!r} s is outside [0, {duration:g}] s, the length of the run")
         if self.shape == "csv":
-            found = self._file(t, rate)
+            currents = self._file(t)
         else:
-            found = self._shapes(t, rate, duration) * np.array(self._amplitudes())
+            currents = self._shapes(t, rate, duration) * np.array(self._amplitudes())
         if self.ramp > 0:
-            found = found * np.minimum(1.0, t / self.ramp)[:, None]
-        found[-1] = 0.0
+            currents = currents * np.minimum(1.0, t / self.ramp)[:, None]
+        currents[-1] = 0.0
         for k, limit in enumerate(CURRENT_LIMIT):
-            over = np.flatnonzero(np.abs(found[:, k]) > limit * (1 + 1e-12))
+            over = np.flatnonzero(np.abs(currents[:, k]) > limit * (1 + 1e-12))
             if over.size:
                 raise ModelError(
-                    f"the current of motor {k + 1} is {found[over[0], k]:.4g} A at {t[over[0]]:.4g} s ({over.size} "
+                    f"the current of motor {k + 1} is {currents[over[0], k]:.4g} A at {t[over[0]]:.4g} s ({over.size} "
                     f"samples in all), over the limit of {limit:g} A; use a smaller amplitude"
                 )
-        return found
+        return currents
 
     def _amplitudes(self) -> tuple[float, float]:
         given = self.amplitude if isinstance(self.amplitude, (tuple, list)) else (self.amplitude, self.amplitude)
@@ -147,49 +147,22 @@ class Excitation:
             raise ModelError(f"band = {band!r} Hz is not two rising frequencies up to half the rate, {rate / 2:g} Hz")
         return float(band[0]), float(band[1])
 
-    def _file(self, t: Floats, rate: float) -> Floats:
+    def _file(self, t: Floats) -> Floats:
         if self.file is None:
             raise ModelError("input = 'csv' needs a file; give it as file= (--file)")
         names = column_names(self.file)
-        currents = [name for name in INPUTS if names is not None and name in names]
+        there = [name for name in INPUTS if names is not None and name in names]
         # A run that ftlm wrote knows its signals; any other file is asked for the currents alone.
-        run = load(self.file) if names is None else load(self.file, outputs=currents) if currents else None
+        run = load(self.file) if names is None else load(self.file, outputs=there) if there else None
         if run is None or not any(name in run for name in INPUTS):
             raise DataError(f"{str(self.file)!r} has no column I1 or I2; name the currents [A] so")
         rows = np.minimum(np.floor(t / run.step + 1e-6).astype(np.int64), run.length - 1)
         past = t > run.duration + run.step * (1 - 1e-6)
-        given = {name: run[name] for name in INPUTS if name in run}
-        zero = np.zeros(run.length)
-        found = np.column_stack([given.get(name, zero)[rows] for name in INPUTS])
-        found[past] = 0.0
-        return found
+        currents = np.column_stack([(run[name] if name in run else np.zeros(run.length))[rows] for name in INPUTS])
+        currents[past] = 0.0
+        return currents
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         told = asdict(self) | {"file": None if self.file is None else Path(self.file).name}
         return {k: list(v) if isinstance(v, tuple) else v for k, v in told.items() if v is not None}
-
-
-def column_of(name: str) -> int:
-    if name not in COLUMNS:
-        raise ModelError(f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(COLUMNS)}")
-    return COLUMNS.index(name)
-
-
-def check_times(duration: float, limit: float, rate: float, seed: int) -> None:
-    def number(value: object) -> bool:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-    if not number(limit) or not 0 < limit <= LONGEST:
-        raise ModelError(f"limit = {limit!r} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
-    if not number(duration) or duration <= 0:
-        raise ModelError(f"duration = {duration!r} s is not a time above 0; give the length of the run")
-    if duration > limit:
-        way_out = "raise limit= (--limit)" if duration <= LONGEST else f"no run is longer than {LONGEST:g} s"
-        raise ModelError(f"duration = {duration:g} s is over the limit of {limit:g} s; {way_out}")
-    if not number(rate) or rate <= 0:
-        raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
-    if duration * rate < 2:
-        raise ModelError(f"duration = {duration:g} s holds fewer than three samples at {rate:g} Hz; make it longer")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ModelError(f"seed = {seed!r} is not a whole number from 0")

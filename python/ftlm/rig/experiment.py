@@ -19,11 +19,12 @@ from ftlm.data.asked import Asked
 from ftlm.data.names import is_run_name
 from ftlm.data.run import Run, built
 from ftlm.fit.streaming import Streaming
-from ftlm.rig.excitation import INPUTS, Excitation, check_times, column_of
+from ftlm.rig.excitation import INPUTS, Excitation
+from ftlm.rig.parameters import ArmParameters
 from ftlm.rig.quanser import QuanserBoard
 from ftlm.rig.recording import UNITS, Partial, partial_of, saved
-from ftlm.rig.rig import COLUMNS, Board, Limits, Rig
-from ftlm.rig.virtual import ArmParameters, VirtualBoard
+from ftlm.rig.rig import COLUMNS, LONGEST, Board, Limits, Rig
+from ftlm.rig.virtual import VirtualBoard
 
 #: The stock low-pass of the deflections: natural frequency [rad/s] and damping.
 STOCK_FILTER = (math.sqrt(157.9137), 22.6195 / (2.0 * math.sqrt(157.9137)))
@@ -32,30 +33,14 @@ _ROWS_PACED, _ROWS_FAST = 32, 500
 
 
 def record(
-    rig: str | Board = "virtual",
-    *,
-    input: str = "square",
-    amplitude: float | tuple[float, float] = 0.3,
-    period: float | None = None,
-    band: tuple[float, float] = (0.1, 20.0),
-    ramp: float = 0.0,
-    file: str | os.PathLike[str] | None = None,
-    duration: float = 10.0,
-    limit: float = 30.0,
-    rate: float = 500.0,
-    seed: int = 0,
-    parameters: str | os.PathLike[str] | ArmParameters = "effective",
-    paced: bool = False,
-    sensor_filter: Literal["stock"] | None = None,
-    watchdog: float = 0.1,
-    arm: bool = False,
-    card: str = "0",
-    name: str | None = None,
-    out: str | os.PathLike[str] | None = None,
-    force: bool = False,
-    live: Streaming | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Run:
+    rig: str | Board = "virtual", *, input: str = "square", amplitude: float | tuple[float, float] = 0.3,
+    period: float | None = None, band: tuple[float, float] = (0.1, 20.0), ramp: float = 0.0,
+    file: str | os.PathLike[str] | None = None, duration: float = 10.0, limit: float = 30.0, rate: float = 500.0,
+    seed: int = 0, parameters: str | os.PathLike[str] | ArmParameters = "effective", paced: bool = False,
+    sensor_filter: Literal["stock"] | None = None, watchdog: float = 0.1, arm: bool = False, card: str = "0",
+    name: str | None = None, out: str | os.PathLike[str] | None = None, force: bool = False,
+    live: Streaming | None = None, progress: Callable[[int, int], None] | None = None,
+) -> Run:  # fmt: skip
     """Drive both motors of a rig and record currents and angles.
 
     Every command is clamped, slew-limited and limited by the motors' heat in the innermost write; every sample is
@@ -125,7 +110,7 @@ def record(
         The rig stopped the run. The cause is in words; what was recorded is in `run` and in the file.
     """
     excitation = Excitation(input, amplitude, period, band, ramp, seed, file)
-    check_times(duration, limit, rate, seed)
+    _check_times(duration, limit, rate, seed)
     commands = excitation.commands(rate, duration)
     if sensor_filter not in (None, "stock"):
         raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or None")
@@ -150,15 +135,27 @@ def record(
         board, rate=rate, watchdog=watchdog, limit=limit, limits=Limits(),
         sensor_filter=STOCK_FILTER if sensor_filter else None,
     )  # fmt: skip
-    for needed in () if live is None else live.signals:
-        column_of(needed)
-    partial = Partial(target, name, 1.0 / rate, about)
-    recorder = _Recorder(partial, len(commands), progress, live)
+    columns = [] if live is None else [_column_of(signal_name) for signal_name in live.signals]
+    recorder = _Recorder(Partial(target, name, 1.0 / rate, about), len(commands), progress, live, columns)
+    ended, faults = _drive(link, recorder, commands, _ROWS_PACED if paced else _ROWS_FAST)
+    about |= {"missed_deadlines": link.guard.missed, "faults": faults}
+    if live is not None:
+        about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.trouble}
+    try:
+        run = recorder.finish(name, about, faults, 1.0 / rate)
+    except BaseException:
+        recorder.partial.close()
+        raise
+    return saved(run, target, recorder.partial, force=force, ended=ended, faults=faults)
+
+
+def _drive(link: Rig, recorder: _Recorder, commands: Floats, block: int) -> tuple[BaseException | None, list[str]]:
+    """Runs all commands between a start and a way out; what ended the run early, and every fault in words."""
     faults: list[str] = []
     ended: BaseException | None = None
     try:
         with link:
-            recorder.follow(link, commands, _ROWS_PACED if paced else _ROWS_FAST)
+            recorder.follow(link, commands, block)
     except RigFault as error:
         ended = error
         faults.append(str(error))
@@ -166,18 +163,9 @@ def record(
         ended = error
         faults.append(stopped_by(error))
     except BaseException:
-        partial.remove()
+        recorder.partial.remove()
         raise
-    faults += [t for t in link.troubles if t not in faults]
-    about |= {"missed_deadlines": link.guard.missed, "faults": faults}
-    if live is not None:
-        about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.trouble}
-    try:
-        run = recorder.finish(name, about, faults, 1.0 / rate)
-    except BaseException:
-        partial.close()
-        raise
-    return saved(run, target, partial, force=force, ended=ended, faults=faults)
+    return ended, faults + [t for t in link.troubles if t not in faults]
 
 
 def stopped_by(ended: KeyboardInterrupt | SystemExit) -> str:
@@ -193,15 +181,14 @@ class _Recorder:
     """Takes rows from a rig, to disk and to memory."""
 
     def __init__(
-        self, partial: Partial, rows: int, progress: Callable[[int, int], None] | None, live: Streaming | None
-    ) -> None:
-        self.partial = partial
-        self.live = live
+        self, partial: Partial, rows: int, progress: Callable[[int, int], None] | None, live: Streaming | None,
+        columns: list[int],
+    ) -> None:  # fmt: skip
+        self.partial, self.progress = partial, progress
+        self.live, self.columns = live, columns
         self.trouble: str | None = None
-        self.columns = [] if live is None else [column_of(name) for name in live.signals]
         self.blocks: list[Floats] = []
         self.rows, self.done = rows, 0
-        self.progress = progress
 
     def follow(self, rig: Rig, commands: Floats, block: int) -> None:
         """Runs all commands, a block at a time."""
@@ -240,17 +227,16 @@ def _board(
     rig: str | Board, parameters: str | os.PathLike[str] | ArmParameters, seed: int, *, paced: bool, horizon: float,
     card: str,
 ) -> tuple[Board, dict[str, Any]]:  # fmt: skip
+    """The board that is asked for, and what a run tells of it."""
     if rig == "virtual":
-        found = ArmParameters.of(parameters)
-        board = VirtualBoard(found, seed=seed, paced=paced, horizon=horizon)
-        return board, {"parameters": found.to_dict()}
+        arm = ArmParameters.of(parameters)
+        return VirtualBoard(arm, seed=seed, paced=paced, horizon=horizon), {"parameters": arm.to_dict()}
     if rig == "q8":
         return QuanserBoard(card=card), {"card": card}
     if isinstance(rig, str):
         raise ModelError(f"rig = {rig!r} is not known; use 'virtual' or 'q8'")
-    found_parameters = getattr(rig, "parameters", None)
-    told = {"parameters": found_parameters.to_dict()} if isinstance(found_parameters, ArmParameters) else {}
-    return rig, told
+    own = getattr(rig, "parameters", None)
+    return rig, {"parameters": own.to_dict()} if isinstance(own, ArmParameters) else {}
 
 
 def _check_target(target: Path, *, force: bool) -> None:
@@ -265,3 +251,31 @@ def _check_target(target: Path, *, force: bool) -> None:
             f"{str(left)!r} holds what was recorded by a program that did not end; load it, rename or remove it, or "
             "overwrite it with force=True (--force)"
         )
+
+
+def _check_times(duration: float, limit: float, rate: float, seed: int) -> None:
+    """Refuse times, a rate or a seed that no run can have."""
+
+    def number(value: object) -> bool:
+        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+    if not number(limit) or not 0 < limit <= LONGEST:
+        raise ModelError(f"limit = {limit!r} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
+    if not number(duration) or duration <= 0:
+        raise ModelError(f"duration = {duration!r} s is not a time above 0; give the length of the run")
+    if duration > limit:
+        way_out = "raise limit= (--limit)" if duration <= LONGEST else f"no run is longer than {LONGEST:g} s"
+        raise ModelError(f"duration = {duration:g} s is over the limit of {limit:g} s; {way_out}")
+    if not number(rate) or rate <= 0:
+        raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
+    if duration * rate < 2:
+        raise ModelError(f"duration = {duration:g} s holds fewer than three samples at {rate:g} Hz; make it longer")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
+
+
+def _column_of(name: str) -> int:
+    """Where a row of a run holds a signal of the live structure."""
+    if name not in COLUMNS:
+        raise ModelError(f"the live structure needs {name!r}, which a rig does not record; it has {', '.join(COLUMNS)}")
+    return COLUMNS.index(name)

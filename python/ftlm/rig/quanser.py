@@ -17,11 +17,12 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
-from ftlm.base.errors import ModelError, RigFault
+from ftlm.base.errors import RigFault
+from ftlm.rig.fault import EXPIRED, check_rate, unset
 from ftlm.rig.rig import COLUMNS
 
-#: Hardware clock of the board [Hz]: normal and fast update rate.
-RATE_NORMAL, RATE_FAST = 1000.0, 8000.0
+#: Up to here the board's normal update rate does [Hz]; above, the fast one.
+RATE_NORMAL = 1000.0
 ANALOG_IN = np.arange(4, dtype=np.uint32)
 ANALOG_OUT = np.arange(2, dtype=np.uint32)
 ENCODERS = np.arange(2, dtype=np.uint32)
@@ -38,7 +39,6 @@ ENDLESS = 0x7FFFFFFF
 OPTIONS_SIZE = 256
 #: `watchdog_clear` at start-up, when there is nothing to clear.
 NOTHING_TO_CLEAR = -599
-EXPIRED = "the watchdog expired: the program did not answer in time, and the board put 0 V out"
 #: The board's clock and the computer's drift apart; delays are counted from an instant that follows by this share.
 DRIFT = 1e-3
 WORDS = {
@@ -63,10 +63,14 @@ def _driver() -> ModuleType:
     except ImportError:
         raise RigFault(NO_PACKAGE) from None
     except OSError as error:
-        raise RigFault(
-            f"the vendor's Python package is installed, but its library (hil) cannot be loaded ({error}); install the "
-            "vendor's runtime"
-        ) from None
+        raise _no_library(error) from None
+
+
+def _no_library(error: OSError) -> RigFault:
+    return RigFault(
+        f"the vendor's Python package is installed, but its library (hil) cannot be loaded ({error}); install the "
+        "vendor's runtime"
+    )
 
 
 def driver_state(card: str = "0") -> str:
@@ -129,18 +133,14 @@ class QuanserBoard:
             self._hil = None
             raise self._fault("opening the board", error) from None
         except OSError as error:
-            raise RigFault(
-                f"the vendor's Python package is installed, but its library (hil) cannot be loaded ({error}); install "
-                "the vendor's runtime"
-            ) from None
+            raise _no_library(error) from None
         if not valid:
             self._hil = None
             raise RigFault(f"Q8-USB: {WORDS[-108]}")
 
     def configure(self, rate: float) -> None:
         """Ranges, directions, encoders, outputs at zero, and one reader for all channels: one sample instant."""
-        if not 1.0 <= rate <= RATE_FAST:
-            raise ModelError(f"rate = {rate!r} Hz cannot be done by this board; use 1 to {RATE_FAST:g} Hz")
+        check_rate(rate)
         self._rate = rate
         speed = "normal" if rate <= RATE_NORMAL else "fast"
         low_in, low_out = np.full(len(ANALOG_IN), -10.0), np.full(len(ANALOG_OUT), -10.0)
@@ -176,11 +176,7 @@ class QuanserBoard:
 
     def unsafe(self) -> str | None:
         """What was not set."""
-        if not self._analog_safe:
-            return "the watchdog's expiration state of the analog outputs is not 0 V"
-        if not self._digital_safe:
-            return "the watchdog's expiration state of the digital lines is not tristate, so analog outputs would stay"
-        return None
+        return unset(analog=self._analog_safe, digital=self._digital_safe)
 
     def start_watchdog(self, seconds: float) -> None:
         """Starts the board's watchdog."""

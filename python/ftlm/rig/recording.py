@@ -107,14 +107,9 @@ class Partial:
 
 
 def saved(
-    run: Run | None,
-    target: Path | None,
-    partial: Partial,
-    *,
-    force: bool,
-    ended: BaseException | None,
+    run: Run | None, target: Path | None, partial: Partial, *, force: bool, ended: BaseException | None,
     faults: list[str],
-) -> Run:
+) -> Run:  # fmt: skip
     """Write the run, and raise what ended it."""
     place = "nothing was recorded until then"
     if run is not None:
@@ -134,12 +129,10 @@ def saved(
                 raise fault from None
     else:
         partial.remove()
-    if isinstance(ended, RigFault) or (ended is None and (faults or run is None)):
+    if ended is not None and not isinstance(ended, RigFault):
+        raise ended
+    if ended is not None or faults or run is None:
         fault = RigFault(f"{'; '.join(faults) or 'no sample was read'}; {place}")
         fault.run = run
         raise fault from None
-    if ended is not None:
-        raise ended
-    if run is None:
-        raise RigFault("no sample was read")
     return run

@@ -82,25 +82,13 @@ class Limits:
         """The guard that enforces them at a sampling step [s]."""
         return _core.Guard(
             {
-                "step": step,
-                "strain_scale": STRAIN_SCALE,
-                "sense_scale": SENSE_SCALE,
-                "command_scale": COMMAND_SCALE,
-                "encoder_scale": ENCODER_SCALE,
-                "current_limit": self.current,
-                "slew": self.slew,
-                "continuous": self.continuous,
-                "thermal_time": self.thermal_time,
-                "deflection_limit": self.deflection,
-                "saturation": self.saturation,
-                "moving_current": self.moving_current,
-                "standstill": self.standstill,
-                "fastest": self.fastest,
-                "late_limit": self.late,
-                "missed_limit": self.missed,
-                "filter": sensor_filter,
+                "step": step, "strain_scale": STRAIN_SCALE, "sense_scale": SENSE_SCALE, "command_scale": COMMAND_SCALE,
+                "encoder_scale": ENCODER_SCALE, "current_limit": self.current, "slew": self.slew,
+                "continuous": self.continuous, "thermal_time": self.thermal_time, "deflection_limit": self.deflection,
+                "saturation": self.saturation, "moving_current": self.moving_current, "standstill": self.standstill,
+                "fastest": self.fastest, "late_limit": self.late, "missed_limit": self.missed, "filter": sensor_filter,
             }
-        )
+        )  # fmt: skip
 
 
 class Board(Protocol):
@@ -202,15 +190,9 @@ class Rig:
     """
 
     def __init__(
-        self,
-        board: Board,
-        *,
-        rate: float = 500.0,
-        watchdog: float = 0.1,
-        limit: float = 30.0,
-        limits: Limits | None = None,
-        sensor_filter: tuple[float, float] | None = None,
-    ) -> None:
+        self, board: Board, *, rate: float = 500.0, watchdog: float = 0.1, limit: float = 30.0,
+        limits: Limits | None = None, sensor_filter: tuple[float, float] | None = None,
+    ) -> None:  # fmt: skip
         low, high = WATCHDOG_RANGE
         if not low <= watchdog <= high:
             raise ModelError(

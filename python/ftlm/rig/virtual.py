@@ -3,27 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import subprocess
-import tomllib
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ftlm import _core
-from ftlm.arm.link import order_law
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import listed, nearest
-from ftlm.base.errors import DataError, ModelError, RigFault
+from ftlm.base.errors import RigFault
 from ftlm.rig import watchdog
-from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
+from ftlm.rig.fault import EXPIRED, check_rate, unset
+from ftlm.rig.parameters import SETS, ArmParameters
 
-#: Longest step of the simulation inside a sample [s]: deflections are then within 2e-5 of their range.
-SUBSTEP = 1e-4
 #: What can be made to go wrong: name, and what its number means.
 INJECTIONS = {
     "dead encoder": "",
@@ -35,210 +27,6 @@ INJECTIONS = {
 }
 #: A run that is not in real time cannot be late; its watchdog only has to see that the program lives [s].
 _FAST_WATCHDOG = 2.0
-#: The board's clock [Hz], normal and fast.
-RATES = (1.0, 8000.0)
-
-
-@dataclass(frozen=True)
-class StageParameters:
-    """One stage of the simulated arm: the free orders and coefficients of the law, and the hub's Coulomb friction.
-
-    Parameters
-    ----------
-    a, b, d, g, r
-        Coefficients of the hub's equation and the inertia ratio, which give the deflection's.
-    gamma, beta, mu
-        Free orders, in [0, 1.2], such that every order of the law lies in [0, 2); both highest orders are 2.
-    coulomb
-        Friction as a motor current [A].
-    """
-
-    a: float
-    b: float
-    d: float
-    g: float
-    r: float
-    gamma: float
-    beta: float
-    mu: float
-    coulomb: float = 0.0
-
-    def orders(self, stage: int) -> dict[str, float]:
-        """The five free orders, by the law's names."""
-        h, k = 2 * stage - 1, 2 * stage
-        return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
-
-    def equations(self, stage: int) -> dict[str, Any]:
-        """Orders and coefficients of both equations, as the core takes them."""
-        h, k = 2 * stage - 1, 2 * stage
-        free = self.orders(stage)
-        law = {name: order.at(free) for name, order in order_law(1 if stage == 1 else 2).items()}
-        return {
-            "hub_orders": [law[f"{n}{h}"] for n in ("beta", "gamma", "mu")],
-            "hub": [self.a, self.b, self.d, self.g],
-            "deflection_orders": [law[f"{n}{k}"] for n in ("beta", "gamma", "mu")],
-            "deflection": [-self.a * self.r, -self.b, -self.d * self.r, -self.g],
-            "coulomb": self.coulomb,
-        }
-
-
-@dataclass(frozen=True)
-class ArmParameters:
-    """The simulated arm and its sensors.
-
-    Parameters
-    ----------
-    stage1, stage2
-        The stages.
-    coupling
-        0: stages apart; 1: stage 2 rides on link 1.
-    inertia_ratio
-        J_21/J_12.
-    strain_noise, current_noise
-        Standard deviation of the noise on the gauges and on the current sense [V].
-    strain_bias, current_bias
-        Their offsets [V].
-    bits
-        Of the converters over ±10 V; 0 for none, which leaves the gauges exact.
-    encoder_scale
-        Hub angle per count [rad].
-    travel
-        Hub angle at which a limit switch opens [rad].
-    name
-        What files call them.
-    """
-
-    stage1: StageParameters
-    stage2: StageParameters
-    coupling: float = 1.0
-    inertia_ratio: float = 0.00301955 / 0.170434
-    strain_noise: tuple[float, float] = (0.015, 0.0134)
-    current_noise: tuple[float, float] = (0.0012, 0.0012)
-    strain_bias: tuple[float, float] = (0.12, -0.2)
-    current_bias: tuple[float, float] = (0.006, 0.0105)
-    bits: int = 16
-    encoder_scale: tuple[float, float] = ENCODER_SCALE
-    travel: tuple[float, float] = (math.pi / 2, math.pi / 2)
-    name: str = "effective"
-
-    @classmethod
-    def of(cls, given: str | os.PathLike[str] | ArmParameters) -> ArmParameters:
-        """A named set, a TOML file's, or what it is given.
-
-        Raises
-        ------
-        ModelError
-            A name that is not known, a key or a number in the file that cannot be used.
-        DataError
-            A file that cannot be read.
-        """
-        if isinstance(given, ArmParameters):
-            return given
-        if isinstance(given, str) and given in SETS:
-            return SETS[given]
-        if not os.fspath(given).endswith(".toml"):
-            raise ModelError(
-                f"parameters = {os.fspath(given)!r} is not known{nearest(given, SETS)}; use {listed(SETS)}, or a file "
-                "whose name ends with .toml"
-            )
-        return cls._from_toml(Path(given))
-
-    @classmethod
-    def _from_toml(cls, path: Path) -> ArmParameters:
-        try:
-            told = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
-            raise DataError(f"{str(path)!r} is not a TOML file that can be read ({error}); correct it") from None
-        base = told.pop("base", "effective")
-        if base not in SETS:
-            raise ModelError(f"{path.name}: base = {base!r} is not known{nearest(base, SETS)}; use {listed(SETS)}")
-        start = SETS[base]
-        stages = {}
-        for name in ("stage1", "stage2"):
-            table = told.pop(name, {})
-            if not isinstance(table, dict):
-                raise ModelError(f"{path.name}: {name} is not a table; write [{name}] and its numbers below it")
-            stages[name] = replace(getattr(start, name), **_numbers(path, name, table, StageParameters))
-        rest = _numbers(path, "the file", told, ArmParameters)
-        return replace(start, **{**rest, **stages, "name": path.name[:100]})
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
-
-    def arm(self, step: float, horizon: float) -> _core.VirtualArm:
-        """The simulated arm at rest, for runs of at most `horizon` s in samples of `step` s."""
-        return _core.VirtualArm(
-            {
-                "stages": [self.stage1.equations(1), self.stage2.equations(2)],
-                "coupling": self.coupling,
-                "inertia_ratio": self.inertia_ratio,
-            },
-            {
-                "strain_scale": STRAIN_SCALE,
-                "strain_bias": self.strain_bias,
-                "noise": [*self.strain_noise, *self.current_noise],
-                "sense_bias": self.current_bias,
-                "sense_scale": SENSE_SCALE,
-                "command_scale": COMMAND_SCALE,
-                "encoder_scale": self.encoder_scale,
-                "range": 10.0,
-                "bits": self.bits,
-                "current_limit": CURRENT_LIMIT,
-                "travel": self.travel,
-            },
-            step,
-            SUBSTEP,
-            horizon,
-        )
-
-
-def _numbers(path: Path, where: str, table: Mapping[str, Any], kind: type[Any]) -> dict[str, Any]:
-    known = {f.name: f.type for f in fields(kind) if f.name not in ("stage1", "stage2", "name")}
-    found: dict[str, Any] = {}
-    for key, value in table.items():
-        if key not in known:
-            raise ModelError(
-                f"{path.name}: {key!r} in {where} is not known{nearest(key, known)}; known are {listed(known)}"
-            )
-        pair = "tuple" in str(known[key])
-        values = value if isinstance(value, list) else [value]
-        good = all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in values)
-        if not good or len(values) != (2 if pair else 1) or isinstance(value, list) != pair:
-            what = "a pair of numbers such as [0.1, 0.2]" if pair else "a number"
-            raise ModelError(f"{path.name}: {key} = {value!r} in {where} is not {what}")
-        if key == "bits" and not (isinstance(value, int) and 0 <= value <= 24):
-            raise ModelError(f"{path.name}: bits = {value!r} is not a whole number from 0 to 24")
-        if (key.endswith("noise") and min(values) < 0) or (key in ("travel", "encoder_scale") and min(values) <= 0):
-            raise ModelError(f"{path.name}: {key} = {value!r} in {where} must not be negative")
-        found[key] = tuple(map(float, values)) if pair else value if key == "bits" else float(value)
-    return found
-
-
-_STAGE1 = StageParameters(
-    a=628.89, b=-62.956, d=6.63, g=140.47, r=(0.0635 + 0.1704) / 0.1704, gamma=0.95, beta=0.1, mu=0.85, coulomb=0.08
-)
-_STAGE2 = StageParameters(
-    a=2271.117, b=-496.763, d=28.351, g=288.122, r=(0.00301955 + 0.0064387) / 0.0064387,
-    gamma=0.9, beta=0.2, mu=0.8, coulomb=0.1,
-)  # fmt: skip
-#: "effective": the maker's effective parameters with fractional damping, friction, coupling and noise. "linear": the
-#: same two stages apart, without friction, noise and quantisation of the gauges: Plants A and A2. "measured":
-#: stiffness, damping, torque and friction fitted to the spectra of two measured runs of the real arm (docs/rig.md),
-#: whose hubs are heavier and whose first link is softer than the maker's parameters say.
-SETS: dict[str, ArmParameters] = {
-    "effective": ArmParameters(_STAGE1, _STAGE2),
-    "linear": ArmParameters(
-        replace(_STAGE1, coulomb=0.0), replace(_STAGE2, coulomb=0.0), coupling=0.0,
-        strain_noise=(0.0, 0.0), current_noise=(0.0, 0.0), strain_bias=(0.0, 0.0), current_bias=(0.0, 0.0), bits=0,
-        name="linear",
-    ),
-    "measured": ArmParameters(
-        replace(_STAGE1, a=208.0, b=-29.5, d=2.56, g=51.7, coulomb=0.18),
-        replace(_STAGE2, a=2190.0, b=-641.0, d=18.8, g=547.0, coulomb=0.01),
-        name="measured",
-    ),
-}  # fmt: skip
 
 
 @dataclass
@@ -288,9 +76,7 @@ class VirtualBoard:
     def configure(self, rate: float) -> None:
         """Makes the arm; its converters and encoders need no setting."""
         self._access()
-        low, high = RATES
-        if not low <= rate <= high:
-            raise ModelError(f"rate = {rate!r} Hz cannot be done by this board; use {low:g} to {high:g} Hz")
+        check_rate(rate)
         self._rate = rate
         self._arm = self.parameters.arm(1.0 / rate, self.horizon + 2.0)
         for what, channel, seconds, number in self.inject:
@@ -308,11 +94,8 @@ class VirtualBoard:
     def unsafe(self) -> str | None:
         """What the registers lack."""
         page = self._access()
-        if any(page.get(f"state{k}") != 0.0 for k in (1, 2)):
-            return "the watchdog's expiration state of the analog outputs is not 0 V"
-        if not page.get("tristate"):
-            return "the watchdog's expiration state of the digital lines is not tristate, so analog outputs would stay"
-        return None
+        zero = all(page.get(f"state{k}") == 0.0 for k in (1, 2))
+        return unset(analog=zero, digital=bool(page.get("tristate")))
 
     def start_watchdog(self, seconds: float) -> None:
         """Starts the process that watches."""
@@ -388,7 +171,7 @@ class VirtualBoard:
         if self._page is None:
             raise RigFault("virtual rig: the board is not open")
         if self._page.expired:
-            raise RigFault("the watchdog expired: the program did not answer in time, and the board put 0 V out")
+            raise RigFault(EXPIRED)
         return self._page
 
     def _stepped(self) -> _core.VirtualArm:

@@ -1,0 +1,45 @@
+"""The program `ftlm`: its commands in the order in which its help lists them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from ftlm import _core
+from ftlm.cli.identify import identify, resume, search, status
+from ftlm.cli.inspect import doctor, inspect
+from ftlm.cli.judge import compare, export, plot, report, resid, simulate
+from ftlm.cli.paper import demo, reproduce
+from ftlm.cli.record import record
+
+app = typer.Typer(
+    name="ftlm",
+    help="Fractional-order models of flexible machines from measured data.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback(invoke_without_command=True)
+def version(
+    show_version: Annotated[bool, typer.Option("--version", help="Show the version and exit.")] = False,
+) -> None:
+    """Fractional-order models of flexible machines from measured data."""
+    if show_version:
+        print(f"ftlm {_core.__version__}")
+        raise typer.Exit
+
+
+for _command in (
+    demo, record, inspect, identify, search, resume, status, compare, resid, simulate, report, reproduce, plot, export,
+    doctor,
+):  # fmt: skip
+    app.command()(_command)
+
+
+def main() -> None:
+    """Entry point."""
+    app()

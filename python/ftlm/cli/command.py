@@ -1,0 +1,98 @@
+"""What makes a function a command: options from records, errors as one line, results for people or for scripts."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import json
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from typing import Any, get_type_hints
+
+import typer
+
+from ftlm.base.errors import FtlmError, InternalError, ModelError, RigFault
+
+EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
+
+
+def command(work: Callable[..., None]) -> Callable[..., None]:
+    """Make a function a command.
+
+    A parameter that is a dataclass stands for its fields: each is an option of the command, in that place, and the
+    function receives the record. An error becomes one line on standard error and an exit code.
+    """
+    records: dict[str, type[Any]] = {}
+    options: list[inspect.Parameter] = []
+    for parameter in inspect.signature(work, eval_str=True).parameters.values():
+        kind = parameter.annotation
+        if isinstance(kind, type) and is_dataclass(kind):
+            records[parameter.name] = kind
+            options += _options_of(kind)
+        else:
+            options.append(parameter)
+
+    @functools.wraps(work)
+    def run(**given: Any) -> None:
+        made = {name: kind(**{f.name: given.pop(f.name) for f in fields(kind)}) for name, kind in records.items()}
+        try:
+            work(**given, **made)
+            sys.stdout.flush()
+        except KeyboardInterrupt:
+            print("ftlm: interrupted; nothing was written", file=sys.stderr)
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        except BrokenPipeError:
+            # The reader of a pipe has gone; what it did not read is nobody's loss.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(0) from None
+        except FtlmError as error:
+            print(f"ftlm: {error}", file=sys.stderr)
+            raise typer.Exit(exit_code(error)) from None
+
+    # What typer reads.
+    run.__annotations__ = {option.name: option.annotation for option in options}
+    run.__signature__ = inspect.Signature(options)  # type: ignore[attr-defined]
+    return run
+
+
+def _options_of(record: type[Any]) -> list[inspect.Parameter]:
+    """The fields of a record as parameters of a function."""
+    hints = get_type_hints(record, include_extras=True)
+    return [
+        inspect.Parameter(f.name, inspect.Parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
+        for f in fields(record)
+    ]
+
+
+def exit_code(error: FtlmError) -> int:
+    """Exit code of an error: 1 internal, 2 usage, 3 data refused, 5 rig."""
+    if isinstance(error, InternalError):
+        return EXIT_INTERNAL
+    if isinstance(error, ModelError):
+        return EXIT_USAGE
+    return EXIT_RIG if isinstance(error, RigFault) else EXIT_DATA
+
+
+def show(result: Any, *, as_json: bool) -> None:
+    """Print a result, for people or as JSON."""
+    if as_json:
+        show_json(result.to_dict())
+    else:
+        print(result)
+
+
+def show_json(document: Any) -> None:
+    """Print a document of plain values and NumPy's."""
+    print(json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False, default=_plain))
+
+
+def tell(sentence: str, *, as_json: bool, **facts: Any) -> None:
+    """Print what was done, as a sentence or as one line of JSON."""
+    print(json.dumps(facts, ensure_ascii=False) if as_json else sentence)
+
+
+def _plain(value: Any) -> Any:
+    """NumPy scalars and arrays as JSON knows them."""
+    return value.tolist() if hasattr(value, "tolist") else str(value)

@@ -1,0 +1,180 @@
+"""Commands that find a model in runs: identify, search, resume, status."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from typer import Argument, Option
+
+from ftlm.base.errors import ModelError
+from ftlm.base.output import COMMAND, check_free
+from ftlm.base.progress import Progress
+from ftlm.cli.command import EXIT_INTERRUPTED, command, show, show_json
+from ftlm.cli.options import (
+    Files,
+    Force,
+    GeneticOptions,
+    Json,
+    Out,
+    ReadingOptions,
+    SearchOptions,
+    StructureOptions,
+    StructureText,
+    Text,
+    Threads,
+)  # fmt: skip
+from ftlm.data.lattice import Lattice
+from ftlm.data.structures import Structure
+from ftlm.identification import identify as estimation
+from ftlm.search.job import run_job
+from ftlm.search.orders import make_job, resume_job, search_status
+from ftlm.search.result import SearchResult
+from ftlm.search.store import Store
+
+Method = Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"]
+Estimator = Literal["instrumental-variables", "multi-innovation", "least-squares"]
+StoreFile = Annotated[str, Argument(metavar="STORE", help="A file written with --store.")]
+
+
+@command
+def identify(
+    *, files: Files, structure: StructureText,
+    method: Annotated[Method, Option(help="Estimator.")] = "output-error",
+    reading: ReadingOptions, shape: StructureOptions, search: SearchOptions, genetic: GeneticOptions,
+    threads: Threads = None,
+    store: Annotated[
+        Text, Option(metavar="FILE", help="Keep finished order searches there; the same command goes on.")
+    ] = None,
+    out: Out = None,
+    report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
+    validation: Annotated[Text, Option(metavar="FILE", help="Another run.")] = None,
+    force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Identify a model: orders on a lattice, coefficients, both errors, warnings in words."""
+    check_free(out, report, force=force, words=COMMAND)
+    wanted = shape.structure(structure)
+    runs = reading.runs(files)
+    # The slice is of the runs that are identified from.
+    others = replace(reading, sliced=None).runs([validation]) if validation is not None else []
+    with resumable(store, "the same command"), Progress("searching orders", quiet=as_json) as progress:
+        result = estimation.identify(
+            runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
+            genetic=genetic.settings(method), threads=threads, progress=progress, store=store,
+        )  # fmt: skip
+    if out is not None:
+        result.model.save(out, force=force)
+    if report is not None:
+        progress.say("writing the report")
+        result.report(report, validation=others or None, force=force)
+    checked = result.validate(others) if others else None
+    if as_json:
+        show_json({**result.to_dict(), "validation": None if checked is None else checked.to_dict()})
+        return
+    show(result, as_json=False)
+    if checked is not None:
+        print(f"\nvalidation on {', '.join(r.name for r in others)}\n{checked}")
+
+
+@command
+def search(
+    *, files: Files, structure: StructureText,
+    coefficients: Annotated[Estimator, Option(help="Estimator of the coefficients.")] = "multi-innovation",
+    reading: ReadingOptions, shape: StructureOptions, options: SearchOptions, threads: Threads = None,
+    store: Annotated[Text, Option(metavar="FILE", help="Keep finished work there; go on with ftlm resume.")] = None,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
+    wanted = shape.structure(structure)
+    runs = reading.runs(files)
+    parts = wanted.parts() or {e.output: wanted.equation(e.output) for e in wanted.equations}
+    lattice = options.lattice()
+    check_named(lattice, wanted)
+    results = {}
+    with resumable(store), contextlib.ExitStack() as stack:
+        jobs = {
+            name: make_job(
+                runs, part, lattice_of(lattice, part), coefficients=coefficients, threads=threads, **options.settings()
+            )
+            for name, part in parts.items()
+        }
+        kept = None
+        if store is not None:
+            kept = stack.enter_context(Store(store, [job.request(name) for name, job in jobs.items()]))
+            show_notes(kept)
+        for number, (name, job) in enumerate(jobs.items()):
+            with Progress(f"searching orders of {name}", quiet=as_json) as progress:
+                results[name] = run_job(replace(job, progress=progress), store=kept, number=number)
+    show_searches(results, as_json=as_json)
+
+
+def check_named(lattice: Lattice, structure: Structure) -> None:
+    """Refuse values of an order that is not free in any equation."""
+    for name in lattice.orders:
+        if name not in {"alpha", *structure.order_names}:
+            free = ", ".join(structure.order_names) or "none"
+            raise ModelError(f"--lattice {name!r} is no free order; free are {free}")
+
+
+def lattice_of(lattice: Lattice, part: Structure) -> Lattice:
+    """What a lattice says of the orders of one part."""
+    return replace(lattice, orders={n: v for n, v in lattice.orders.items() if n == "alpha" or n in part.order_names})
+
+
+def show_searches(results: Mapping[str, SearchResult], *, as_json: bool) -> None:
+    """Searches by output, for people or as JSON."""
+    if as_json:
+        show_json({name: result.to_dict() for name, result in results.items()})
+    else:
+        print("\n\n".join(f"{name}\n{result}" for name, result in results.items()))
+
+
+@contextlib.contextmanager
+def resumable(path: str | None, how: str | None = None) -> Iterator[None]:
+    """Say after Ctrl-C how to go on with a store, if there is one."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if path is None or not Path(path).exists():
+            raise
+        print(f"ftlm: interrupted; go on with: {how or f'ftlm resume {path}'}", file=sys.stderr)
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def show_notes(store: Store) -> None:
+    """What was mended in a store."""
+    for note in store.notes:
+        print(f"ftlm: {store.path}: {note}", file=sys.stderr)
+
+
+@command
+def resume(
+    *, store: StoreFile,
+    salvage: Annotated[
+        bool, Option("--salvage", help="Go on with a damaged store; the damaged file is kept beside it.")
+    ] = False,
+    threads: Threads = None, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Go on with the searches of a store, and show them; it needs no other file."""
+    results = {}
+    with resumable(store), Store(store, salvage=salvage) as kept:
+        show_notes(kept)
+        for number, request in enumerate(kept.contents.requests):
+            with Progress(f"searching orders of {request.name}", quiet=as_json) as progress:
+                results[request.name] = resume_job(kept, number, threads=threads, progress=progress)
+    show_searches(results, as_json=as_json)
+
+
+@command
+def status(*, store: StoreFile, as_json: Json = False) -> None:
+    """Show how far the searches of a store are; it may be in use."""
+    states = search_status(store)
+    if as_json:
+        show_json({name: state.to_dict() for name, state in states.items()})
+    else:
+        print("\n".join(str(state) for state in states.values()))

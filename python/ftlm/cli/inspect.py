@@ -1,0 +1,56 @@
+"""Commands that look before anything is done: at a run (`inspect`), at the installation (`doctor`)."""
+
+from __future__ import annotations
+
+import json
+import platform
+from importlib import metadata
+from typing import Any
+
+from ftlm import _core
+from ftlm.base.checks import available_threads
+from ftlm.cli.command import command
+from ftlm.cli.options import Files, Json, ReadingOptions
+from ftlm.data.inspection import inspect_run
+from ftlm.rig.quanser import driver_state
+
+
+@command
+def inspect(*, files: Files, reading: ReadingOptions, as_json: Json = False) -> None:
+    """Show what a run holds: ranges, noise, quantisation, rest, and what to do about it before identification."""
+    inspected = [(inspect_run(run), run.advice()) for run in reading.runs(files)]
+    if as_json:
+        data = [{**figures.to_dict(), "advice": advice.to_dict()} for figures, advice in inspected]
+        print(json.dumps(data, indent=1, ensure_ascii=False))
+    else:
+        print("\n\n".join(f"{figures}\n{advice}" for figures, advice in inspected))
+
+
+@command
+def doctor(*, as_json: Json = False) -> None:
+    """Show versions, cores, vector unit, and whether the rig's driver is there."""
+    about: dict[str, Any] = {
+        "ftlm": _core.__version__,
+        "core": _core.__version__,
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cores": available_threads(),
+        "simd": _core.SIMD,
+        "numpy": _installed("numpy"),
+        "scipy": _installed("scipy"),
+        "rig driver": driver_state(),
+    }
+    if as_json:
+        print(json.dumps(about, indent=1))
+        return
+    for name, value in about.items():
+        print(f"{name:<12}{value if value is not None else 'not installed'}")
+    if about["scipy"] is None:
+        print("scipy is needed for .mat files: pip install 'ftlm[mat]'")
+
+
+def _installed(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,153 @@
+"""Commands that take a saved model: compare, resid, simulate, report, plot, export."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from typer import Argument, Option
+
+from ftlm.base.errors import ModelError
+from ftlm.base.output import COMMAND, check_free, write_atomically
+from ftlm.cli.command import EXIT_VALIDATION, command, show, tell
+from ftlm.cli.options import (
+    BlockPulses,
+    Files,
+    Force,
+    Json,
+    Number,
+    Out,
+    Page,
+    ReadingOptions,
+    SavedModel,
+    Text,
+    Texts,
+)  # fmt: skip
+from ftlm.cli.words import interval
+from ftlm.model.model import load_model
+from ftlm.report import plots
+from ftlm.report.model_page import model_page
+from ftlm.solve.exports import export_text
+
+
+@command
+def compare(
+    *, model: SavedModel, files: Files,
+    min_fit: Annotated[Number, Option(help="Exit with 4 where a free run fits less than this percentage.")] = None,
+    reading: ReadingOptions, m: BlockPulses = None, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Equation error and output error of a saved model on measured runs."""
+    comparison = load_model(model).compare(reading.runs(files), m=m)
+    show(comparison, as_json=as_json)
+    if min_fit is not None:
+        # Negated so that a fit that is not a number is too low.
+        low = {name: fit for name, fit in comparison.fit_percent.items() if not fit >= min_fit}
+        if low:
+            listed = ", ".join(f"{name} {fit:.4g} %" for name, fit in low.items())
+            print(f"ftlm: fit below {min_fit:g} %: {listed}", file=sys.stderr)
+            raise typer.Exit(EXIT_VALIDATION)
+
+
+@command
+def resid(
+    *, model: SavedModel, files: Files,
+    lags: Annotated[int, Option(min=1, help="Largest lag in samples.")] = 25,
+    reading: ReadingOptions, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Test a saved model's residuals: are they white, and independent of the inputs? Exit with 4 where not."""
+    tests = load_model(model).resid(reading.runs(files), lags=lags)
+    show(tests, as_json=as_json)
+    if not tests.passed:
+        raise typer.Exit(EXIT_VALIDATION)
+
+
+@command
+def simulate(
+    *, model: SavedModel,
+    file: Annotated[str, Argument(metavar="FILE", help="A run whose inputs drive the model.")],
+    out: Annotated[str, Option("-o", "--out", metavar="CSV", help="Where to write the simulated run.")],
+    reading: ReadingOptions,
+    tolerance: Annotated[float, Option(help="Relative change at which refinement ends.")] = 1e-6,
+    force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Free run of a saved model on a run's inputs, written as csv."""
+    check_free(out, force=force, words=COMMAND)
+    loaded = load_model(model)
+    free = loaded.simulate(reading.runs([file])[0], tolerance=tolerance)
+    free.to_csv(out, force=force)
+    sentence = f"{free.length} rows of {', '.join(free.outputs)} written to {out}"
+    tell(sentence, as_json=as_json, written=out, rows=free.length, outputs=list(free.outputs))
+
+
+@command
+def report(
+    *, model: SavedModel, out: Page,
+    validation: Annotated[Texts, Option(metavar="FILE", help="A run that the model has not seen.")] = None,
+    reading: ReadingOptions, force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Write the report of a saved model, with validation runs: one page that opens offline."""
+    check_free(out, force=force, words=COMMAND)
+    loaded = load_model(model)
+    page = model_page(loaded, out, validation=reading.runs(validation) or None, force=force)
+    tell(f"written: {page}", as_json=as_json, written=str(page))
+
+
+@command
+def plot(
+    *, model: SavedModel,
+    out: Annotated[str, Option("-o", "--out", metavar="FILE", help="Figure to write: .png, .pdf or .svg.")],
+    files: Annotated[Texts, Argument(metavar="[RUN]...", help="Runs; bode needs none.")] = None,
+    kind: Annotated[Literal["fit", "residuals", "bode"], Option(help="What to draw.")] = "fit",
+    reading: ReadingOptions, force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Draw a saved model for a paper: its fit or residual tests on runs, or its Bode plot."""
+    check_free(out, force=force, words=COMMAND)
+    suffix = Path(out).suffix.removeprefix(".").lower()
+    if suffix not in ("png", "pdf", "svg"):
+        raise ModelError(f"{out} ends in {suffix or 'nothing'!r}; write .png, .pdf or .svg")
+    loaded = load_model(model)
+    runs = reading.runs(files)
+    if not runs and kind != "bode":
+        raise ModelError(f"--kind {kind} needs at least one run; give files")
+    if kind == "bode":
+        figure = plots.bode(loaded)
+    elif kind == "fit":
+        figure = plots.fit(loaded, runs)
+    else:
+        figure = plots.residuals(loaded.resid(runs))
+    data = io.BytesIO()
+    figure.savefig(data, format=suffix, dpi=200)
+    write_atomically(out, data.getvalue(), force=force)
+    tell(f"written: {out}", as_json=as_json, written=out)
+
+
+@command
+def export(
+    *, model: SavedModel,
+    to: Annotated[
+        Literal["control", "matlab", "json"],
+        Option(help="control: Python script; matlab: script for FOMCON; json."),
+    ],
+    band: Annotated[Text, Option(metavar="LOW:HIGH", help="Frequencies [rad/s] that control needs.")] = None,
+    order: Annotated[int, Option(help="Order of Oustaloup's filter, for control.")] = 5,
+    out: Out = None, force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Write a saved model for another tool, to a file or to standard output."""
+    check_free(out, force=force, words=COMMAND)
+    limits = None if band is None else _both_ends(band)
+    text = export_text(load_model(model), to, band=limits, order=order)
+    if out is None:
+        tell(text.rstrip("\n"), as_json=as_json, to=to, text=text)
+    else:
+        write_atomically(out, text.encode(), force=force)
+        tell(f"written: {out}", as_json=as_json, to=to, written=out)
+
+
+def _both_ends(band: str) -> tuple[float, float]:
+    low, high = interval(band, "--band", "0.1:100")
+    if low is None or high is None:
+        raise ModelError(f"--band {band!r} lacks an end; write LOW:HIGH in rad/s, such as 0.1:100")
+    return low, high

@@ -1,0 +1,76 @@
+"""The commands `ftlm demo` and `ftlm reproduce`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Option
+
+from ftlm.base.errors import ModelError
+from ftlm.base.output import COMMAND, check_folder, check_free
+from ftlm.base.progress import Progress
+from ftlm.cli.command import command, show_json
+from ftlm.cli.options import Force, GeneticOptions, Json, LatticeStep, Page, ReadingOptions, Text, Threads
+from ftlm.paper import reproduction
+from ftlm.paper.demo import run_demo
+from ftlm.paper.demo_page import demo_page, demo_text
+from ftlm.paper.page import reproduction_text
+from ftlm.paper.reproduction import ALWAYS_SAVED
+
+
+@command
+def demo(
+    *,
+    out: Annotated[str, Option("-o", "--out", metavar="FOLDER", help="Where to write.")] = "ftlm-demo",
+    step: LatticeStep = 0.1,
+    noise: Annotated[float, Option(help="Noise on every angle [rad].")] = 1e-4,
+    seed: Annotated[int, Option(min=0, help="Seed of the noise.")] = 1,
+    threads: Threads = None, force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Simulate both stages, identify every equation with p = 1, 3, 5, 7, compare, save, draw.
+
+    The paper's lattice is that of --step 0.05, which takes minutes.
+    """
+    with Progress("", quiet=as_json) as progress:
+        result = run_demo(
+            Path(out), step=step, noise=noise, seed=seed, threads=threads, force=force, say=progress.say,
+            progress=progress,
+        )  # fmt: skip
+        progress.say("writing the page")
+        result.files.append(demo_page(result, Path(out) / "demo.html", force=force))
+    if as_json:
+        show_json(result.to_dict())
+    else:
+        print(f"{demo_text(result)}\n\nwritten: {', '.join(str(f) for f in result.files)}")
+
+
+@command
+def reproduce(
+    *, out: Page = "paper.html",
+    save: Annotated[Text, Option(metavar="FOLDER", help="Also write runs, models and the tables' numbers.")] = None,
+    square: Annotated[Text, Option(metavar="FILE", help="A measured run to identify from.")] = None,
+    sine: Annotated[Text, Option(metavar="FILE", help="Another one, to validate on.")] = None,
+    reading: ReadingOptions, step: LatticeStep = 0.05,
+    noise: Annotated[float, Option(help="Noise on every angle of the virtual rig [rad].")] = 1e-4,
+    seed: Annotated[int, Option("--noise-seed", min=0, help="Seed of that noise.")] = 1,
+    genetic: GeneticOptions, threads: Threads = None, force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Recompute the tables and figures of the paper, on the virtual rig or on measured runs, as one page."""
+    check_free(out, force=force, words=COMMAND)
+    if save is not None:
+        check_folder(Path(save), ALWAYS_SAVED, force=force)
+    if sine is not None and square is None:
+        raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
+    measured = reading.runs([f for f in (square, sine) if f is not None], apart=True)
+    with Progress("", quiet=as_json) as progress:
+        result = reproduction.reproduce(
+            *measured, step=step, noise=noise, seed=seed, genetic=genetic.settings(), threads=threads,
+            say=progress.say, progress=progress,
+        )  # fmt: skip
+        progress.say("writing the page")
+        files = [result.page(out, force=force), *(result.save(save, force=force) if save is not None else [])]
+    if as_json:
+        show_json({**result.to_dict(), "files": [str(f) for f in files]})
+    else:
+        print(f"{reproduction_text(result)}\n\nwritten: {', '.join(str(f) for f in files)}")
