@@ -6,7 +6,7 @@ use std::sync::{Mutex, PoisonError};
 use crate::error::{Error, Result};
 use crate::search::outcome::Part;
 
-/// Shared with the caller while a search runs.
+/// Shared with the caller while a search runs: any thread may read the counters, stop the search, take its checkpoints.
 #[derive(Debug, Default)]
 pub struct Control {
     /// Set to end the search with [`Error::Interrupted`].
@@ -33,7 +33,7 @@ impl Control {
         *slot = Some(checkpoint);
     }
 
-    /// Takes the latest checkpoint.
+    /// Takes the latest checkpoint; none if there is no new one.
     pub fn take(&self) -> Option<Checkpoint> {
         self.checkpoint.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
@@ -94,4 +94,9 @@ pub struct Checkpoint {
     /// What it came to so far. A checkpoint that is taken holds only the rows found since the one before; one to go on
     /// from must hold all of them.
     pub part: Part,
+}
+
+/// The refusal of a checkpoint, a part or a verdict that does not belong to the search at hand.
+pub(crate) fn another(what: String) -> Error {
+    Error::Structure { what, remedy: "start the search again".into() }
 }

@@ -35,6 +35,11 @@ impl Norm {
     }
 
     /// A raw sum (Σ|e| or Σe²) over so many samples as the number that this norm gives.
+    ///
+    /// ```
+    /// # use ftlm::search::options::Norm;
+    /// assert_eq!((Norm::L1.score(36.0, 4), Norm::L2.score(36.0, 4)), (36.0, 3.0));
+    /// ```
     #[allow(clippy::cast_precision_loss)]
     #[must_use]
     pub fn score(self, raw: f64, samples: usize) -> f64 {
@@ -57,6 +62,9 @@ pub enum Estimator {
 }
 
 /// The settings of a search.
+///
+/// By default the output error in the norm of (45) ranks, coefficients are least squares', records start at rest, twenty
+/// rows are kept and one thread is used.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
     /// Which error ranks.
@@ -67,13 +75,27 @@ pub struct Options {
     pub estimator: Estimator,
     /// Initial terms of each record.
     pub initial: Initial,
-    /// How many rows to keep.
+    /// How many rows to keep, at least one.
     pub keep: usize,
-    /// Threads.
+    /// Threads, 1 to [`crate::search::threads::MAX_THREADS`]; any number gives the same bits.
     pub threads: usize,
     /// Whether to leave a candidate as soon as it cannot be kept, by bound or partial sum; `false` is brute force, the
     /// oracle.
     pub early_stopping: bool,
+}
+
+impl Default for Options {
+    fn default() -> Self {
+        Self {
+            criterion: Criterion::OutputError,
+            norm: Norm::L1,
+            estimator: Estimator::LeastSquares,
+            initial: Initial::Rest,
+            keep: 20,
+            threads: 1,
+            early_stopping: true,
+        }
+    }
 }
 
 impl Options {
@@ -82,6 +104,12 @@ impl Options {
     /// # Errors
     /// [`Error::OutOfRange`] for no row to keep, for an estimator's settings and for an exponent of an initial term;
     /// [`Error::NotFinite`] for exponents that are no numbers.
+    ///
+    /// ```
+    /// # use ftlm::search::options::Options;
+    /// assert!(Options::default().check().is_ok());
+    /// assert!(Options { keep: 0, ..Options::default() }.check().is_err());
+    /// ```
     pub fn check(&self) -> Result<()> {
         if self.keep == 0 {
             return Err(out_of_range("keep", 0.0, "[1, ∞)", "keep at least one row"));

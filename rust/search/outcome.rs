@@ -82,7 +82,19 @@ pub struct Part {
 }
 
 impl Part {
-    /// Takes in what other rounds came to.
+    /// Takes in what other rounds came to; of all rows the best `keep` stay.
+    ///
+    /// ```
+    /// # use ftlm::search::{options::Norm, outcome::{Part, Row}};
+    /// let part = |index, score| Part {
+    ///     rows: vec![Row { index, score, coefficients: vec![], initial: vec![] }],
+    ///     ..Part::default()
+    /// };
+    /// let mut all = part(7, 2.0);
+    /// all.join(part(3, 1.0), 1);
+    /// assert_eq!(all.seed(), [(3, 1.0)]);
+    /// assert_eq!(all.outcome(Norm::L1, 100).counts.kept, 1);
+    /// ```
     pub fn join(&mut self, other: Self, keep: usize) {
         self.rows.extend(other.rows);
         trim(&mut self.rows, keep);
@@ -98,7 +110,7 @@ impl Part {
         self.rows.iter().map(|row| (row.index, row.score)).collect()
     }
 
-    /// The result of a search, from all of its rounds over records of so many samples.
+    /// The result of a search, from all of its rounds over records of so many samples: raw sums become scores.
     #[must_use]
     pub fn outcome(mut self, norm: Norm, samples: usize) -> Outcome {
         self.counts.kept = self.rows.len() as u64;
@@ -125,7 +137,7 @@ impl Counts {
         }
     }
 
-    /// Candidates dealt with.
+    /// Candidates dealt with; at the end of a search all.
     #[must_use]
     pub fn done(&self) -> u64 {
         [self.kept, self.beaten, self.bounded, self.stopped, self.singular, self.diverged]

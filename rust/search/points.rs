@@ -77,7 +77,22 @@ impl Points {
     /// `limit` is left as soon as that is sure and is infinite, too. The same bits for any number of threads.
     ///
     /// # Errors
-    /// A candidate of another length, coefficients that are not finite, [`Error::Interrupted`].
+    /// A candidate of another length, coefficients that are not finite, threads that do not start,
+    /// [`Error::Interrupted`].
+    ///
+    /// ```
+    /// # use ftlm::search::{control::Control, options::Norm, points::{Point, Points}};
+    /// # use ftlm::regressors::Record;
+    /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+    /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+    /// let record = Record::new(0.1, vec![output, input], None)?;
+    /// // D^α y = c u: α = 0.8 and c = 1 made y; an order of u above α makes no equation.
+    /// let mut points = Points::new(vec![record], 0, vec![1], vec![false, true], Norm::L1)?;
+    /// let point = |order: f64, of_input: f64| Point { order, orders: vec![of_input], coefficients: vec![1.0] };
+    /// let errors = points.scores(&[point(0.8, 0.0), point(0.8, 0.9)], f64::INFINITY, 1, &Control::default())?;
+    /// assert!(errors[0] < 1e-9 && errors[1].is_infinite());
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     pub fn scores(&mut self, points: &[Point], limit: f64, threads: usize, control: &Control) -> Result<Vec<f64>> {
         let mut structures = Vec::with_capacity(points.len());
         for point in points {
@@ -183,7 +198,10 @@ impl Points {
     }
 }
 
-/// Error (45) of one candidate on one record by the naive division: the oracle of [`Points::scores`].
+/// Error (45) of one candidate on one record by the naive division: the oracle of [`Points::scores`]. O(m²).
+///
+/// # Panics
+/// Where the record does not hold a signal.
 #[must_use]
 pub fn score_naive(record: &Record, output: usize, signals: &[usize], point: &Point) -> f64 {
     let m = record.m();

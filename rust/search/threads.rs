@@ -11,6 +11,13 @@ pub const MAX_THREADS: usize = 1024;
 ///
 /// # Errors
 /// [`Error::OutOfRange`] for a number outside 1 to [`MAX_THREADS`], [`Error::Threads`] where the system starts no more.
+///
+/// ```
+/// # use ftlm::search::threads::pool;
+/// assert_eq!(pool(2)?.current_num_threads(), 2);
+/// assert!(pool(0).is_err());
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
 pub fn pool(threads: usize) -> Result<rayon::ThreadPool> {
     if threads == 0 || threads > MAX_THREADS {
         #[allow(clippy::cast_precision_loss)]

@@ -9,7 +9,7 @@ use crate::error::Error;
 use crate::estimate::instrumental_variables::{with_projections, Settings};
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::regressors::Record;
-use crate::search::control::{Checkpoint, Place};
+use crate::search::control::{another, Checkpoint, Place};
 use crate::search::lattice::independent::{Lattice, TermAxis};
 use crate::search::lattice::law::{LawEquation, LawLattice};
 use crate::search::options::{Criterion, Estimator, Norm, Options};
@@ -260,7 +260,6 @@ pub fn verdicts(values: &[u8], kinds: &[u8]) -> Result<Vec<Verdict>, Error> {
         }
     });
     known.collect::<Option<Vec<_>>>().filter(|_| values.len() == 8 * kinds.len()).ok_or_else(|| {
-        let what = format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len());
-        Error::Structure { what, remedy: "start the search again".into() }
+        another(format!("{} bytes of values and {} of kinds are no verdicts", values.len(), kinds.len()))
     })
 }

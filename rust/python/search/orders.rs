@@ -11,9 +11,9 @@ use super::arguments::{
     checkpoint, counted, named, part, part_of, CheckpointArg, Given, OrdersArg, PartArg, SettingsArg,
 };
 use super::watch::{saved, watched};
-use crate::error::Error;
+use crate::search::control::another;
 use crate::search::lattice::independent::Lattice;
-use crate::search::outcome::{Counts, Outcome, Part};
+use crate::search::outcome::{Counts, Outcome, Part, Row};
 use crate::search::rounds;
 use crate::search::threads::pool;
 
@@ -60,7 +60,7 @@ impl Found {
             let structure = lattice.structure(index);
             (structure.order, structure.terms.iter().map(|t| t.order).collect::<Vec<f64>>())
         };
-        let row = |row: crate::search::outcome::Row| {
+        let row = |row: Row| {
             let (alpha, orders) = orders(row.index);
             (row.index, row.score, alpha, orders, row.coefficients, row.initial)
         };
@@ -121,14 +121,12 @@ pub fn search_join<'py>(
             let part = part(argument);
             let index = part.rows.iter().map(|r| r.index).chain(part.failures.iter().map(|f| f.0)).max();
             if let Some(index) = index.filter(|&i| i >= lattice.count()) {
-                let what = format!("a row has index {index} among {} candidates", lattice.count());
-                return Err(Error::Structure { what, remedy: "start the search again".into() });
+                return Err(another(format!("a row has index {index} among {} candidates", lattice.count())));
             }
             all.join(part, options.keep);
         }
         if all.counts.candidates != lattice.count() || all.counts.done() != lattice.count() {
-            let what = format!("parts account for {} of {} candidates", all.counts.done(), lattice.count());
-            return Err(Error::Structure { what, remedy: "start the search again".into() });
+            return Err(another(format!("parts account for {} of {} candidates", all.counts.done(), lattice.count())));
         }
         Ok(Found::new(&lattice, all.outcome(options.norm, samples)))
     })?;

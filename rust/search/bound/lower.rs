@@ -21,6 +21,24 @@ use crate::search::options::Norm;
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
+///
+/// ```
+/// # use ftlm::equation::{Equation, Structure, Term};
+/// # use ftlm::search::{bound::lower_bounds, options::Norm};
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// // y is the integral of order 0.8 of u; twice that misses it by Σ|y|.
+/// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c] };
+/// let error: f64 = record.signal(0).iter().map(|y| y.abs()).sum();
+/// let proved = |c: f64| Ok::<_, ftlm::error::Error>(
+///     lower_bounds(&record, &equation(c), Norm::L1)?.into_iter().fold(0.0, f64::max)
+/// );
+/// assert!(proved(1.0)? < 1e-9 && proved(2.0)? > 0.1 * error && proved(2.0)? <= error);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
 pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<Vec<f64>> {
     let (bound, positions) = pooled(record, &equation.structure, norm)?;
     check_length("coefficients", positions.len(), equation.coefficients.len())?;
@@ -34,6 +52,20 @@ pub fn lower_bounds(record: &Record, equation: &Equation, norm: Norm) -> Result<
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients that are not one a term.
+///
+/// ```
+/// # use ftlm::equation::{Structure, Term};
+/// # use ftlm::search::{bound::out_of_reach, options::Norm};
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// // y is the integral of order 0.8 of u: free coefficients reach it, a known one twice as large does not.
+/// assert!(!out_of_reach(&record, &structure, &[None], &[2.0], Norm::L1, 1e-3)?);
+/// assert!(out_of_reach(&record, &structure, &[Some(2.0)], &[2.0], Norm::L1, 1e-3)?);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
 pub fn out_of_reach(
     record: &Record,
     structure: &Structure,

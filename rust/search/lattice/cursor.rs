@@ -6,6 +6,15 @@ use crate::search::lattice::tuples::{Bits, STRIDE};
 
 impl Lattice {
     /// Orders of a candidate: its structure; an index beyond the last is the last.
+    ///
+    /// ```
+    /// # use ftlm::search::lattice::{Lattice, TermAxis};
+    /// let own = TermAxis { signal: 0, values: vec![0.0, 0.5], interchangeable: false };
+    /// let lattice = Lattice::new(0, &[0.8], &[own], |_| false)?;
+    /// let orders: Vec<f64> = (0..lattice.count()).map(|index| lattice.structure(index).terms[0].order).collect();
+    /// assert_eq!(orders, [0.5, 0.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     #[must_use]
     pub fn structure(&self, index: u64) -> Structure {
         Cursor::at(self, index).structure()

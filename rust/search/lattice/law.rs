@@ -33,6 +33,20 @@ impl LawLattice {
     /// [`Error::EmptyLattice`] where an axis is empty, [`Error::LatticeTooLarge`] for the product of the axes,
     /// [`Error::NotFinite`] for an order or a law that is no number, [`Error::Structure`] where there is no equation, or
     /// one names a signal or a free order that is not there.
+    ///
+    /// ```
+    /// # use ftlm::equation::AffineOrder;
+    /// # use ftlm::search::lattice::{LawEquation, LawLattice};
+    /// // D^α y = c D^{α−1} u for a free α.
+    /// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
+    /// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
+    /// let lattice = LawLattice::new(&[vec![0.5, 1.5]], &[equation], &[false, false])?;
+    /// assert_eq!((lattice.product(), lattice.free(1)), (2, vec![1.5]));
+    /// // An order below 0 is for inputs alone.
+    /// assert!(lattice.structures(0).is_none());
+    /// assert_eq!(lattice.structures(1).map(|all| all[0].terms[0].order), Some(0.5));
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     pub fn new(axes: &[Vec<f64>], equations: &[LawEquation], inputs: &[bool]) -> Result<Self> {
         for (axis, values) in axes.iter().enumerate() {
             check_finite(&format!("values of free order {axis}"), values)?;

@@ -4,10 +4,10 @@ use std::sync::atomic::Ordering;
 
 use rayon::prelude::*;
 
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::search::candidate::problem::Scratch;
 use crate::search::catalogue::Catalogue;
-use crate::search::control::{Checkpoint, Control, Place};
+use crate::search::control::{another, Checkpoint, Control, Place};
 use crate::search::lattice::cursor::Cursor;
 use crate::search::outcome::{Failure, Kept, Part, Row, Verdict, LISTED};
 use crate::search::screen::{by_guess, screen, Open};
@@ -78,8 +78,8 @@ impl<'a> Hunt<'a> {
             self.part.failures.extend(singular.into_iter().take(LISTED).map(|index| (index, Failure::Singular)));
         }
         if !place.fits(open.len() as u64) {
-            let what = format!("a checkpoint stands at {} of {} candidates to follow", place.followed, open.len());
-            return Err(Error::Structure { what, remedy: "start the search again".into() });
+            let (at, of) = (place.followed, open.len());
+            return Err(another(format!("a checkpoint stands at {at} of {of} candidates to follow")));
         }
         by_guess(&mut open);
         self.follow(&open, kept, place, true)

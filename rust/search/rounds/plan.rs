@@ -32,6 +32,12 @@ pub fn rounds(candidates: u64, options: &Options) -> u64 {
 }
 
 /// Where each wave of so many rounds ends: 1, 3, 7, …
+///
+/// ```
+/// # use ftlm::search::{options::Options, rounds::{rounds, waves}};
+/// let rounds = rounds(400_000, &Options::default());
+/// assert_eq!((rounds, waves(rounds)), (7, vec![1, 3, 7]));
+/// ```
 #[must_use]
 pub fn waves(rounds: u64) -> Vec<u64> {
     let mut ends = Vec::new();

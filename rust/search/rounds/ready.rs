@@ -7,10 +7,10 @@
 use std::borrow::Cow;
 use std::sync::atomic::Ordering;
 
-use crate::error::{Error, Result};
+use crate::error::Result;
 use crate::regressors::Record;
 use crate::search::catalogue::Catalogue;
-use crate::search::control::{Checkpoint, Control, Place};
+use crate::search::control::{another, Checkpoint, Control, Place};
 use crate::search::lattice::independent::Lattice;
 use crate::search::options::Options;
 use crate::search::outcome::{Counts, Kept, Outcome, Part, Row};
@@ -26,6 +26,21 @@ use crate::search::threads::pool;
 /// # Errors
 /// A setting out of range, records without the signals of the equation, fixed coefficients that are not one a term, a
 /// bank beyond the memory limit, threads that do not start, [`Error::Interrupted`].
+///
+/// ```
+/// # use ftlm::search::{control::Control, lattice::{Lattice, TermAxis}, options::Options, rounds::search};
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// // y is the integral of order 0.8 of u: D^0.8 y = u.
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
+/// let lattice = Lattice::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
+/// let found = search(&[record], &lattice, &[None], &Options::default(), &Control::default())?;
+/// assert_eq!(lattice.structure(found.rows[0].index).order, 0.8);
+/// assert!((found.rows[0].coefficients[0] - 1.0).abs() < 1e-9);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
 pub fn search(
     records: &[Record],
     lattice: &Lattice,
@@ -90,6 +105,28 @@ impl<'a> Search<'a> {
     ///
     /// # Errors
     /// [`Error::Interrupted`], or rounds, seed or checkpoint that do not fit this search.
+    ///
+    /// ```
+    /// # use std::borrow::Cow;
+    /// # use ftlm::search::{control::Control, lattice::{Lattice, TermAxis}, options::Options, outcome::Part};
+    /// # use ftlm::search::{rounds::{rounds, waves, Search}, threads::pool};
+    /// # use ftlm::regressors::Record;
+    /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+    /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+    /// # let record = Record::new(0.1, vec![output, input], None)?;
+    /// # let order = TermAxis { signal: 1, values: vec![0.0], interchangeable: false };
+    /// # let lattice = Lattice::new(0, &[0.6, 0.7, 0.8, 0.9], &[order], |signal| signal == 1)?;
+    /// let (options, control, pool) = (Options::default(), Control::default(), pool(1)?);
+    /// let ready = Search::new(&[record], Cow::Borrowed(&lattice), &[None], &options, &pool, &control)?;
+    /// let (mut all, mut first) = (Part::default(), 0);
+    /// for last in waves(rounds(lattice.count(), &options)) {
+    ///     let seed = all.seed();
+    ///     all.join(ready.rounds(first, last, &seed, None, &pool, &control)?, options.keep);
+    ///     first = last;
+    /// }
+    /// assert_eq!(all.counts.candidates, 4);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     pub fn rounds(
         &self,
         first: u64,
@@ -153,8 +190,4 @@ impl<'a> Search<'a> {
         }
         Ok(())
     }
-}
-
-fn another(what: String) -> Error {
-    Error::Structure { what, remedy: "start the search again".into() }
 }

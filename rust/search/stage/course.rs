@@ -13,7 +13,7 @@ use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
 use crate::search::candidate::needed::Needed;
 use crate::search::candidate::problem::{Problem, Scratch};
-use crate::search::control::Control;
+use crate::search::control::{another, Control};
 use crate::search::lattice::law::LawLattice;
 use crate::search::options::{Norm, Options};
 use crate::search::outcome::{Counts, Failure, Row, Verdict};
@@ -352,6 +352,28 @@ impl Course {
 ///
 /// # Errors
 /// As [`Stage::new`].
+///
+/// ```
+/// # use ftlm::search::{control::Control, options::Options, stage::search};
+/// # use ftlm::equation::AffineOrder;
+/// # use ftlm::search::lattice::{LawEquation, LawLattice};
+/// let law = |constant: f64| AffineOrder { constant, weights: vec![1.0] };
+/// let equation = LawEquation { output: 0, order: law(0.0), terms: vec![(1, law(-1.0))] };
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// # let derived: Vec<f64> = input.clone();
+/// # let input = Record::new(0.1, vec![derived], None)?.integral(0, 0.7);
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 1.0);
+/// // D^α y = D^{α−1} u for any α: y is the integral of u.
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let lattice = LawLattice::new(&[vec![1.0, 1.5]], &[equation], &[false, true])?;
+/// let fixed = [vec![None]];
+/// let found = search(&[record], &lattice, &fixed, &[1.0], &Options::default(), &Control::default())?;
+/// assert_eq!(found.counts.candidates, 2);
+/// assert!((found.rows[0].rows[0].coefficients[0] - 1.0).abs() < 1e-9);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
 pub fn search(
     records: &[Record],
     lattice: &LawLattice,
@@ -367,8 +389,4 @@ pub fn search(
         course.take(&stage, &verdicts, &pool, control)?;
     }
     stage.outcome(&course, control)
-}
-
-fn another(what: String) -> Error {
-    Error::Structure { what, remedy: "start the search again".into() }
 }
