@@ -144,7 +144,7 @@ impl<'a> Search<'a> {
             let what = format!("rounds {first} to {last} from {} on are not among {all}", from.place.round);
             return Err(another(what));
         }
-        if let Some((index, score)) = seed.iter().find(|(index, score)| *index >= count || !(*score >= 0.0)) {
+        if let Some((index, score)) = seed.iter().find(|(index, score)| *index >= count || strange(*score)) {
             return Err(another(format!("a row of score {score} has index {index} among {count} candidates")));
         }
         self.check(&from.part)?;
@@ -180,8 +180,8 @@ impl<'a> Search<'a> {
     /// Refuses what another search came to.
     fn check(&self, part: &Part) -> Result<()> {
         let (count, width) = (self.catalogue.lattice.count(), self.catalogue.lattice.width());
-        let strange = |row: &Row| row.coefficients.len() != width || row.index >= count || !(row.score >= 0.0);
-        if part.rows.iter().any(strange) || part.failures.iter().any(|failure| failure.0 >= count) {
+        let other = |row: &Row| row.coefficients.len() != width || row.index >= count || strange(row.score);
+        if part.rows.iter().any(other) || part.failures.iter().any(|failure| failure.0 >= count) {
             return Err(another("a checkpoint holds rows of another search".into()));
         }
         let done = part.counts.done();
@@ -190,4 +190,9 @@ impl<'a> Search<'a> {
         }
         Ok(())
     }
+}
+
+/// Whether this is no raw sum of errors.
+fn strange(score: f64) -> bool {
+    score.is_nan() || score < 0.0
 }
