@@ -57,7 +57,7 @@ pub enum Estimator {
     LeastSquares,
     /// Multi-innovation least squares in closed form.
     MultiInnovation(Innovation),
-    /// Refined instrumental variables from the records' clean signals ([`Record::with_clean`]).
+    /// Refined instrumental variables from the records' clean signals ([`crate::regressors::Record::with_clean`]).
     InstrumentalVariables(Settings),
 }
 

@@ -25,7 +25,7 @@ use crate::search::threads::pool;
 ///
 /// # Errors
 /// A setting out of range, records without the signals of the equation, fixed coefficients that are not one a term, a
-/// bank beyond the memory limit, threads that do not start, [`Error::Interrupted`].
+/// bank beyond the memory limit, threads that do not start, [`crate::error::Error::Interrupted`].
 ///
 /// ```
 /// # use ftlm::search::{control::Control, lattice::{Lattice, TermAxis}, options::Options, rounds::search};
@@ -104,7 +104,7 @@ impl<'a> Search<'a> {
     /// stretch and seed that holds all rows found since its start.
     ///
     /// # Errors
-    /// [`Error::Interrupted`], or rounds, seed or checkpoint that do not fit this search.
+    /// [`crate::error::Error::Interrupted`], or rounds, seed or checkpoint that do not fit this search.
     ///
     /// ```
     /// # use std::borrow::Cow;
