@@ -7,8 +7,10 @@ use criterion::{criterion_group, criterion_main, BatchSize, BenchmarkId, Criteri
 use ftlm::equation::{Equation, Initial, Structure, Term};
 use ftlm::fractional::{block_pulse_kernel, kernel_with_derivative};
 use ftlm::regressors::Record;
+use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::run::{search, Control, Criterion as Criterium, Estimator, Norm, Options};
+use ftlm::search::options::{Criterion as Criterium, Estimator, Norm, Options};
+use ftlm::search::rounds::search;
 use ftlm::series::{self, Buffers, Kernel};
 use ftlm::{haar, metrics, operational, simulate};
 

@@ -11,8 +11,10 @@ use ftlm::fft::{self, Bin, Workspace};
 use ftlm::fractional::block_pulse_kernel;
 use ftlm::operational::{block_pulse_matrix, operational_matrix, operational_matrix_dense};
 use ftlm::regressors::Record;
+use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::run::{search, Control, Criterion, Estimator, Norm, Options};
+use ftlm::search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::search::rounds::search;
 use ftlm::series::{self, Buffers, Division, Kernel};
 use ftlm::simulate;
 

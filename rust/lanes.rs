@@ -43,6 +43,23 @@ pub fn portable(on: bool) {
 }
 
 /// Runs a kernel with the widest vector instructions of this machine.
+///
+/// ```
+/// use ftlm::lanes::{dot, widest, Kernel};
+///
+/// struct Squares<'a>(&'a [f64]);
+///
+/// impl Kernel for Squares<'_> {
+///     type Output = f64;
+///
+///     #[inline(always)]
+///     fn run(self) -> f64 {
+///         dot(self.0, self.0)
+///     }
+/// }
+///
+/// assert_eq!(widest(Squares(&[3.0, 4.0])), 25.0);
+/// ```
 pub fn widest<K: Kernel>(kernel: K) -> K::Output {
     if PORTABLE.load(Ordering::Relaxed) {
         kernel.run()
@@ -51,7 +68,11 @@ pub fn widest<K: Kernel>(kernel: K) -> K::Output {
     }
 }
 
-/// Σ a·b, summed in [`WIDTH`] lanes that are joined at the end.
+/// Σ a·b, summed in [`WIDTH`] lanes that are joined at the end; slices are of one length.
+///
+/// ```
+/// assert_eq!(ftlm::lanes::dot(&[1.0, 2.0], &[3.0, 4.0]), 11.0);
+/// ```
 #[inline(always)]
 #[must_use]
 pub fn dot(a: &[f64], b: &[f64]) -> f64 {

@@ -39,6 +39,7 @@ impl Record {
         }
         if let Some(series) = &filter {
             check_length("filter", m, series.len())?;
+            check_finite("filter", series)?;
         }
         Ok(Self { step, signals, filter, clean: None })
     }
@@ -66,6 +67,9 @@ impl Record {
     }
 
     /// The record of the substitutes for all signals but one.
+    ///
+    /// # Panics
+    /// Where there is no such signal.
     #[must_use]
     pub fn cleaned_but(&self, signal: usize) -> Self {
         let mut cleaned = self.cleaned();
@@ -77,6 +81,13 @@ impl Record {
     ///
     /// # Errors
     /// [`Error::Length`], [`Error::NotFinite`] where the filter blows up.
+    ///
+    /// ```
+    /// # use ftlm::regressors::Record;
+    /// let record = Record::new(0.5, vec![vec![1.0, 2.0, 3.0]], None)?;
+    /// assert_eq!(record.through(&[0.0, 1.0, 0.0])?.signal(0), [0.0, 1.0, 2.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     pub fn through(&self, filter: &[f64]) -> Result<Self> {
         let m = self.m();
         check_length("filter", m, filter.len())?;
@@ -109,19 +120,40 @@ impl Record {
         self.signals.is_empty()
     }
 
-    /// Pulse means of a signal.
+    /// Pulse means of a signal, [`Record::m`] of them.
+    ///
+    /// # Panics
+    /// Where there is no such signal.
     #[must_use]
     pub fn signal(&self, index: usize) -> &[f64] {
         &self.signals[index]
     }
 
-    /// I^η of a signal.
+    /// I^η of a signal, as [`Record::m`] pulse means; η in [0, 3]. O(m log m).
+    ///
+    /// # Panics
+    /// Where there is no such signal.
+    ///
+    /// ```
+    /// # use ftlm::regressors::Record;
+    /// let record = Record::new(0.5, vec![vec![1.0; 4]], None)?;
+    /// let ramp = record.integral(0, 1.0);
+    /// assert!(ramp.iter().zip([0.25, 0.75, 1.25, 1.75]).all(|(a, b)| (a - b).abs() < 1e-12));
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     #[must_use]
     pub fn integral(&self, signal: usize, eta: f64) -> Vec<f64> {
         series::multiply(&block_pulse_kernel(eta, self.m(), self.step), &self.signals[signal], self.m())
     }
 
-    /// Pulse means of the initial term t^exponent, through the sensor filter where there is one.
+    /// Pulse means of the initial term t^exponent, t in seconds, through the sensor filter where there is one.
+    ///
+    /// ```
+    /// # use ftlm::regressors::Record;
+    /// let record = Record::new(0.5, vec![vec![1.0; 4]], None)?;
+    /// assert!(record.initial_term(0.0).iter().all(|v| (v - 1.0).abs() < 1e-12));
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     #[must_use]
     pub fn initial_term(&self, exponent: f64) -> Vec<f64> {
         let powers = power_means(exponent, self.m(), self.step);
@@ -212,10 +244,29 @@ impl Bank {
     /// One pair of transforms a column. O(columns · m log m), memory 8·m bytes a column (twice for the output's own).
     ///
     /// # Errors
-    /// [`Error::BankTooLarge`] beyond [`BANK_LIMIT`].
+    /// [`Error::BankTooLarge`] beyond [`BANK_LIMIT`], [`Error::Structure`] for a signal that the record does not hold.
+    ///
+    /// ```
+    /// # use ftlm::regressors::{Bank, Index, Key, Record};
+    /// let record = Record::new(0.5, vec![vec![1.0; 4], vec![2.0; 4]], None)?;
+    /// let mut index = Index::default();
+    /// let input = index.insert(Key::integral(1, 0.0));
+    /// let own = index.insert(Key::integral(0, 0.8));
+    /// let bank = Bank::new(&index, &record, 0)?;
+    /// assert_eq!(bank.column(input), [2.0; 4]);
+    /// assert!(bank.kernel(input).is_empty() && bank.kernel(own).len() == 4);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     #[allow(clippy::cast_precision_loss)]
     pub fn new(index: &Index, record: &Record, output: usize) -> Result<Self> {
         let m = record.m();
+        let strange = |key: &&Key| matches!(key, Key::Integral { signal, .. } if *signal >= record.len());
+        if let Some(Key::Integral { signal, .. }) = index.keys.iter().find(strange) {
+            return Err(Error::Structure {
+                what: format!("a regressor is of signal {signal}, but the record holds {}", record.len()),
+                remedy: "give the record all signals of the equation".into(),
+            });
+        }
         let own = index.keys.iter().filter(|k| matches!(k, Key::Integral { signal, .. } if *signal == output)).count();
         let bytes = 8 * m as u128 * (index.keys.len() + own) as u128;
         if bytes > BANK_LIMIT {
@@ -249,13 +300,19 @@ impl Bank {
         Ok(Self { columns, kernels })
     }
 
-    /// Column at a position.
+    /// Column at a position: one value a pulse.
+    ///
+    /// # Panics
+    /// Where there is no such column.
     #[must_use]
     pub fn column(&self, position: usize) -> &[f64] {
         &self.columns[position]
     }
 
-    /// Kernel of an own-output column.
+    /// Kernel of an own-output column, one value a pulse; empty for any other column.
+    ///
+    /// # Panics
+    /// Where there is no such column.
     #[must_use]
     pub fn kernel(&self, position: usize) -> &[f64] {
         &self.kernels[position]

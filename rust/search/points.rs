@@ -1,8 +1,6 @@
 //! Errors of candidates given as points, each with orders and coefficients of its own: what a genetic algorithm asks for.
 
 use std::collections::HashMap;
-use std::sync::atomic::Ordering;
-use std::sync::Mutex;
 
 use rayon::prelude::*;
 
@@ -10,8 +8,12 @@ use crate::equation::{Structure, Term};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::fractional::block_pulse_kernel;
 use crate::regressors::{Key, Record};
-use crate::search::run::{pool, Control, Norm};
-use crate::series::{self, Division, BLOCK};
+use crate::search::candidate::march::March;
+use crate::search::control::Control;
+use crate::search::options::Norm;
+use crate::search::outcome::Verdict;
+use crate::search::threads::{pool, PerThread};
+use crate::series;
 
 /// Memory for regressors kept from one call to the next; a population that has settled asks for the same ones again.
 const KEPT_BYTES: usize = 256 << 20;
@@ -75,7 +77,22 @@ impl Points {
     /// `limit` is left as soon as that is sure and is infinite, too. The same bits for any number of threads.
     ///
     /// # Errors
-    /// A candidate of another length, coefficients that are not finite, [`Error::Interrupted`].
+    /// A candidate of another length, coefficients that are not finite, threads that do not start,
+    /// [`Error::Interrupted`].
+    ///
+    /// ```
+    /// # use ftlm::search::{control::Control, options::Norm, points::{Point, Points}};
+    /// # use ftlm::regressors::Record;
+    /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+    /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+    /// let record = Record::new(0.1, vec![output, input], None)?;
+    /// // D^α y = c u: α = 0.8 and c = 1 made y; an order of u above α makes no equation.
+    /// let mut points = Points::new(vec![record], 0, vec![1], vec![false, true], Norm::L1)?;
+    /// let point = |order: f64, of_input: f64| Point { order, orders: vec![of_input], coefficients: vec![1.0] };
+    /// let errors = points.scores(&[point(0.8, 0.0), point(0.8, 0.9)], f64::INFINITY, 1, &Control::default())?;
+    /// assert!(errors[0] < 1e-9 && errors[1].is_infinite());
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
     pub fn scores(&mut self, points: &[Point], limit: f64, threads: usize, control: &Control) -> Result<Vec<f64>> {
         let mut structures = Vec::with_capacity(points.len());
         for point in points {
@@ -94,7 +111,7 @@ impl Points {
         #[allow(clippy::cast_precision_loss)]
         let samples = self.samples as f64;
         let raw_limit = if self.norm == Norm::L1 { limit } else { limit * limit * samples };
-        let divisions: Vec<Mutex<Option<Division>>> = (0..threads).map(|_| Mutex::new(None)).collect();
+        let marches = PerThread::<March>::new(&pool);
         let this = &*self;
         let raw: Vec<f64> = pool.install(|| {
             structures
@@ -102,21 +119,16 @@ impl Points {
                 .zip(points)
                 .map(|(structure, point)| {
                     let Some(structure) = structure else { return f64::INFINITY };
-                    let thread = rayon::current_thread_index().unwrap_or(0) % divisions.len();
-                    let mut division = divisions[thread].lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-                    let mut sum = 0.0;
-                    for r in 0..this.records.len() {
-                        sum = this.march(r, structure, &point.coefficients, (sum, raw_limit), &mut division, control);
-                    }
-                    sum
+                    marches.with(|march| {
+                        let error = this.error(structure, &point.coefficients, raw_limit, march, control);
+                        error.unwrap_or(f64::INFINITY)
+                    })
                 })
                 .collect()
         });
-        if control.stop.load(Ordering::Relaxed) {
-            return Err(Error::Interrupted);
-        }
-        control.done.fetch_add(points.len() as u64, Ordering::Relaxed);
-        Ok(raw.into_iter().map(|s| if self.norm == Norm::L1 { s } else { (s / samples).sqrt() }).collect())
+        control.check_stop()?;
+        control.count(points.len() as u64, 0);
+        Ok(raw.into_iter().map(|raw| self.norm.score(raw, self.samples)).collect())
     }
 
     /// Computes the regressors that are not kept yet.
@@ -156,74 +168,40 @@ impl Points {
         self.kept.extend(wanted.into_iter().map(|(key, _, _)| key).zip(made));
     }
 
-    /// Adds a record's error to a sum, block by block, or gives infinity once it passes the limit.
-    fn march(
+    /// Raw error of a candidate on all records, or none where it passes the limit or its free run diverges.
+    fn error(
         &self,
-        r: usize,
         structure: &Structure,
         coefficients: &[f64],
-        (mut sum, limit): (f64, f64),
-        division: &mut Option<Division>,
+        limit: f64,
+        march: &mut March,
         control: &Control,
-    ) -> f64 {
-        let target = self.records[r].signal(self.output);
-        let m = target.len();
-        let columns: Vec<(bool, &[f64], f64)> = (0..structure.terms.len())
-            .filter_map(|k| {
-                let signal = structure.terms[k].signal;
-                let kept = self.kept.get(&Key::integral(signal, structure.integration(k)))?;
-                Some((signal == self.output, &kept[r][..], coefficients[k]))
-            })
-            .collect();
-        let division = match division {
-            Some(d) if d.terms() == m => {
-                d.reset();
-                d
+    ) -> Option<f64> {
+        let mut sum = 0.0;
+        for (r, record) in self.records.iter().enumerate() {
+            let columns: Vec<(bool, &[f64], f64)> = (0..structure.terms.len())
+                .filter_map(|k| {
+                    let signal = structure.terms[k].signal;
+                    let kept = self.kept.get(&Key::integral(signal, structure.integration(k)))?;
+                    Some((signal == self.output, &kept[r][..], coefficients[k]))
+                })
+                .collect();
+            let side = |own: bool| columns.iter().filter(move |term| term.0 == own).map(|&(_, column, c)| (column, c));
+            let target = record.signal(self.output);
+            match march.run(target, side(true), side(false), self.norm, sum, limit, control) {
+                // A limit that is not a number is passed by all.
+                Verdict::Score(raw) if raw <= limit => sum = raw,
+                _ => return None,
             }
-            other => other.insert(Division::new(1, m)),
-        };
-        let mut divisor: Vec<f64> = Vec::with_capacity(m);
-        let (mut inverse, mut block) = ([0.0], [0.0; BLOCK]);
-        while division.solved() < m {
-            let lo = division.solved();
-            let hi = (lo + BLOCK).min(m);
-            let from = divisor.len();
-            let needed = division.reads().max(from);
-            divisor.resize(needed, 0.0);
-            let block = &mut block[..hi - lo];
-            block.fill(0.0);
-            for &(own, column, c) in &columns {
-                if own {
-                    divisor[from..].iter_mut().zip(&column[from..needed]).for_each(|(d, v)| *d -= c * v);
-                } else {
-                    block.iter_mut().zip(&column[lo..hi]).for_each(|(b, v)| *b += c * v);
-                }
-            }
-            if from == 0 {
-                divisor[0] += 1.0;
-                if divisor[0] == 0.0 || !divisor[0].is_finite() {
-                    return f64::INFINITY;
-                }
-                inverse[0] = 1.0 / divisor[0];
-            }
-            division.add(0, lo, block);
-            division.solve_block(&inverse, |_, _, len| &divisor[..len]);
-            let simulated = &division.quotient(0)[lo..hi];
-            sum += match self.norm {
-                Norm::L1 => target[lo..hi].iter().zip(simulated).map(|(y, v)| (y - v).abs()).sum::<f64>(),
-                Norm::L2 => target[lo..hi].iter().zip(simulated).map(|(y, v)| (y - v) * (y - v)).sum::<f64>(),
-            };
-            // Negated so that a sum that is not a number has passed the limit.
-            if !(sum <= limit && sum.is_finite()) || control.stop.load(Ordering::Relaxed) {
-                return f64::INFINITY;
-            }
-            division.join(|_, _, len| &divisor[..len]);
         }
-        sum
+        Some(sum)
     }
 }
 
-/// Error (45) of one candidate on one record by the naive division: the oracle of [`Points::scores`].
+/// Error (45) of one candidate on one record by the naive division: the oracle of [`Points::scores`]. O(m²).
+///
+/// # Panics
+/// Where the record does not hold a signal.
 #[must_use]
 pub fn score_naive(record: &Record, output: usize, signals: &[usize], point: &Point) -> f64 {
     let m = record.m();

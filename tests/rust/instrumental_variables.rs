@@ -8,8 +8,10 @@ use ftlm::estimate::instrumental_variables::{
 use ftlm::estimate::least_squares;
 use ftlm::fractional::block_pulse_kernel;
 use ftlm::regressors::Record;
+use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis};
-use ftlm::search::run::{search, Control, Criterion, Estimator, Norm, Options};
+use ftlm::search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::search::rounds::search;
 use ftlm::series::{divide_naive, multiply_naive, Kernel};
 use ftlm::{simulate, small};
 

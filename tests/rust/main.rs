@@ -17,6 +17,7 @@ mod multivariable;
 mod output_error;
 mod plants;
 mod points;
+mod refusals;
 mod rig;
 mod search;
 mod series;

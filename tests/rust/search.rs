@@ -10,8 +10,12 @@ use ftlm::estimate::least_squares::{self, Estimate};
 use ftlm::estimate::multi_innovation::{closed_form, Innovation, Rows};
 use ftlm::regressors::Record;
 use ftlm::search::bound::{lower_bounds, out_of_reach};
+use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis, MAX_CANDIDATES};
-use ftlm::search::run::{search, Control, Counts, Criterion, Estimator, Failure, Norm, Options, Outcome, MAX_THREADS};
+use ftlm::search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::search::outcome::{Counts, Failure, Outcome};
+use ftlm::search::rounds::search;
+use ftlm::search::threads::MAX_THREADS;
 use ftlm::simulate::{equation_error, respond};
 use proptest::prelude::*;
 
@@ -739,7 +743,9 @@ proptest! {
 
 #[test]
 fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
-    use ftlm::search::run::{Part, Search};
+    use ftlm::search::control::Checkpoint;
+    use ftlm::search::outcome::Part;
+    use ftlm::search::rounds::Search;
     use std::borrow::Cow;
     use std::sync::atomic::Ordering::Relaxed;
 
@@ -761,7 +767,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
             let part: Part = loop {
                 let control = Control::default();
                 control.saving.store(true, Relaxed);
-                let base = from.as_ref().map_or(0, |c: &ftlm::search::run::Checkpoint| c.part.counts.done());
+                let base = from.as_ref().map_or(0, |c: &Checkpoint| c.part.counts.done());
                 let end = base + 1 + random.below(6000) as u64;
                 let finished = std::sync::atomic::AtomicBool::new(false);
                 let (finished, watched) = (&finished, &control);

@@ -8,8 +8,10 @@ use ftlm::error::Error;
 use ftlm::estimate::least_squares;
 use ftlm::estimate::multi_innovation::{Innovation, Rows};
 use ftlm::regressors::Record;
+use ftlm::search::control::Control;
 use ftlm::search::lattice::{LawEquation, LawLattice, MAX_TUPLES};
-use ftlm::search::run::{Control, Criterion, Estimator, Failure, Norm, Options};
+use ftlm::search::options::{Criterion, Estimator, Norm, Options};
+use ftlm::search::outcome::Failure;
 use ftlm::search::stage::{search, Span, Stage, StageOutcome};
 use ftlm::simulate::{equation_error, respond};
 

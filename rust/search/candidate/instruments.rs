@@ -4,7 +4,7 @@
 use crate::error::{Error, Result};
 use crate::estimate::instrumental_variables::{low_pass, power_frequency, refine, Scratch, Settings, Source};
 use crate::regressors::{Bank, Index, Record};
-use crate::search::run::Failure;
+use crate::search::outcome::Failure;
 use crate::series::Kernel;
 
 /// Low-pass behind which the first coefficients are estimated, in units of the output's own band.

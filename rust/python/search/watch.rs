@@ -1,0 +1,79 @@
+//! Runs a computation on a thread of its own, so that Python can stop it and see how far it is.
+
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::mpsc::{channel, RecvTimeoutError};
+use std::time::Duration;
+
+use pyo3::prelude::*;
+
+use super::super::errors::caught;
+use super::arguments::checkpoint_of;
+use crate::error::Error;
+use crate::search::control::Control;
+
+/// How often Python is asked for signals: well under the half second after which Ctrl-C must have ended a search.
+const LOOK: Duration = Duration::from_millis(50);
+
+/// Runs `work` on a thread of its own, so that this one can watch for signals and report progress.
+pub fn watched<T: Send>(
+    py: Python<'_>,
+    progress: Option<&Py<PyAny>>,
+    work: impl FnOnce(&Control) -> Result<T, Error> + Send,
+) -> PyResult<T> {
+    saved(py, progress, None, work)
+}
+
+/// As [`watched`]; whenever Python is asked for signals, `save` is called with the latest checkpoint, or with None.
+pub fn saved<T: Send>(
+    py: Python<'_>,
+    progress: Option<&Py<PyAny>>,
+    save: Option<&Py<PyAny>>,
+    work: impl FnOnce(&Control) -> Result<T, Error> + Send,
+) -> PyResult<T> {
+    let control = Control::default();
+    control.saving.store(save.is_some(), Ordering::Relaxed);
+    let result = py.detach(|| {
+        std::thread::scope(|scope| {
+            let (finished, wait) = channel::<()>();
+            let worker = scope.spawn(|| {
+                let result = caught(|| work(&control));
+                drop(finished);
+                result
+            });
+            let mut raised: Option<PyErr> = None;
+            while let Err(RecvTimeoutError::Timeout) = wait.recv_timeout(LOOK) {
+                let look = Python::attach(|py| {
+                    py.check_signals()?;
+                    if let Some(progress) = progress {
+                        progress.call1(py, state(&control))?;
+                    }
+                    if let Some(save) = save {
+                        save.call1(py, (control.take().map(checkpoint_of),))?;
+                    }
+                    Ok::<_, PyErr>(())
+                });
+                if let Err(error) = look {
+                    control.stop.store(true, Ordering::Relaxed);
+                    raised.get_or_insert(error);
+                }
+            }
+            let result = worker
+                .join()
+                .unwrap_or_else(|_| Err(Error::Internal { what: "the search thread ended without a result".into() }));
+            match raised {
+                Some(error) => Err(error),
+                None => result.map_err(PyErr::from),
+            }
+        })
+    })?;
+    if let Some(progress) = progress {
+        progress.call1(py, state(&control))?;
+    }
+    Ok(result)
+}
+
+/// Candidates done, in all, and left before the end of the record.
+fn state(control: &Control) -> (u64, u64, u64) {
+    let read = |x: &AtomicU64| x.load(Ordering::Relaxed);
+    (read(&control.done), read(&control.total), read(&control.pruned))
+}

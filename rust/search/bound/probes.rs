@@ -1,0 +1,165 @@
+//! The test vectors on one record: what each says of a candidate's error there.
+
+use crate::dense;
+use crate::lanes::WIDTH;
+use crate::regressors::Bank;
+use crate::search::bound::vectors::{effects, vectors, Wide};
+use crate::search::options::Norm;
+
+/// A column without an effect on the divisor.
+pub(super) const NONE: usize = usize::MAX;
+
+/// The test vectors on one record: what they make of each column.
+pub(super) struct Probes {
+    /// Number of [`Wide`] groups of test vectors.
+    pub(super) groups: usize,
+    /// ⟨t, x⟩ of column p and group g at p·groups + g, real and imaginary part.
+    pub(super) products: Vec<[Wide; 2]>,
+    /// ⟨t, y⟩.
+    pub(super) target: Vec<[Wide; 2]>,
+    /// Row of `effects` of a column, [`NONE`] where it is not of the output itself.
+    pub(super) rows: Vec<usize>,
+    /// g·‖t‖ (real, imaginary) and ‖Fᵀt − g t‖.
+    pub(super) effects: Vec<[Wide; 3]>,
+    /// ‖t‖ in the dual norm.
+    pub(super) size: Vec<Wide>,
+    /// What rounding may add to |⟨t, w⟩| per unit of a column's coefficient, and for the target.
+    pub(super) rounding: Vec<f64>,
+    pub(super) target_rounding: f64,
+    /// What rounding may add to a sum of m terms, per unit.
+    pub(super) unit: f64,
+}
+
+impl Probes {
+    #[allow(clippy::cast_precision_loss)]
+    pub(super) fn new(bank: &Bank, target: &[f64], norm: Norm, output_error: bool, count: usize) -> Self {
+        let m = target.len();
+        let groups = count / WIDTH;
+        let vectors = vectors(count, m);
+        let dual = |parts: &[&[f64]; 2]| -> f64 {
+            let squares = parts[0].iter().zip(parts[1]).map(|(a, b)| a * a + b * b);
+            match norm {
+                Norm::L1 => squares.fold(0.0, f64::max).sqrt(),
+                Norm::L2 => squares.sum::<f64>().sqrt(),
+            }
+        };
+        let sizes: Vec<f64> = vectors.iter().map(|[a, b]| dual(&[a, b])).collect();
+
+        let mut columns: Vec<&[f64]> = (0..bank.len()).map(|p| bank.column(p)).collect();
+        columns.push(target);
+        let flat: Vec<&[f64]> = vectors.iter().flatten().map(Vec::as_slice).collect();
+        let inner = dense::inner_products(&columns, &flat);
+        let gathered = |p: usize| -> Vec<[Wide; 2]> {
+            (0..groups)
+                .map(|g| {
+                    let part =
+                        |half: usize| std::array::from_fn(|n| inner[p * flat.len() + 2 * (g * WIDTH + n) + half]);
+                    [part(0), part(1)]
+                })
+                .collect()
+        };
+        let products: Vec<[Wide; 2]> = (0..bank.len()).flat_map(gathered).collect();
+
+        // A generous multiple of what m additions may lose; it covers columns, inner products and the march as well.
+        let unit = 16.0 * f64::EPSILON * m as f64;
+        let sum = |x: &[f64]| x.iter().map(|v| v.abs()).sum::<f64>();
+        let size_of_target = sum(target);
+        let own: Vec<usize> = (0..bank.len()).filter(|&p| output_error && !bank.kernel(p).is_empty()).collect();
+        let mut rows = vec![NONE; bank.len()];
+        own.iter().enumerate().for_each(|(row, &p)| rows[p] = row);
+        let rounding =
+            (0..bank.len()).map(|p| unit * (sum(bank.column(p)) + sum(bank.kernel(p)) * size_of_target)).collect();
+        let effects = effects(bank, &own, &vectors, &sizes, norm, unit);
+        let size = (0..groups).map(|g| std::array::from_fn(|n| sizes[g * WIDTH + n])).collect();
+        Self {
+            groups,
+            products,
+            target: gathered(bank.len()),
+            rows,
+            effects,
+            size,
+            rounding,
+            target_rounding: 2.0 * unit * size_of_target,
+            unit,
+        }
+    }
+
+    pub(super) fn chosen(&self, which: &[usize]) -> Self {
+        let groups = which.len() / WIDTH;
+        let pick = |source: &[Wide], g: usize| -> Wide {
+            std::array::from_fn(|n| source[which[g * WIDTH + n] / WIDTH][which[g * WIDTH + n] % WIDTH])
+        };
+        let part =
+            |rows: &[[Wide; 2]], half: usize, g: usize| pick(&rows.iter().map(|r| r[half]).collect::<Vec<_>>(), g);
+        let pairs = |rows: &[[Wide; 2]]| (0..groups).map(|g| [part(rows, 0, g), part(rows, 1, g)]).collect::<Vec<_>>();
+        let triples = |rows: &[[Wide; 3]]| {
+            let half = |h: usize, g: usize| pick(&rows.iter().map(|r| r[h]).collect::<Vec<_>>(), g);
+            (0..groups).map(|g| [half(0, g), half(1, g), half(2, g)]).collect::<Vec<_>>()
+        };
+        Self {
+            groups,
+            products: self.products.chunks(self.groups).flat_map(pairs).collect(),
+            target: pairs(&self.target),
+            rows: self.rows.clone(),
+            effects: self.effects.chunks(self.groups).flat_map(triples).collect(),
+            size: (0..groups).map(|g| pick(&self.size, g)).collect(),
+            rounding: self.rounding.clone(),
+            target_rounding: self.target_rounding,
+            unit: self.unit,
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn allowance(&self, terms: &[usize], coefficients: &[f64], initial: &[usize], weights: &[f64]) -> f64 {
+        let pairs = terms.iter().zip(coefficients).chain(initial.iter().zip(weights));
+        pairs.fold(self.target_rounding, |sum, (&p, c)| sum + c.abs() * self.rounding[p])
+    }
+
+    /// Bounds and guesses of one group of test vectors.
+    #[inline(always)]
+    pub(super) fn group(
+        &self,
+        group: usize,
+        terms: &[usize],
+        coefficients: &[f64],
+        initial: &[usize],
+        weights: &[f64],
+        rounding: f64,
+    ) -> (Wide, Wide) {
+        let [mut re, mut im] = self.target[group];
+        let mut divisor = self.size[group];
+        let (mut divisor_im, mut slack) = ([0.0; WIDTH], [0.0; WIDTH]);
+        for (&p, &c) in terms.iter().zip(coefficients) {
+            let [a, b] = &self.products[p * self.groups + group];
+            for n in 0..WIDTH {
+                re[n] -= c * a[n];
+                im[n] -= c * b[n];
+            }
+            let row = self.rows[p];
+            if row != NONE {
+                let [a, b, rest] = &self.effects[row * self.groups + group];
+                for n in 0..WIDTH {
+                    divisor[n] -= c * a[n];
+                    divisor_im[n] -= c * b[n];
+                    slack[n] += c.abs() * rest[n];
+                }
+            }
+        }
+        for (&p, &c) in initial.iter().zip(weights) {
+            let [a, b] = &self.products[p * self.groups + group];
+            for n in 0..WIDTH {
+                re[n] -= c * a[n];
+                im[n] -= c * b[n];
+            }
+        }
+        let (mut bounds, mut guesses) = ([0.0; WIDTH], [0.0; WIDTH]);
+        for n in 0..WIDTH {
+            let seen = (re[n] * re[n] + im[n] * im[n]).sqrt() - rounding;
+            let size = (divisor[n] * divisor[n] + divisor_im[n] * divisor_im[n]).sqrt();
+            // A hair more, for the rounding of the divisor and of the score itself.
+            bounds[n] = seen / ((size + slack[n]) * (1.0 + self.unit));
+            guesses[n] = seen / size;
+        }
+        (bounds, guesses)
+    }
+}

@@ -1,0 +1,200 @@
+//! Some rounds at work: screens their candidates, follows the open ones, accounts for all.
+
+use std::sync::atomic::Ordering;
+
+use rayon::prelude::*;
+
+use crate::error::Result;
+use crate::search::candidate::problem::Scratch;
+use crate::search::catalogue::Catalogue;
+use crate::search::control::{another, Checkpoint, Control, Place};
+use crate::search::lattice::cursor::Cursor;
+use crate::search::outcome::{Failure, Kept, Part, Row, Verdict, LISTED};
+use crate::search::screen::{by_guess, screen, Open};
+use crate::search::threads::PerThread;
+
+/// Pulses of all candidates followed between two checkpoints: a tenth of a second or so of one core.
+const PIECE: usize = 1 << 21;
+/// Candidates that a thread screens at a time.
+const CHUNK: u64 = 512;
+/// First and largest number of candidates followed between two looks at the kept scores.
+const FOLLOWED: (u64, u64) = (256, 16_384);
+/// First and largest number of refined candidates followed between two looks at the kept scores: each takes about a
+/// millisecond, and a lower score excludes many.
+const REFINED: (u64, u64) = (32, 1024);
+
+/// Some rounds of a search at work.
+pub(super) struct Hunt<'a> {
+    pub(super) catalogue: &'a Catalogue<'a>,
+    pub(super) pool: &'a rayon::ThreadPool,
+    control: &'a Control,
+    scratches: PerThread<Scratch>,
+    /// Of the rounds done, and of the candidates done in this one but for its rows.
+    pub(super) part: Part,
+}
+
+impl<'a> Hunt<'a> {
+    pub(super) fn new(catalogue: &'a Catalogue<'a>, pool: &'a rayon::ThreadPool, control: &'a Control) -> Self {
+        Self { catalogue, pool, control, scratches: PerThread::new(pool), part: Part::default() }
+    }
+
+    pub(super) fn check_stop(&self) -> Result<()> {
+        self.control.check_stop()
+    }
+
+    /// Screens a round and follows what is open, from a place on: its rows.
+    pub(super) fn round(&mut self, bounds: (u64, u64), kept: &mut Kept, place: Place) -> Result<()> {
+        let (start, end) = bounds;
+        let (limit, resumed) = (kept.limit, place.end > 0);
+        let (catalogue, control) = (self.catalogue, self.control);
+        let parts: Vec<(Vec<Open>, Vec<u64>)> = self.pool.install(|| {
+            (0..(end - start).div_ceil(CHUNK))
+                .into_par_iter()
+                .map(|chunk| {
+                    let (lo, hi) = (start + chunk * CHUNK, end.min(start + (chunk + 1) * CHUNK));
+                    if control.stopped() {
+                        return Default::default();
+                    }
+                    let found = screen(catalogue, lo, hi, limit);
+                    let closed = hi - lo - (found.0.len() + found.1.len()) as u64;
+                    if !resumed {
+                        control.count(closed + found.1.len() as u64, closed);
+                    }
+                    found
+                })
+                .collect()
+        });
+        self.check_stop()?;
+        let mut open: Vec<Open> = Vec::new();
+        let mut singular: Vec<u64> = Vec::new();
+        for (found, failed) in parts {
+            open.extend(found);
+            singular.extend(failed);
+        }
+        if !resumed {
+            let failed = singular.len() as u64;
+            self.part.counts.singular += failed;
+            self.part.counts.bounded += end - start - open.len() as u64 - failed;
+            self.part.failures.extend(singular.into_iter().take(LISTED).map(|index| (index, Failure::Singular)));
+        }
+        if !place.fits(open.len() as u64) {
+            let (at, of) = (place.followed, open.len());
+            return Err(another(format!("a checkpoint stands at {at} of {of} candidates to follow")));
+        }
+        by_guess(&mut open);
+        self.follow(&open, kept, place, true)
+    }
+
+    /// Follows open candidates in this order from a place on; what is learnt goes to `kept`, and to the counts and
+    /// checkpoints if `counted`.
+    pub(super) fn follow(&mut self, open: &[Open], kept: &mut Kept, mut place: Place, counted: bool) -> Result<()> {
+        if open.is_empty() {
+            return Ok(());
+        }
+        let Catalogue { problem, options, .. } = self.catalogue;
+        let saving = counted && self.control.saving.load(Ordering::Relaxed);
+        // A refinement costs about ten times a free run.
+        let pulses = if problem.refines() { PIECE / 8 } else { PIECE };
+        let piece = if saving { (pulses / problem.samples().max(1)).max(4 * self.scratches.len()) } else { usize::MAX };
+        let (first, largest) = if problem.refines() { REFINED } else { FOLLOWED };
+        let batch = |at: u64| usize::try_from(at).unwrap_or(usize::MAX).min(open.len());
+        if place.end == 0 {
+            place.size = first;
+            place.end = batch(place.size) as u64;
+            place.limit = kept.limit;
+        }
+        loop {
+            let limit = place.limit;
+            kept.limit = limit;
+            while place.followed < place.end {
+                let (start, end) = (batch(place.followed), batch(place.end));
+                let end = end.min(start.saturating_add(piece));
+                let rows = self.follow_some(&open[start..end], limit, counted)?;
+                place.followed = end as u64;
+                if saving {
+                    kept.take(rows.iter().cloned());
+                    self.part.failures.sort_unstable();
+                    self.part.failures.truncate(LISTED);
+                    let rows = rows.into_iter().filter(|row| kept.holds(row)).collect();
+                    let part = Part { rows, counts: self.part.counts, failures: self.part.failures.clone() };
+                    self.control.save(Checkpoint { place, part });
+                } else {
+                    kept.take(rows.into_iter());
+                }
+            }
+            kept.lower(options.early_stopping);
+            if batch(place.end) == open.len() {
+                return Ok(());
+            }
+            place.size = place.size.saturating_mul(2).min(largest);
+            place.end = batch(place.end.saturating_add(place.size)) as u64;
+            place.limit = kept.limit;
+        }
+    }
+
+    /// Follows these candidates up to a limit: the rows they make.
+    fn follow_some(&mut self, open: &[Open], limit: f64, counted: bool) -> Result<Vec<Row>> {
+        let (catalogue, control, scratches) = (self.catalogue, self.control, &self.scratches);
+        let problem = &catalogue.problem;
+        let visit = |candidate: &Open| {
+            if control.stopped() {
+                return None;
+            }
+            if candidate.bound > limit {
+                return Some((candidate.index, Verdict::Bounded(candidate.bound), None));
+            }
+            scratches.with(|scratch| {
+                let mut positions = std::mem::take(&mut scratch.positions);
+                let mut initial = std::mem::take(&mut scratch.initial);
+                let cursor = Cursor::at(&catalogue.lattice, candidate.index);
+                positions.clear();
+                positions.resize(catalogue.lattice.width(), 0);
+                catalogue.positions(&cursor, &mut positions);
+                catalogue.initial(&cursor, &mut initial);
+                let verdict = problem.evaluate(&positions, &initial, limit, false, scratch, control);
+                let row = match verdict {
+                    Verdict::Score(raw) if raw <= limit => {
+                        Some(problem.row(candidate.index, raw, initial.len(), scratch))
+                    }
+                    _ => None,
+                };
+                scratch.positions = positions;
+                scratch.initial = initial;
+                // One that is bounded is counted as done with the other bounded ones.
+                if counted && !matches!(verdict, Verdict::Bounded(_)) {
+                    control.count(1, u64::from(matches!(verdict, Verdict::Stopped(_))));
+                }
+                Some((candidate.index, verdict, row))
+            })
+        };
+        let least = if problem.refines() { 1 } else { 4 };
+        let results: Vec<_> = self.pool.install(|| open.par_iter().with_min_len(least).map(visit).collect());
+        self.check_stop()?;
+        let mut rows = Vec::new();
+        for (index, verdict, row) in results.into_iter().flatten() {
+            if counted {
+                self.count(index, verdict);
+            }
+            rows.extend(row);
+        }
+        Ok(rows)
+    }
+
+    fn count(&mut self, index: u64, verdict: Verdict) {
+        match verdict {
+            Verdict::Score(_) => self.part.counts.beaten += 1,
+            Verdict::Bounded(_) => {
+                self.part.counts.bounded += 1;
+                self.control.count(1, 1);
+            }
+            Verdict::Stopped(_) => self.part.counts.stopped += 1,
+            Verdict::Failed(failure) => {
+                match failure {
+                    Failure::Singular => self.part.counts.singular += 1,
+                    Failure::Diverged => self.part.counts.diverged += 1,
+                }
+                self.part.failures.push((index, failure));
+            }
+        }
+    }
+}

@@ -1,0 +1,9 @@
+//! A search over a lattice, round by round.
+
+mod hunt;
+mod plan;
+mod ready;
+mod scouts;
+
+pub use plan::{rounds, waves};
+pub use ready::{search, Search};

@@ -1,0 +1,160 @@
+//! Screening: coefficients of candidates side by side, and those left open that no proved lower bound excludes.
+
+use crate::equation::Initial;
+use crate::lanes::{self, WIDTH};
+use crate::search::candidate::columns::{part_of, Columns};
+use crate::search::candidate::normal::Solve;
+use crate::search::catalogue::Catalogue;
+use crate::search::lattice::cursor::Cursor;
+use crate::search::spread::spread;
+
+/// A candidate that its bound has not excluded.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Open {
+    pub(crate) index: u64,
+    pub(crate) bound: f64,
+    /// A guess at its score, by which visits are ordered.
+    pub(crate) guess: f64,
+}
+
+/// Sorts by guess, ties by index; what has no order comes last.
+pub(crate) fn by_guess(open: &mut [Open]) {
+    open.sort_unstable_by(|a, b| a.guess.total_cmp(&b.guess).then(a.index.cmp(&b.index)));
+}
+
+/// Screens candidates `lo … hi − 1` against a limit: the open ones, and the singular ones; compiled for the widest
+/// vectors at hand.
+pub(crate) fn screen(catalogue: &Catalogue<'_>, lo: u64, hi: u64, limit: f64) -> (Vec<Open>, Vec<u64>) {
+    lanes::widest(Screening { catalogue, lo, hi, limit })
+}
+
+/// [`screen`] as a kernel.
+struct Screening<'a> {
+    catalogue: &'a Catalogue<'a>,
+    lo: u64,
+    hi: u64,
+    limit: f64,
+}
+
+impl lanes::Kernel for Screening<'_> {
+    type Output = (Vec<Open>, Vec<u64>);
+
+    #[inline(always)]
+    fn run(self) -> Self::Output {
+        let Self { catalogue, lo, hi, limit } = self;
+        let mut found = (Vec::new(), Vec::new());
+        let mut cursor = Cursor::at(&catalogue.lattice, lo);
+        let mut index = lo;
+        let width = catalogue.lattice.width();
+        // Candidates differ in their Caputo terms, so they cannot share a layout.
+        if catalogue.options.initial != Initial::Caputo {
+            let mut screen = Screen::<WIDTH>::new(width);
+            catalogue.positions(&cursor, &mut screen.terms);
+            while index + WIDTH as u64 <= hi {
+                screen.some(catalogue, &mut cursor, index, limit, &mut found);
+                index += WIDTH as u64;
+            }
+        }
+        let mut screen = Screen::<1>::new(width);
+        catalogue.positions(&cursor, &mut screen.terms);
+        while index < hi {
+            screen.some(catalogue, &mut cursor, index, limit, &mut found);
+            index += 1;
+        }
+        found
+    }
+}
+
+/// Memory of a screening of L candidates side by side.
+struct Screen<const L: usize> {
+    solve: Solve<L>,
+    positions: Vec<Columns<L>>,
+    initial: Vec<usize>,
+    /// Columns of the candidate that comes next.
+    terms: Vec<usize>,
+    /// One candidate's columns, coefficients and initial terms.
+    columns: Vec<usize>,
+    coefficients: Vec<f64>,
+    weights: Vec<f64>,
+}
+
+impl<const L: usize> Screen<L> {
+    fn new(width: usize) -> Self {
+        Self {
+            solve: Solve::new(),
+            positions: vec![Columns::new([0; L]); width],
+            initial: Vec::new(),
+            terms: vec![0; width],
+            columns: vec![0; width],
+            coefficients: vec![0.0; width],
+            weights: Vec::new(),
+        }
+    }
+
+    /// Screens the next L candidates.
+    #[inline(always)]
+    fn some(
+        &mut self,
+        catalogue: &Catalogue<'_>,
+        cursor: &mut Cursor<'_>,
+        index: u64,
+        limit: f64,
+        (open, singular): &mut (Vec<Open>, Vec<u64>),
+    ) {
+        let Self { solve, positions, initial, terms, columns, coefficients, weights } = self;
+        catalogue.initial(cursor, initial);
+        if let Some((term, digit)) = cursor.stretch(L) {
+            for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
+                *columns = Columns::one(column);
+            }
+            positions[term].at = part_of(&catalogue.of_term(cursor, term)[digit..]);
+            positions[term].compare();
+            cursor.skip(L - 1);
+            catalogue.next(cursor, terms);
+        } else {
+            for n in 0..L {
+                for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
+                    columns.at[n] = column;
+                }
+                catalogue.next(cursor, terms);
+            }
+            positions.iter_mut().for_each(Columns::compare);
+        }
+        let failed = catalogue.problem.equations.solve(positions, initial, solve);
+        #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
+        let squares = match &catalogue.problem.squares {
+            Some(squares) => Some(squares.error(positions, &solve.coefficients)),
+            None => None,
+        };
+        for n in 0..L {
+            let index = index + n as u64;
+            if failed[n] {
+                singular.push(index);
+                continue;
+            }
+            let (bound, guess) = match (&squares, &catalogue.problem.bound) {
+                (Some((least, guess)), _) => (least[n], guess[n]),
+                (None, Some(bound)) => {
+                    // Coefficients that are yet to be refined give an order of visiting and prove nothing.
+                    let refined = catalogue.problem.refines();
+                    let limit = if refined { f64::INFINITY } else { limit };
+                    columns.iter_mut().zip(positions.iter()).for_each(|(t, p)| *t = p.at[n]);
+                    coefficients.iter_mut().zip(&solve.coefficients).for_each(|(c, x)| *c = x[n]);
+                    weights.clear();
+                    weights.extend(solve.initial.iter().map(|x| x[n]));
+                    let e = initial.len();
+                    let (least, guess) = bound.evaluate(limit, |r| {
+                        (&columns[..], &coefficients[..], &initial[..], &weights[r * e..(r + 1) * e])
+                    });
+                    (if refined { 0.0 } else { least }, guess)
+                }
+                (None, None) => (0.0, spread(index)),
+            };
+            // Written so that a bound that is not a number excludes nothing.
+            if bound > limit {
+                continue;
+            }
+            open.push(Open { index, bound, guess });
+        }
+    }
+}
