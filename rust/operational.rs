@@ -4,8 +4,8 @@
 
 use crate::dense;
 use crate::error::{check_step, Result};
-use crate::fractional::{block_pulse_kernel, check_order};
 use crate::haar;
+use crate::kernels::{block_pulse_kernel, check_order};
 
 /// Upper-triangular Toeplitz F^η, row-major m × m (paper (32)); `step` = duration / m.
 ///

@@ -7,7 +7,7 @@
 
 use crate::equation::Structure;
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::fractional::block_pulse_kernel;
+use crate::kernels::block_pulse_kernel;
 use crate::memory::{decay, Rates};
 use crate::small::Recursion;
 

@@ -11,9 +11,7 @@ use crate::error::{check_finite, check_length, Error};
 use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::estimate::streaming::Streaming as StreamingFit;
-use crate::estimate::{
-    instrumental_variables as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint,
-};
+use crate::estimate::{iv as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint};
 
 /// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);

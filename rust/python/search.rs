@@ -14,7 +14,7 @@ use super::arrays::{initial, records, rows, InitialArg, RecordArg};
 use super::errors::caught;
 use crate::equation::{AffineOrder, Initial};
 use crate::error::Error;
-use crate::estimate::instrumental_variables::{with_projections, Settings};
+use crate::estimate::iv::{with_projections, Settings};
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::regressors::Record;
 use crate::search::lattice::{Lattice, LawEquation, LawLattice, TermAxis};

@@ -5,9 +5,10 @@ use pyo3::prelude::*;
 
 use super::arrays::{stacked, vector};
 use crate::error::{check_length, Error};
-use crate::guard::{self, Fault};
 use crate::memory::{decay, Rates};
-use crate::virtual_arm::{Arm, Injection, Pace, Parameters, Plant, Reading, Sensors, Stage};
+use crate::rig::arm::{Arm, Parameters, Stage};
+use crate::rig::guard::{self, Fault};
+use crate::rig::virtual_arm::{Injection, Pace, Plant, Reading, Sensors};
 
 /// Columns of a row: written currents, four angles, two measured currents, delay.
 const COLUMNS: usize = 9;

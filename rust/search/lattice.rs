@@ -6,7 +6,7 @@ use std::ops::Range;
 
 use crate::equation::{alpha_fits, order_fits, tidy, AffineOrder, Structure, Term, ORDER_GRAIN};
 use crate::error::{Error, Result};
-use crate::fractional::MAX_ORDER;
+use crate::kernels::MAX_ORDER;
 
 /// Most candidates that one search takes: an hour or so where bounds and early stopping do their work.
 pub const MAX_CANDIDATES: u128 = 10_000_000_000;

@@ -8,10 +8,10 @@ use rayon::prelude::*;
 
 use crate::equation::{Structure, Term};
 use crate::error::{check_finite, check_length, Error, Result};
-use crate::fractional::block_pulse_kernel;
+use crate::kernels::block_pulse_kernel;
 use crate::regressors::{Key, Record};
 use crate::search::run::{pool, Control, Norm};
-use crate::series::{self, Division, BLOCK};
+use crate::series::{Division, BLOCK};
 
 /// Memory for regressors kept from one call to the next; a population that has settled asks for the same ones again.
 const KEPT_BYTES: usize = 256 << 20;
@@ -224,6 +224,7 @@ impl Points {
 }
 
 /// Error (45) of one candidate on one record by the naive division: the oracle of [`Points::scores`].
+#[cfg(feature = "oracles")]
 #[must_use]
 pub fn score_naive(record: &Record, output: usize, signals: &[usize], point: &Point) -> f64 {
     let m = record.m();
@@ -234,10 +235,10 @@ pub fn score_naive(record: &Record, output: usize, signals: &[usize], point: &Po
         if signal == output {
             divisor.iter_mut().zip(&kernel).for_each(|(d, v)| *d -= c * v);
         } else {
-            let integral = series::multiply_naive(&kernel, record.signal(signal), m);
+            let integral = crate::series::multiply_naive(&kernel, record.signal(signal), m);
             numerator.iter_mut().zip(integral).for_each(|(n, v)| *n += c * v);
         }
     }
-    series::divide_naive(&numerator, &divisor)
+    crate::series::divide_naive(&numerator, &divisor)
         .map_or(f64::INFINITY, |response| record.signal(output).iter().zip(response).map(|(y, v)| (y - v).abs()).sum())
 }

@@ -18,7 +18,7 @@ use rayon::prelude::*;
 use crate::dense;
 use crate::equation::{grains, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_length, Error, Result};
-use crate::estimate::instrumental_variables::Settings;
+use crate::estimate::iv::Settings;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::haar;
 use crate::lanes::{self, Lanes, WIDTH};

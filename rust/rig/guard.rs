@@ -4,7 +4,7 @@
 use thiserror::Error;
 
 use crate::error::{Error, Result};
-use crate::virtual_arm::Reading;
+use crate::rig::virtual_arm::Reading;
 
 /// Numbers of the arm that limits and faults are judged by; pairs are stage 1 and stage 2.
 #[derive(Debug, Clone, PartialEq)]
