@@ -236,12 +236,15 @@ fn whole_logarithms(m: usize) -> Arc<Vec<f64>> {
     grown(TABLE.get_or_init(Mutex::default), m, |len| (0..len).map(|n| libm::log(n.max(1) as f64)).collect())
 }
 
-/// ψ(x) for x > 0: recurrence up to x ≥ 10, then the asymptotic series (DLMF 5.11.2).
+/// ψ(x) for x > 0, NaN elsewhere: recurrence up to x ≥ 10, then the asymptotic series (DLMF 5.11.2).
 #[must_use]
 pub fn digamma(x: f64) -> f64 {
     // B_{2k}/(2k) for k = 1 … 7; the eighth term is below 1e−17 at x = 10.
     const SERIES: [f64; 7] =
         [1.0 / 12.0, -1.0 / 120.0, 1.0 / 252.0, -1.0 / 240.0, 1.0 / 132.0, -691.0 / 32760.0, 1.0 / 12.0];
+    if x.is_nan() || x <= 0.0 {
+        return f64::NAN;
+    }
     let (mut x, mut shift) = (x, 0.0);
     while x < 10.0 {
         shift += 1.0 / x;

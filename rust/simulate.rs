@@ -278,12 +278,18 @@ pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -
 /// [`Error::Structure`] naming the equation whose orders are not whole.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -> Result<Vec<Vec<f64>>> {
+    check_step(step)?;
+    for (i, signal) in signals.iter().enumerate() {
+        check_finite(&format!("signal {i}"), signal)?;
+        check_length(&format!("signal {i}"), signals[0].len(), signal.len())?;
+    }
     let whole = |order: f64| (order - order.round()).abs() < ORDER_GRAIN && order >= 0.0;
     let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
     let alpha: Vec<usize> = equations.iter().map(|e| e.structure.order.round() as usize).collect();
     for (i, equation) in equations.iter().enumerate() {
         let structure = &equation.structure;
         structure.check(signals.len(), |s| !outputs.contains(&s))?;
+        equation.check(signals.len())?;
         let fits = |term: &crate::equation::Term| match outputs.iter().position(|&o| o == term.signal) {
             Some(j) => whole(term.order) && (term.order.round() as usize) < alpha[j],
             None => term.order.abs() < ORDER_GRAIN,

@@ -118,7 +118,7 @@ pub fn recursion(
 ) -> Result<(Estimate, Vec<Vec<f64>>)> {
     let regression = rows(records, structure, fixed, initial, innovation)?;
     let k = regression.columns.len();
-    let mut state = Recursion::new(&vec![0.0; k], innovation.prior_covariance);
+    let mut state = Recursion::new(&vec![0.0; k], innovation.prior_covariance)?;
     let end = regression.target.len();
     let matrix: Vec<Vec<f64>> = (0..end).map(|i| regression.columns.iter().map(|c| c[i]).collect()).collect();
     let mut trace = Vec::with_capacity(end);

@@ -19,6 +19,9 @@ const MEMORY_TOLERANCE: f64 = 1e-10;
 /// Sweeps of the friction solve; two hubs need one where the stages are apart and a few where they are not.
 const FRICTION_SWEEPS: usize = 60;
 
+/// Most substeps of a sample: more take seconds each, and a slip of the hand would never end.
+const MOST_SUBSTEPS: f64 = 1e6;
+
 /// Orders, coefficients and friction of one stage, by the paper's names.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stage {
@@ -84,13 +87,27 @@ impl Arm {
     /// An arm at rest, stepped `step` s at a time in substeps of at most `longest_substep`, for `horizon` s.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for an order outside [0, 2), a negative friction or coupling, a step that is not positive;
+    /// [`Error::OutOfRange`] for an order outside [0, 2), a negative friction or coupling, a step that is not positive, a
+    /// horizon that is no number, more than a million substeps;
     /// [`Error::NotFinite`] for a coefficient.
     pub fn new(parameters: &Parameters, step: f64, longest_substep: f64, horizon: f64) -> Result<Self> {
         check_step(step)?;
         check_step(longest_substep)?;
+        let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
+            name: name.into(),
+            value,
+            range: range.into(),
+            remedy: "correct the times of the virtual arm".into(),
+        };
+        if horizon.is_nan() {
+            return Err(outside("horizon", horizon, "[0, ∞) s"));
+        }
+        let parts = (step / longest_substep - 1e-9).ceil().max(1.0);
+        if parts > MOST_SUBSTEPS {
+            return Err(outside("substeps a sample", parts, &format!("[1, {MOST_SUBSTEPS}]")));
+        }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-        let substeps = (step / longest_substep - 1e-9).ceil().max(1.0) as usize;
+        let substeps = parts as usize;
         #[allow(clippy::cast_precision_loss)]
         let h = step / substeps as f64;
         let (mut operators, input) = accelerations(parameters)?;

@@ -66,6 +66,17 @@ impl Settings {
             ("fastest", self.fastest),
             ("late_limit", self.late_limit),
         ];
+        if let Some((frequency, damping)) = self.filter {
+            if !(frequency > 0.0 && frequency.is_finite() && damping > 0.0 && damping.is_finite()) {
+                let value = if frequency > 0.0 && frequency.is_finite() { damping } else { frequency };
+                return Err(Error::OutOfRange {
+                    name: "sensor filter".into(),
+                    value,
+                    range: "(0, ∞)".into(),
+                    remedy: "give its frequency in rad/s and its damping".into(),
+                });
+            }
+        }
         let all = pairs.iter().flat_map(|(name, v)| v.map(|v| (*name, v))).chain(single);
         for (name, value) in all {
             if !(value > 0.0 && value.is_finite()) {
@@ -344,7 +355,7 @@ impl Guard {
         } else {
             self.missed = 0;
         }
-        if late > s.late_limit {
+        if late.is_nan() || late > s.late_limit {
             self.fail(Fault::Late { milliseconds: 1e3 * late, limit: 1e3 * self.settings.late_limit });
         } else if self.missed > s.missed_limit {
             self.fail(Fault::Missed { count: self.missed });

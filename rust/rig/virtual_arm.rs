@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::arm::Arm;
-use crate::error::{Error, Result};
+use crate::error::{check_finite, check_step, Error, Result};
 
 /// What the arm's sensors and converters make of it.
 #[derive(Debug, Clone, PartialEq)]
@@ -104,14 +104,38 @@ pub struct Plant {
 
 impl Plant {
     /// An arm at rest with no current.
-    #[must_use]
-    pub fn new(arm: Arm, sensors: Sensors) -> Self {
-        Self { arm, sensors, current: [0.0; 2], frozen: [None; 2], injections: Vec::new(), sample: 0 }
+    ///
+    /// # Errors
+    /// As [`Sensors::check`].
+    pub fn new(arm: Arm, sensors: Sensors) -> Result<Self> {
+        sensors.check()?;
+        Ok(Self { arm, sensors, current: [0.0; 2], frozen: [None; 2], injections: Vec::new(), sample: 0 })
     }
 
     /// Adds something that goes wrong.
-    pub fn inject(&mut self, injection: Injection) {
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a stage or a line that is not there, [`Error::NotFinite`] for its number.
+    pub fn inject(&mut self, injection: Injection) -> Result<()> {
+        let place = |name: &str, index: usize, count: usize| {
+            if index < count {
+                return Ok(());
+            }
+            #[allow(clippy::cast_precision_loss)]
+            Err(outside(name, index as f64, &format!("[0, {count})")))
+        };
+        match injection {
+            Injection::DeadEncoder { stage, .. } | Injection::SaturatedGauge { stage, .. } => place("stage", stage, 2)?,
+            Injection::LimitSwitch { line, .. } => place("line", line, 4)?,
+            Injection::Deflection { stage, angle, .. } => {
+                place("stage", stage, 2)?;
+                check_finite("injected deflection", &[angle])?;
+            }
+            Injection::Late { seconds, .. } => check_finite("injected delay", &[seconds])?,
+            Injection::LostSamples { .. } => {}
+        }
         self.injections.push(injection);
+        Ok(())
     }
 
     /// Number of the sample that [`Self::read`] reads next.
@@ -188,7 +212,49 @@ impl Plant {
     }
 }
 
+/// A number of the virtual arm outside its range.
+fn outside(name: &str, value: f64, range: &str) -> Error {
+    Error::OutOfRange {
+        name: name.into(),
+        value,
+        range: range.into(),
+        remedy: "correct the parameters of the virtual arm".into(),
+    }
+}
+
+/// Finest converters: beyond these bits a step is below the rounding of the volts.
+const MOST_BITS: u32 = 52;
+
 impl Sensors {
+    /// Refuses scales, limits and a range that are not positive, noise that is negative, offsets that are not finite and
+    /// converters of more bits than a number has.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`], [`Error::NotFinite`].
+    pub fn check(&self) -> Result<()> {
+        let pairs = [
+            ("strain_scale", self.strain_scale),
+            ("encoder_scale", self.encoder_scale),
+            ("current_limit", self.current_limit),
+            ("travel", self.travel),
+        ];
+        let single = [("sense_scale", self.sense_scale), ("command_scale", self.command_scale), ("range", self.range)];
+        for (name, value) in pairs.iter().flat_map(|(name, v)| v.map(|v| (*name, v))).chain(single) {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(outside(name, value, "(0, ∞)"));
+            }
+        }
+        if let Some(&noise) = self.noise.iter().find(|v| !(**v >= 0.0 && v.is_finite())) {
+            return Err(outside("noise", noise, "[0, ∞) V"));
+        }
+        check_finite("strain_bias", &self.strain_bias)?;
+        check_finite("sense_bias", &self.sense_bias)?;
+        if self.bits > MOST_BITS {
+            return Err(outside("bits", f64::from(self.bits), &format!("[0, {MOST_BITS}]")));
+        }
+        Ok(())
+    }
+
     /// Clips to the converters' range and rounds to their steps; what is not a number becomes 0 V.
     fn convert(&self, volts: f64) -> f64 {
         if !volts.is_finite() {
@@ -214,17 +280,29 @@ pub struct Pace {
 /// The system's sleep ends late by some tens of microseconds; the rest is waited out awake.
 const AWAKE: Duration = Duration::from_micros(120);
 
+/// A loop in real time has its next sample within a day \[s\]: no instant overflows.
+const LONGEST_STEP: f64 = 86_400.0;
+
 impl Pace {
-    /// Starts now.
-    #[must_use]
-    pub fn new(step: f64) -> Self {
-        Self { start: Instant::now(), step, samples: 0 }
+    /// Starts now, with a deadline every `step` s.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a step that is not positive, or longer than a day.
+    pub fn new(step: f64) -> Result<Self> {
+        check_step(step)?;
+        if step > LONGEST_STEP {
+            return Err(outside("step", step, "(0, 86400] s"));
+        }
+        Ok(Self { start: Instant::now(), step, samples: 0 })
     }
 
     /// Waits for the next sample instant; how late it is when it returns \[s\].
     pub fn wait(&mut self) -> f64 {
         #[allow(clippy::cast_precision_loss)]
-        let due = self.start + Duration::from_secs_f64(self.step * self.samples as f64);
+        let due = Duration::try_from_secs_f64(self.step * self.samples as f64)
+            .ok()
+            .and_then(|since| self.start.checked_add(since))
+            .unwrap_or(self.start);
         self.samples += 1;
         loop {
             let now = Instant::now();

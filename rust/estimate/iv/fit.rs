@@ -67,6 +67,9 @@ pub fn fit(
     settings: Settings,
 ) -> Result<Fit> {
     check_length("fixed coefficients", structures.len(), fixed.len())?;
+    if structures.is_empty() {
+        return Err(Error::Length { name: "equations".into(), expected: 1, found: 0 });
+    }
     let clean: Vec<Record> = records.iter().map(Record::cleaned).collect();
     let exponents: Vec<Vec<f64>> = structures.iter().map(|s| s.initial_exponents(initial)).collect();
     let problem = Problem { records, clean: &clean, structures, fixed, exponents: &exponents };

@@ -7,55 +7,61 @@ use crate::series;
 /// One run to compare with: pulse means on a grid of which every `every`-th edge is a sample.
 #[derive(Debug, Clone)]
 pub struct Experiment {
-    pub(super) record: Record,
-    pub(super) every: usize,
-    pub(super) samples: Vec<Vec<f64>>,
-    pub(super) weights: Vec<f64>,
-    filter: Option<(Vec<f64>, Vec<bool>)>,
+    /// Pulse means of all signals.
+    pub record: Record,
+    /// Pulses a sample interval.
+    pub every: usize,
+    /// Point samples of each equation's output, one more than there are intervals.
+    pub samples: Vec<Vec<f64>>,
+    /// Filter that simulated outputs pass before they are compared, where there is one: a series as long as the record,
+    /// and a flag for each output that passes it.
+    pub filter: Option<(Vec<f64>, Vec<bool>)>,
+    /// 1/σ of each equation's output.
+    pub weights: Vec<f64>,
 }
 
 impl Experiment {
-    /// Pulse means of all signals, `every` pulses a sample interval; point samples of each equation's output, one more
-    /// than there are intervals; 1/σ of each of these outputs.
+    /// An experiment without a filter.
     ///
     /// # Errors
-    /// [`Error::Structure`] where the pulses are no multiple of `every`, [`Error::Length`], [`Error::NotFinite`].
+    /// As [`Experiment::check`].
     pub fn new(record: Record, every: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Result<Self> {
-        if every == 0 || record.m() % every != 0 {
-            let what = format!("{} pulses are no multiple of {every} a sample interval", record.m());
-            return Err(Error::Structure { what, remedy: "refine every interval alike".into() });
-        }
-        for (i, samples) in samples.iter().enumerate() {
-            check_finite(&format!("samples of output {i}"), samples)?;
-            check_length("samples", record.m() / every + 1, samples.len())?;
-        }
-        check_finite("weights", &weights)?;
-        check_length("weights", samples.len(), weights.len())?;
-        Ok(Self { record, every, samples, weights, filter: None })
+        let experiment = Self { record, every, samples, filter: None, weights };
+        experiment.check()?;
+        Ok(experiment)
     }
 
-    /// Puts a filter (a series as long as the record) before the comparison, for those outputs whose flag is set.
+    /// The same experiment, its outputs compared behind a filter.
     ///
     /// # Errors
-    /// [`Error::Length`], [`Error::NotFinite`].
+    /// As [`Experiment::check`].
     pub fn with_filter(mut self, series: Vec<f64>, applies: Vec<bool>) -> Result<Self> {
-        check_finite("filter", &series)?;
-        check_length("filter", self.record.m(), series.len())?;
-        check_length("filtered outputs", self.samples.len(), applies.len())?;
         self.filter = Some((series, applies));
+        self.check()?;
         Ok(self)
     }
 
-    /// Pulse means of all signals.
-    #[must_use]
-    pub fn record(&self) -> &Record {
-        &self.record
-    }
-
-    /// Pulses a sample interval.
-    #[must_use]
-    pub fn every(&self) -> usize {
-        self.every
+    /// Refuses what cannot be compared.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] where the pulses are no multiple of `every`, [`Error::Length`], [`Error::NotFinite`].
+    pub fn check(&self) -> Result<()> {
+        let (m, every) = (self.record.m(), self.every);
+        if every == 0 || m % every != 0 {
+            let what = format!("{m} pulses are no multiple of {every} a sample interval");
+            return Err(Error::Structure { what, remedy: "refine every interval alike".into() });
+        }
+        for (i, samples) in self.samples.iter().enumerate() {
+            check_finite(&format!("samples of output {i}"), samples)?;
+            check_length("samples", m / every + 1, samples.len())?;
+        }
+        if let Some((series, applies)) = &self.filter {
+            check_finite("filter", series)?;
+            check_length("filter", m, series.len())?;
+            check_length("filtered outputs", self.samples.len(), applies.len())?;
+        }
+        check_finite("weights", &self.weights)?;
+        check_length("weights", self.samples.len(), self.weights.len())
     }
 
     /// Samples that are compared: all that have a pulse on either side.

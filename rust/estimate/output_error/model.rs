@@ -162,6 +162,7 @@ impl FreeModel {
             return refuse(format!("bounds {low} to {high} of an order"), "give two rising orders");
         }
         for experiment in experiments {
+            experiment.check()?;
             check_length("outputs", self.equations.len(), experiment.samples.len())?;
         }
         self.initial.check()

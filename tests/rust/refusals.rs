@@ -1,0 +1,214 @@
+//! What would panic, hang or exhaust memory later is refused at the door, in words.
+
+use ftlm::equation::{Equation, Filter, Initial};
+use ftlm::error::{check_dense, check_points, Error, MOST_POINTS};
+use ftlm::estimate::iv;
+use ftlm::estimate::least_squares::{self, Regression};
+use ftlm::estimate::output_error::Experiment;
+use ftlm::estimate::streaming::Streaming;
+use ftlm::kernels::digamma;
+use ftlm::means::{delayed, pulse_means, Intersample};
+use ftlm::memory::{integral_by_memory, Rates};
+use ftlm::rig::arm::{Arm, Parameters, Stage};
+use ftlm::rig::virtual_arm::{Injection, Pace, Plant, Sensors};
+use ftlm::simulate::{self, OutputFilter};
+use ftlm::small::{self, Recursion};
+use ftlm::{fft, haar, metrics, operational, series};
+
+use crate::common::{equation, record, structure};
+
+/// Fails unless this is refused, and with more than a few words.
+#[track_caller]
+fn refused<T>(result: Result<T, Error>) {
+    match result {
+        Ok(_) => panic!("not refused"),
+        Err(Error::Internal { what }) => panic!("a fault: {what}"),
+        Err(error) => assert!(error.to_string().len() > 20, "{error}"),
+    }
+}
+
+#[test]
+fn lengths_beyond_memory() {
+    for m in [MOST_POINTS + 1, 1 << 31, 1 << 60, usize::MAX] {
+        refused(check_points("m", m));
+        refused(check_dense(m));
+        refused(pulse_means(&[0.0, 1.0], m, Intersample::Hold));
+        refused(Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 1.0)] }.series(m, 0.1));
+        refused(haar::matrix(m));
+        refused(operational::block_pulse_matrix(0.5, m, 0.1));
+        refused(operational::operational_matrix(0.5, m, 0.1));
+    }
+    refused(check_dense(0));
+    check_points("m", MOST_POINTS).unwrap();
+}
+
+#[test]
+fn equations_that_miss_something() {
+    let s = structure(0, 2.0, &[(0, 1.0), (1, 0.0)]);
+    refused(Equation::new(s.clone(), vec![1.0]));
+    refused(Equation::new(s.clone(), vec![1.0, f64::NAN]));
+    let whole = Equation::new(s.clone(), vec![-1.0, 2.0]).unwrap();
+    whole.check(2).unwrap();
+    refused(whole.check(1));
+    let run = record(0.1, vec![vec![0.5; 20], vec![1.0; 20]]);
+    let short = Equation { structure: s.clone(), coefficients: vec![1.0] };
+    let missing = equation(0, 2.0, &[(5, 0.0, 1.0)]);
+    let nan = equation(0, 2.0, &[(1, 0.0, f64::NAN)]);
+    for bad in [&short, &missing, &nan] {
+        let bad = std::slice::from_ref(bad);
+        refused(simulate::respond(bad, &run, &[]));
+        refused(simulate::respond_damped(bad, &run, &[], 0.1));
+        refused(simulate::inverse(bad, &run));
+        refused(simulate::respond_with_initial(bad, &run, &Initial::Rest, None));
+        refused(simulate::equation_error(&bad[0], &run, &Initial::Rest));
+    }
+    let good = std::slice::from_ref(&whole);
+    refused(simulate::respond(good, &run, &[vec![(0.0, f64::NAN)]]));
+    refused(simulate::respond(good, &run, &[vec![(-1.0, 1.0)]]));
+    refused(simulate::respond(good, &run, &[vec![], vec![]]));
+    refused(simulate::respond_with_initial(good, &run, &Initial::Powers(vec![-2.0]), None));
+    let filter = |series, applies| Some(OutputFilter { series, applies });
+    refused(simulate::respond_with_initial(good, &run, &Initial::Rest, filter(&[1.0], &[true])));
+    refused(simulate::respond_with_initial(good, &run, &Initial::Rest, filter(&[1.0; 20], &[])));
+    refused(simulate::explicit_euler(std::slice::from_ref(&short), &[vec![0.0; 5], vec![0.0; 5]], 0.1));
+    let euler = [equation(0, 2.0, &[(1, 0.0, 1.0)])];
+    refused(simulate::explicit_euler(&euler, &[vec![0.0; 5], vec![0.0; 4]], 0.1));
+    refused(simulate::explicit_euler(&euler, &[vec![0.0; 5], vec![f64::NAN; 5]], 0.1));
+    refused(simulate::explicit_euler(&euler, &[vec![0.0; 5], vec![0.0; 5]], 0.0));
+}
+
+#[test]
+fn regressions_that_cannot_be_made() {
+    let run = [record(0.1, vec![vec![0.5; 20], vec![1.0; 20]])];
+    let there = structure(0, 1.0, &[(1, 0.0)]);
+    refused(Regression::new(&run, &structure(0, 1.0, &[(7, 0.0)]), &[None], &Initial::Rest).map(|_| ()));
+    refused(Regression::new(&run, &structure(9, 1.0, &[(1, 0.0)]), &[None], &Initial::Rest).map(|_| ()));
+    refused(least_squares::fit(&run, &there, &[Some(f64::NAN)], &Initial::Rest));
+    refused(least_squares::fit(&run, &there, &[None], &Initial::Powers(vec![f64::NAN])));
+    refused(least_squares::fit(&[], &there, &[None], &Initial::Rest));
+    refused(least_squares::solve(&[vec![1.0; 3]], &[1.0; 4], 1));
+    refused(iv::fit(&run, &[], &[], &Initial::Rest, iv::Settings::default()));
+    refused(iv::fit(&run, &[structure(0, 1.0, &[(7, 0.0)])], &[vec![None]], &Initial::Rest, iv::Settings::default()));
+}
+
+#[test]
+fn streams_that_cannot_run() {
+    let s = structure(0, 1.0, &[(1, 0.0)]);
+    let stream = |length, prior, s: &ftlm::equation::Structure, fixed: Option<f64>| {
+        Streaming::new(0.1, 50, &[false, true], &[(s.clone(), vec![fixed])], length, prior)
+    };
+    refused(stream(0, 1.0, &s, None));
+    refused(stream(1, 0.0, &s, None));
+    refused(stream(1, f64::NAN, &s, None));
+    refused(stream(1, 1.0, &structure(0, 1.0, &[(4, 0.0)]), None));
+    refused(stream(1, 1.0, &s, Some(f64::INFINITY)));
+    // Longer than the run is no innovation that memory must hold beforehand.
+    stream(usize::MAX, 1.0, &s, None).unwrap();
+}
+
+#[test]
+fn experiments_that_cannot_be_compared() {
+    let run = record(0.1, vec![vec![0.5; 20], vec![1.0; 20]]);
+    let experiment =
+        |every, samples: Vec<f64>, weight| Experiment::new(run.clone(), every, vec![samples], vec![weight]);
+    refused(experiment(0, vec![0.0; 21], 1.0));
+    refused(experiment(3, vec![0.0; 21], 1.0));
+    refused(experiment(1, vec![0.0; 20], 1.0));
+    refused(experiment(1, vec![f64::NAN; 21], 1.0));
+    refused(experiment(1, vec![0.0; 21], f64::NAN));
+    refused(Experiment::new(run.clone(), 1, vec![vec![0.0; 21]], vec![]));
+    let good = experiment(2, vec![0.0; 11], 1.0).unwrap();
+    refused(good.clone().with_filter(vec![1.0], vec![true]));
+    refused(good.clone().with_filter(vec![f64::NAN; 20], vec![true]));
+    refused(good.with_filter(vec![1.0; 20], vec![]));
+}
+
+#[test]
+fn numbers_that_are_none() {
+    refused(pulse_means(&[0.0, f64::NAN], 2, Intersample::Linear));
+    refused(delayed(&[0.0, f64::NAN], 1.0, 0.0));
+    refused(delayed(&[0.0, 1.0], 1.0, f64::NAN));
+    refused(metrics::metrics(&[f64::NAN], &[0.0]));
+    refused(metrics::correlation(&[vec![f64::NAN; 9]], &[vec![0.0; 9]], 2));
+    refused(Filter { numerator: vec![(f64::NAN, 0.0)], denominator: vec![(1.0, 1.0)] }.series(9, 0.1));
+    refused(Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 1.0)] }.series(9, f64::NAN));
+    refused(Recursion::new(&[0.0], f64::NAN));
+    refused(small::inverse(&[1.0, 2.0], 2));
+    refused(small::scaled_inverse(&[1.0, 2.0], 2));
+    refused(Recursion::new(&[0.0], 1.0).unwrap().step([(&[1.0, 2.0][..], 1.0)].into_iter()));
+    refused(series::divide_naive(&[1.0, 2.0], &[1.0]));
+    refused(Rates::new(1e-300, 1e300, 1e-6));
+    refused(integral_by_memory(&[0.0, f64::NAN], 0.5, 0.1, 1e-6));
+    refused(integral_by_memory(&[0.0, 1.0], 2.0, 0.1, 1e-6));
+    assert!([f64::NAN, -1e300, 0.0].iter().all(|&x| digamma(x).is_nan()));
+}
+
+fn arm(step: f64, substep: f64, horizon: f64) -> Result<Arm, Error> {
+    let stage = Stage {
+        hub_orders: [0.1, 0.95, 0.75],
+        hub: [60.0, -6.0, 1.5, 14.0],
+        deflection_orders: [0.1, 1.05, 0.85],
+        deflection: [-84.0, 6.0, -2.1, -14.0],
+        coulomb: 0.05,
+    };
+    Arm::new(&Parameters { stages: [stage.clone(), stage], coupling: 1.0, inertia_ratio: 0.02 }, step, substep, horizon)
+}
+
+fn sensors() -> Sensors {
+    Sensors {
+        strain_scale: [0.0136, 0.0187],
+        strain_bias: [0.12, -0.2],
+        noise: [0.0; 4],
+        sense_bias: [0.0; 2],
+        sense_scale: 2.0,
+        command_scale: 0.5,
+        encoder_scale: [1.5e-5, 3e-5],
+        range: 10.0,
+        bits: 16,
+        current_limit: [0.94, 1.2],
+        travel: [1.57, 1.57],
+    }
+}
+
+#[test]
+fn an_arm_that_would_never_end() {
+    refused(arm(0.002, 1e-3, f64::NAN));
+    refused(arm(0.002, 1e-3, f64::INFINITY));
+    refused(arm(1.0, 1e-12, 5.0));
+    refused(arm(f64::NAN, 1e-3, 5.0));
+    let changes: [fn(&mut Sensors); 13] = [
+        |s| s.range = f64::NAN,
+        |s| s.range = -10.0,
+        |s| s.range = 0.0,
+        |s| s.strain_scale[1] = -1.0,
+        |s| s.encoder_scale[0] = 0.0,
+        |s| s.sense_scale = -2.0,
+        |s| s.command_scale = f64::INFINITY,
+        |s| s.current_limit[0] = f64::NAN,
+        |s| s.noise[2] = -1e-3,
+        |s| s.travel[0] = f64::NAN,
+        |s| s.strain_bias[0] = f64::NAN,
+        |s| s.sense_bias[1] = f64::INFINITY,
+        |s| s.bits = 53,
+    ];
+    for change in changes {
+        let mut bad = sensors();
+        change(&mut bad);
+        refused(Plant::new(arm(0.002, 1e-3, 5.0).unwrap(), bad));
+    }
+    let mut plant = Plant::new(arm(0.002, 1e-3, 5.0).unwrap(), sensors()).unwrap();
+    refused(plant.inject(Injection::DeadEncoder { stage: 2, from: 0 }));
+    refused(plant.inject(Injection::LimitSwitch { line: 4, from: 0 }));
+    refused(plant.inject(Injection::Deflection { stage: 0, from: 0, angle: f64::NAN }));
+    refused(plant.inject(Injection::Late { at: 0, seconds: f64::NAN }));
+    for step in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e300] {
+        refused(Pace::new(step));
+    }
+}
+
+#[test]
+#[should_panic(expected = "a transform of 10 points")]
+fn a_transform_of_another_length_does_not_return_zeros() {
+    let plan = fft::plan(10);
+    plan.forward(&mut [0.0; 8], &mut vec![fft::Complex::default(); plan.bins()], &mut fft::Workspace::new());
+}
