@@ -161,6 +161,11 @@ pub type Result<T> = std::result::Result<T, Error>;
 ///
 /// # Errors
 /// [`Error::NotFinite`] with the first bad index and the count.
+///
+/// ```
+/// let error = ftlm::error::check_finite("x", &[0.0, f64::NAN]).unwrap_err();
+/// assert!(error.to_string().starts_with("x is not finite at index 1"));
+/// ```
 pub fn check_finite(name: &str, values: &[f64]) -> Result<()> {
     match values.iter().position(|v| !v.is_finite()) {
         None => Ok(()),

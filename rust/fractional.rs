@@ -31,6 +31,16 @@ pub enum Derivative {
 ///
 /// # Errors
 /// An order outside [0, 3], a step that is not positive, or a value that is not finite.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::fractional::{fractional_integral, IntegralRule};
+/// // I^1 of t is t²/2, exactly for the linear interpolant.
+/// let integral = fractional_integral(&[0.0, 1.0, 2.0], 1.0, 1.0, IntegralRule::Trapezoidal)?;
+/// assert!((integral[2] - 2.0).abs() < 1e-12);
+/// # Ok(())
+/// # }
+/// ```
 pub fn fractional_integral(x: &[f64], eta: f64, step: f64, rule: IntegralRule) -> Result<Vec<f64>> {
     check_step(step)?;
     check_order("order", eta)?;
@@ -85,6 +95,16 @@ fn first_sample_weight(eta: f64, n: usize) -> f64 {
 /// # Errors
 /// An order outside [0, 3], a step that is not positive, a value that is not finite, or fewer samples than the
 /// differences need (⌈α⌉ + 2).
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::fractional::{fractional_derivative, Derivative};
+/// // D^0.5 of t is 2 √(t/π).
+/// let slope = fractional_derivative(&[0.0, 1.0, 2.0, 3.0], 0.5, 1.0, Derivative::Caputo, &[])?;
+/// assert!((slope[3] - 2.0 * (3.0 / std::f64::consts::PI).sqrt()).abs() < 1e-12);
+/// # Ok(())
+/// # }
+/// ```
 pub fn fractional_derivative(
     x: &[f64],
     alpha: f64,

@@ -22,6 +22,11 @@ const TERMS_FAR: usize = 8;
 /// identity.
 ///
 /// Cost O(m).
+///
+/// ```
+/// // I^1 of a pulse: half of it within itself, all of it in every later one.
+/// assert_eq!(ftlm::kernels::block_pulse_kernel(1.0, 3, 0.1), [0.05, 0.1, 0.1]);
+/// ```
 #[must_use]
 pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
     let scale = libm::pow(step, eta) / libm::tgamma(eta + 2.0);
@@ -256,6 +261,10 @@ pub fn digamma(x: f64) -> f64 {
 }
 
 /// Grünwald–Letnikov weights `(−1)^j C(α, j)`, j = 0 … m−1 (paper (2)); a negative α integrates.
+///
+/// ```
+/// assert_eq!(ftlm::kernels::grunwald_letnikov_weights(1.0, 4), [1.0, -1.0, 0.0, 0.0]);
+/// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
@@ -271,6 +280,10 @@ pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
 }
 
 /// Pulse means of `t^exponent`, k = 1 … m, exact to a few ε (exponent > −1).
+///
+/// ```
+/// assert_eq!(ftlm::kernels::power_means(1.0, 3, 2.0), [1.0, 3.0, 5.0]);
+/// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {

@@ -67,7 +67,16 @@ const WINDOW: f64 = 6.0;
 ///
 /// # Errors
 /// [`Error::Length`] where x and y differ in runs or samples, [`Error::OutOfRange`] where a run has no more samples than
-/// `lags`.
+/// `lags`, [`Error::NotFinite`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// let x = [vec![1.0, -1.0, 1.0, -1.0, 1.0, -1.0]];
+/// let found = ftlm::metrics::correlation(&x, &x, 1)?;
+/// assert!((found.values[1] - 1.0).abs() < 1e-12 && found.values[2] < -0.8);
+/// # Ok(())
+/// # }
+/// ```
 #[allow(clippy::cast_precision_loss)]
 pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correlation> {
     check_length("runs", x.len(), y.len())?;

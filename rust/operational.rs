@@ -31,6 +31,15 @@ pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
 ///
 /// # Errors
 /// As [`block_pulse_matrix`], and m must be a power of two.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// // The mean of I^1 of one on [0, 2] is 1.
+/// let p = ftlm::operational::operational_matrix(1.0, 2, 1.0)?;
+/// assert!((p[0] - 1.0).abs() < 1e-12);
+/// # Ok(())
+/// # }
+/// ```
 pub fn operational_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     haar::check_power_of_two(m)?;
     check_order("order", eta)?;

@@ -129,7 +129,22 @@ impl<'a> System<'a> {
 /// may leave the range of floating point: the values are then not finite. O(n² m log² m).
 ///
 /// # Errors
-/// Orders or signals that make no equation, [`Error::LeadingZero`] where the outputs cannot be solved for.
+/// Orders or signals that make no equation, coefficients missing or not finite, [`Error::LeadingZero`] where the outputs
+/// cannot be solved for.
+///
+/// ```
+/// use ftlm::equation::{Equation, Structure, Term};
+/// use ftlm::regressors::Record;
+/// # fn main() -> ftlm::error::Result<()> {
+/// // y′ = −y + u.
+/// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+/// let model = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![-1.0, 1.0])?;
+/// let run = Record::new(0.01, vec![vec![0.0; 300], vec![1.0; 300]], None)?;
+/// let response = ftlm::simulate::respond(&[model], &run, &[])?;
+/// assert!((response[0][299] - (1.0 - (-2.995_f64).exp())).abs() < 1e-4);
+/// # Ok(())
+/// # }
+/// ```
 pub fn respond(equations: &[Equation], record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
     checked(equations, record, initial)?.respond(initial)
 }
@@ -254,7 +269,20 @@ fn weight(y: &[f64]) -> f64 {
 /// least squares at the given coefficients.
 ///
 /// # Errors
-/// Orders or signals that make no equation.
+/// As [`respond`].
+///
+/// ```
+/// use ftlm::equation::{Equation, Initial, Structure, Term};
+/// use ftlm::regressors::Record;
+/// # fn main() -> ftlm::error::Result<()> {
+/// // y′ = −y + u.
+/// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+/// let model = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![-1.0, 1.0])?;
+/// let run = Record::new(0.01, vec![vec![0.0; 100], vec![0.0; 100]], None)?;
+/// assert_eq!(ftlm::simulate::equation_error(&model, &run, &Initial::Rest)?, vec![0.0; 100]);
+/// # Ok(())
+/// # }
+/// ```
 pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -> Result<Vec<f64>> {
     equation.check(record.len())?;
     let fixed: Vec<Option<f64>> = equation.coefficients.iter().copied().map(Some).collect();
@@ -275,7 +303,7 @@ pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -
 /// Returns one sample a row for each equation. The values are not finite where Euler's step is unstable.
 ///
 /// # Errors
-/// [`Error::Structure`] naming the equation whose orders are not whole.
+/// [`Error::Structure`] naming the equation whose orders are not whole, and as [`respond`] for equations, signals, step.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -> Result<Vec<Vec<f64>>> {
     check_step(step)?;
@@ -378,6 +406,11 @@ pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -
 /// The divisor 1 − Σ c F^η at z = −1 is 1 − Σ c h^η A(η)/Γ(η+2) with A(η) = 4(1 − 2^{η+2})·ζ(−η−1), the Abel sum of the
 /// alternating kernel (A(1) = 0, A(2) = −1/2). Where it is not positive the scheme has a mode that grows from pulse to
 /// pulse although the model may be stable: the step must be refined. For D²y = −c y the margin is 1 − c·h²/12.
+///
+/// ```
+/// let margin = ftlm::simulate::nyquist_margin(&[(-12.0, 2.0)], 0.5);
+/// assert!((margin - 0.75).abs() < 1e-12);
+/// ```
 #[must_use]
 pub fn nyquist_margin(own_terms: &[(f64, f64)], step: f64) -> f64 {
     1.0 - own_terms

@@ -191,6 +191,34 @@ impl Guard {
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a setting that is not a positive, finite number.
+    ///
+    /// ```
+    /// # fn main() -> ftlm::error::Result<()> {
+    /// use ftlm::rig::guard::{Guard, Settings};
+    /// let mut guard = Guard::new(Settings {
+    ///     step: 0.002,
+    ///     strain_scale: [0.0136, 0.0187],
+    ///     sense_scale: 2.0,
+    ///     command_scale: 0.5,
+    ///     encoder_scale: [1.5e-5, 3.1e-5],
+    ///     current_limit: [0.9, 1.2],
+    ///     slew: [50.0, 80.0],
+    ///     continuous: [0.6, 0.8],
+    ///     thermal_time: 1.0,
+    ///     deflection_limit: [0.09, 0.13],
+    ///     saturation: 9.99,
+    ///     moving_current: 0.25,
+    ///     standstill: 0.5,
+    ///     fastest: 20.0,
+    ///     late_limit: 0.05,
+    ///     missed_limit: 20,
+    ///     filter: None,
+    /// })?;
+    /// // A step of 5 A is slewed to 0.1 A, 50 A/s for 2 ms.
+    /// assert!((guard.command([5.0, 0.0])[0] + 0.2).abs() < 1e-12);
+    /// # Ok(())
+    /// # }
+    /// ```
     pub fn new(settings: Settings) -> Result<Self> {
         settings.check()?;
         let filters = settings.filter.map(|(w, damping)| [Filter::new(w, damping, settings.step); 2]);

@@ -98,6 +98,40 @@ fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
 /// # Errors
 /// A start whose free run is not finite ([`Error::Diverged`]), or that lies outside its coordinates; a model that names
 /// what is not there, experiments that do not fit it ([`FreeModel::check`]).
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::equation::{AffineOrder, Initial};
+/// use ftlm::estimate::output_error::*;
+/// use ftlm::means::point_samples;
+/// use ftlm::regressors::Record;
+/// // D^a y = c u with the truth a = 0.8, c = 3.
+/// let input: Vec<f64> = (0..100).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();
+/// let run = Record::new(0.05, vec![vec![0.0; 100], input], None)?;
+/// let output: Vec<f64> = run.integral(1, 0.8).iter().map(|v| 3.0 * v).collect();
+/// let experiment = Experiment::new(run, 1, vec![point_samples(&output)], vec![1.0])?;
+/// let model = FreeModel {
+///     equations: vec![FreeEquation {
+///         output: 0,
+///         order: AffineOrder { constant: 0.0, weights: vec![1.0] },
+///         terms: vec![(
+///             1,
+///             AffineOrder { constant: 0.0, weights: vec![0.0] },
+///             Monomial { factor: 1.0, powers: vec![(0, 1)] },
+///         )],
+///     }],
+///     order_bounds: vec![(0.1, 2.0)],
+///     coordinates: vec![Coordinate::Logarithm],
+///     delays: vec![],
+///     coupled: false,
+///     initial: Initial::Rest,
+/// };
+/// let start = Point { orders: vec![1.0], coefficients: vec![1.0], delays: vec![] };
+/// let found = fit(&model, &[experiment], &start, Settings::default())?;
+/// assert!((found.point.orders[0] - 0.8).abs() < 1e-6 && (found.point.coefficients[0] - 3.0).abs() < 1e-6);
+/// # Ok(())
+/// # }
+/// ```
 pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
     check_length("orders", model.order_bounds.len(), start.orders.len())?;
     check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;

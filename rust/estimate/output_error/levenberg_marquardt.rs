@@ -147,6 +147,37 @@ fn damped_step(r: &[f64], k: usize, stride: usize, damping: f64) -> Vec<f64> {
 ///
 /// # Errors
 /// As the problem's own at the start; [`Error::Length`] for columns of the Jacobian that do not match the residuals.
+///
+/// ```
+/// use ftlm::error::Result;
+/// use ftlm::estimate::output_error::levenberg_marquardt::{minimise, Problem, Settings};
+///
+/// /// x² − 2.
+/// struct Root;
+///
+/// impl Problem for Root {
+///     type Point = f64;
+///     type Evaluation = [f64; 1];
+///     fn evaluate(&self, x: &f64) -> Result<[f64; 1]> {
+///         Ok([x * x - 2.0])
+///     }
+///     fn residuals<'a>(&self, evaluation: &'a [f64; 1]) -> &'a [f64] {
+///         evaluation
+///     }
+///     fn jacobian(&self, x: &f64, _: &[f64; 1]) -> Result<Vec<Vec<f64>>> {
+///         Ok(vec![vec![2.0 * x]])
+///     }
+///     fn moved(&self, x: &f64, steps: &[f64]) -> (f64, f64) {
+///         (x + steps[0], steps[0].abs())
+///     }
+/// }
+///
+/// # fn main() -> Result<()> {
+/// let found = minimise(&Root, 1.0, Settings::default())?;
+/// assert!((found.point - 2.0_f64.sqrt()).abs() < 1e-9);
+/// # Ok(())
+/// # }
+/// ```
 pub fn minimise<P: Problem>(
     problem: &P,
     start: P::Point,
