@@ -25,7 +25,8 @@ const TERMS_FAR: usize = 8;
 ///
 /// ```
 /// // I^1 of a pulse: half of it within itself, all of it in every later one.
-/// assert_eq!(ftlm::kernels::block_pulse_kernel(1.0, 3, 0.1), [0.05, 0.1, 0.1]);
+/// let kernel = ftlm::kernels::block_pulse_kernel(1.0, 3, 0.1);
+/// assert!(kernel.iter().zip([0.05, 0.1, 0.1]).all(|(v, truth)| (v - truth).abs() < 1e-15));
 /// ```
 #[must_use]
 pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
@@ -282,7 +283,8 @@ pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
 /// Pulse means of `t^exponent`, k = 1 … m, exact to a few ε (exponent > −1).
 ///
 /// ```
-/// assert_eq!(ftlm::kernels::power_means(1.0, 3, 2.0), [1.0, 3.0, 5.0]);
+/// let means = ftlm::kernels::power_means(1.0, 3, 2.0);
+/// assert!(means.iter().zip([1.0, 3.0, 5.0]).all(|(v, truth)| (v - truth).abs() < 1e-14));
 /// ```
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
