@@ -12,7 +12,7 @@ const GROWTH: f64 = 2.0;
 /// 1/D mod z^m, or of D(ρz) with the largest ρ = e^{−γ/m}, γ = 0, 4, 8, …, that keeps it from growing.
 ///
 /// # Errors
-/// [`Error::LeadingZero`] where D starts with zero.
+/// [`LeadingZero`](crate::error::Error::LeadingZero) where D starts with zero.
 #[allow(clippy::cast_precision_loss)]
 pub fn damped_inverse(divisor: &[f64]) -> Result<(Vec<f64>, bool)> {
     let m = divisor.len();

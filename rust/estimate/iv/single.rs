@@ -97,7 +97,7 @@ pub struct Scratch {
 /// covariance of the free coefficients.
 ///
 /// # Errors
-/// [`Error::Singular`] where the instruments do not tell the regressors apart.
+/// [`Singular`](crate::error::Error::Singular) where the instruments do not tell the regressors apart.
 #[allow(clippy::cast_precision_loss)]
 pub fn step(
     sources: &[Source<'_>],
