@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use criterion::{criterion_group, criterion_main, BatchSize, BenchmarkId, Criterion, SamplingMode, Throughput};
 use ftlm::equation::{Equation, Initial, Structure, Term};
-use ftlm::fractional::{block_pulse_kernel, kernel_with_derivative};
+use ftlm::kernels::{block_pulse_kernel, kernel_with_derivative};
 use ftlm::regressors::Record;
 use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis};

@@ -8,7 +8,7 @@ use std::time::Instant;
 use ftlm::equation::{Equation, Initial, Structure, Term};
 use ftlm::estimate::least_squares;
 use ftlm::fft::{self, Bin, Workspace};
-use ftlm::fractional::block_pulse_kernel;
+use ftlm::kernels::block_pulse_kernel;
 use ftlm::operational::{block_pulse_matrix, operational_matrix, operational_matrix_dense};
 use ftlm::regressors::Record;
 use ftlm::search::control::Control;

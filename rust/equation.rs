@@ -3,8 +3,8 @@
 //! An equation is D^α y = Σ_k c_k D^{ν_k} s_k over the signals of a record. Divided by D^α it is a series equation,
 //! y = Σ_k c_k I^{α−ν_k} s_k + initial terms, which is how everything else reads it.
 
-use crate::error::{Error, Result};
-use crate::fractional::{block_pulse_kernel, MAX_ORDER};
+use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
+use crate::kernels::{block_pulse_kernel, MAX_ORDER};
 use crate::series;
 
 /// Orders closer than this are one order: lattices are written in steps, not in rounding errors.
@@ -48,6 +48,59 @@ pub enum Initial {
     Caputo,
     /// These exponents.
     Powers(Vec<f64>),
+}
+
+impl Equation {
+    /// A structure with one finite coefficient a term.
+    ///
+    /// # Errors
+    /// [`Error::Length`], [`Error::NotFinite`].
+    ///
+    /// ```
+    /// use ftlm::equation::{Equation, Structure, Term};
+    /// let structure = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 0, order: 0.5 }] };
+    /// assert!(Equation::new(structure.clone(), vec![-3.0]).is_ok());
+    /// assert!(Equation::new(structure, vec![]).is_err());
+    /// ```
+    pub fn new(structure: Structure, coefficients: Vec<f64>) -> Result<Self> {
+        let equation = Self { structure, coefficients };
+        equation.check_coefficients()?;
+        Ok(equation)
+    }
+
+    /// Refuses an equation that a record of so many signals cannot carry, any of them being an input.
+    ///
+    /// # Errors
+    /// As [`Structure::check`] and [`Equation::new`].
+    pub fn check(&self, signals: usize) -> Result<()> {
+        self.structure.check(signals, |_| true)?;
+        self.check_coefficients()
+    }
+
+    fn check_coefficients(&self) -> Result<()> {
+        check_length("coefficients", self.structure.terms.len(), self.coefficients.len())?;
+        check_finite("coefficients", &self.coefficients)
+    }
+}
+
+impl Initial {
+    /// Refuses exponents whose power of t has no mean over the first pulse.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for an exponent of −1 or less, [`Error::NotFinite`].
+    pub fn check(&self) -> Result<()> {
+        let Self::Powers(exponents) = self else { return Ok(()) };
+        check_finite("exponents of the initial terms", exponents)?;
+        match exponents.iter().find(|&&e| e <= -1.0) {
+            None => Ok(()),
+            Some(&bad) => Err(Error::OutOfRange {
+                name: "exponent of an initial term".into(),
+                value: bad,
+                range: "(-1, ∞)".into(),
+                remedy: "t to this power has no mean over the first pulse".into(),
+            }),
+        }
+    }
 }
 
 impl Structure {
@@ -189,11 +242,29 @@ pub struct Filter {
 }
 
 impl Filter {
-    /// The filter as a series of m pulses, at rest before the record.
+    /// The filter as a series of m pulses of `step` s, at rest before the record. O(terms · m + m log² m).
     ///
     /// # Errors
-    /// An improper filter, an order outside [0, 3], or a denominator that starts with zero.
+    /// An improper filter, an order outside [0, 3], a denominator that starts with zero, a number that is not finite, a
+    /// step that is not positive, more points than memory holds.
+    ///
+    /// ```
+    /// # fn main() -> ftlm::error::Result<()> {
+    /// use ftlm::equation::Filter;
+    /// // 1/(D + 1): a unit step rises like 1 − e^{−t}.
+    /// let low_pass = Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 1.0), (1.0, 0.0)] };
+    /// let rise: f64 = low_pass.series(100, 0.01)?.iter().sum();
+    /// assert!((rise - (1.0 - (-0.995_f64).exp())).abs() < 1e-4);
+    /// # Ok(())
+    /// # }
+    /// ```
     pub fn series(&self, m: usize, step: f64) -> Result<Vec<f64>> {
+        check_points("m", m)?;
+        check_step(step)?;
+        for terms in [&self.numerator, &self.denominator] {
+            let coefficients: Vec<f64> = terms.iter().map(|t| t.0).collect();
+            check_finite("coefficients of the sensor filter", &coefficients)?;
+        }
         let highest = self.denominator.iter().map(|t| t.1).fold(0.0, f64::max);
         let mut parts = [vec![0.0; m], vec![0.0; m]];
         for (part, terms) in parts.iter_mut().zip([&self.numerator, &self.denominator]) {

@@ -161,6 +161,11 @@ pub type Result<T> = std::result::Result<T, Error>;
 ///
 /// # Errors
 /// [`Error::NotFinite`] with the first bad index and the count.
+///
+/// ```
+/// let error = ftlm::error::check_finite("x", &[0.0, f64::NAN]).unwrap_err();
+/// assert!(error.to_string().starts_with("x is not finite at index 1"));
+/// ```
 pub fn check_finite(name: &str, values: &[f64]) -> Result<()> {
     match values.iter().position(|v| !v.is_finite()) {
         None => Ok(()),
@@ -199,4 +204,45 @@ pub fn check_step(step: f64) -> Result<()> {
             remedy: "give the sampling step in seconds".into(),
         })
     }
+}
+
+/// Most points of a series or a record: a hundred times the longest runs, a gigabyte a signal, and far below 2³¹, where
+/// the tables of prime divisors end. More is a slip of the hand that would exhaust memory.
+pub const MOST_POINTS: usize = 1 << 27;
+
+/// Refuses a number of points beyond [`MOST_POINTS`].
+///
+/// # Errors
+/// [`Error::OutOfRange`].
+pub fn check_points(name: &str, m: usize) -> Result<()> {
+    if m <= MOST_POINTS {
+        return Ok(());
+    }
+    #[allow(clippy::cast_precision_loss)]
+    Err(Error::OutOfRange {
+        name: name.to_owned(),
+        value: m as f64,
+        range: format!("[0, {MOST_POINTS}]"),
+        remedy: "ask for as many points as the record has".into(),
+    })
+}
+
+/// Largest side of a dense matrix: two gigabytes. They are for study.
+pub const LARGEST_DENSE: usize = 1 << 14;
+
+/// Refuses a dense matrix without rows, or with more than [`LARGEST_DENSE`].
+///
+/// # Errors
+/// [`Error::OutOfRange`].
+pub fn check_dense(m: usize) -> Result<()> {
+    if (1..=LARGEST_DENSE).contains(&m) {
+        return Ok(());
+    }
+    #[allow(clippy::cast_precision_loss)]
+    Err(Error::OutOfRange {
+        name: "m".into(),
+        value: m as f64,
+        range: format!("[1, {LARGEST_DENSE}]"),
+        remedy: "dense matrices are for study; apply the operator as a series instead".into(),
+    })
 }

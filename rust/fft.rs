@@ -7,7 +7,8 @@
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, OnceLock};
 
-use realfft::{num_complex::Complex, ComplexToReal, RealFftPlanner, RealToComplex};
+pub use realfft::num_complex::Complex;
+use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
 
 /// One complex number of a spectrum.
 pub type Bin = Complex<f64>;
@@ -44,7 +45,15 @@ pub fn fast_length(n: usize) -> usize {
     }
 }
 
-/// The plan of a length, made once per process.
+/// The plan of a length, made once per process; [`fast_length`] gives good ones.
+///
+/// ```
+/// use ftlm::fft::{plan, Complex, Workspace};
+/// let plan = plan(4);
+/// let (mut time, mut spectrum) = (vec![1.0, 2.0, 3.0, 4.0], vec![Complex::default(); plan.bins()]);
+/// plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+/// assert_eq!(spectrum[0], Complex::new(10.0, 0.0));
+/// ```
 #[must_use]
 pub fn plan(len: usize) -> Plan {
     static PLANS: OnceLock<Mutex<HashMap<usize, Plan>>> = OnceLock::new();
@@ -91,15 +100,32 @@ impl Plan {
     }
 
     /// Spectrum of `time`, whose content is destroyed. `time` has `len`, `spectrum` has `bins` elements.
+    ///
+    /// # Panics
+    /// For other lengths: a fault of the caller's program, whatever the data.
     pub fn forward(&self, time: &mut [f64], spectrum: &mut [Bin], workspace: &mut Workspace) {
+        self.check(time.len(), spectrum.len());
         let scratch = workspace.at_least(self.forward.get_scratch_len());
-        // Lengths are those of the plan by construction; a mismatch would leave zeros and fail every oracle.
+        // The transform refuses nothing but lengths, which are right.
         let done = self.forward.process_with_scratch(time, spectrum, scratch);
-        debug_assert!(done.is_ok());
+        assert!(done.is_ok(), "the forward transform refused its own lengths");
+    }
+
+    fn check(&self, points: usize, bins: usize) {
+        assert!(
+            points == self.len && bins == self.bins(),
+            "a transform of {} points and {} bins was given {points} and {bins}",
+            self.len,
+            self.bins()
+        );
     }
 
     /// Signal of `spectrum`, divided by the length; the spectrum's content is destroyed.
+    ///
+    /// # Panics
+    /// As [`Plan::forward`].
     pub fn inverse(&self, spectrum: &mut [Bin], time: &mut [f64], workspace: &mut Workspace) {
+        self.check(time.len(), spectrum.len());
         // The transform refuses an imaginary part in the two bins that a real signal keeps real.
         if let Some(first) = spectrum.first_mut() {
             first.im = 0.0;
@@ -111,7 +137,7 @@ impl Plan {
         }
         let scratch = workspace.at_least(self.inverse.get_scratch_len());
         let done = self.inverse.process_with_scratch(spectrum, time, scratch);
-        debug_assert!(done.is_ok());
+        assert!(done.is_ok(), "the inverse transform refused its own lengths");
         #[allow(clippy::cast_precision_loss)]
         let scale = 1.0 / self.len as f64;
         for value in time {

@@ -1,6 +1,6 @@
 //! The fast Haar transform and the dense Haar matrix: an orthogonal change of basis of pulse means.
 
-use crate::error::{Error, Result};
+use crate::error::{check_dense, Error, Result};
 
 /// Refuses a length that is no power of two.
 ///
@@ -22,6 +22,15 @@ pub fn check_power_of_two(m: usize) -> Result<()> {
 ///
 /// # Errors
 /// [`Error::NotPowerOfTwo`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// let mut f = [1.0, 1.0, 1.0, 1.0];
+/// ftlm::haar::transform(&mut f)?;
+/// assert!((f[0] - 2.0).abs() < 1e-15 && f[1..] == [0.0; 3]);
+/// # Ok(())
+/// # }
+/// ```
 pub fn transform(f: &mut [f64]) -> Result<()> {
     check_power_of_two(f.len())?;
     let mut scratch = vec![0.0; f.len()];
@@ -71,6 +80,7 @@ pub(crate) fn forward(f: &mut [f64], scratch: &mut [f64]) {
 #[allow(clippy::cast_precision_loss)]
 pub fn matrix(m: usize) -> Result<Vec<f64>> {
     check_power_of_two(m)?;
+    check_dense(m)?;
     let mut phi = vec![0.0; m * m];
     let unit = 1.0 / (m as f64).sqrt();
     phi[..m].fill(unit);

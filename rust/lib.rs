@@ -3,26 +3,53 @@
 //! The modules in the order in which a measurement passes them:
 //!
 //! 1. [`means`]: point samples become means over block pulses;
-//! 2. [`fractional`], [`series`], [`haar`], [`operational`]: fractional integrals as truncated power series in the
-//!    one-step delay, and the operational matrices of the literature beside them ([`fft`] and [`dense`] serve them);
+//! 2. [`kernels`], [`fractional`], [`series`], [`haar`], [`operational`]: fractional integrals as truncated power series
+//!    in the one-step delay, and the operational matrices of the literature beside them ([`fft`] and [`dense`] serve
+//!    them);
 //! 3. [`equation`]: terms, orders, order laws, sensor filters;
 //! 4. [`regressors`]: a record and an equation become regressors I^{α−ν} s;
-//! 5. [`estimate`]: coefficients at given orders, by least squares and multi-innovation least squares ([`small`]);
+//! 5. [`estimate`]: coefficients at given orders by least squares, multi-innovation least squares and instrumental
+//!    variables; orders and coefficients together by joint output error ([`small`] and [`memory`] serve them);
 //! 6. [`search`]: the orders themselves, exhaustively over a lattice;
 //! 7. [`simulate`], [`metrics`]: free runs, the two errors, and what they amount to.
 //!
-//! Runs come from a file or from a rig: [`virtual_arm`] is the arm itself, with its past in bounded [`memory`];
-//! [`guard`] stands between commands and motors.
+//! ```
+//! use ftlm::equation::{Equation, Initial, Structure, Term};
+//! use ftlm::estimate::least_squares;
+//! use ftlm::regressors::Record;
+//! use ftlm::simulate;
 //!
-//! The mathematics knows no file, no clock (but for the pace of the virtual rig) and no Python; bindings live behind the feature `python`.
+//! # fn main() -> ftlm::error::Result<()> {
+//! // D^1.5 y = −4 D^0.5 y + 2 u, driven by a square wave.
+//! let terms = vec![Term { signal: 0, order: 0.5 }, Term { signal: 1, order: 0.0 }];
+//! let plant = Equation::new(Structure { output: 0, order: 1.5, terms }, vec![-4.0, 2.0])?;
+//! let input: Vec<f64> = (0..400).map(|k| if k % 100 < 50 { 1.0 } else { -1.0 }).collect();
+//! let driven = Record::new(0.01, vec![vec![0.0; 400], input.clone()], None)?;
+//! let output = simulate::respond(std::slice::from_ref(&plant), &driven, &[])?.remove(0);
+//!
+//! let run = Record::new(0.01, vec![output, input], None)?;
+//! let found = least_squares::fit(&[run], &plant.structure, &[None, None], &Initial::Rest)?;
+//! assert!((found.coefficients[0] + 4.0).abs() < 1e-9);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! # Features
+//!
+//! None is on by default. `rig`: [`rig`], the simulated arm and the guard between commands and motors. `oracles`: the slow
+//! computations by definition that tests compare the fast ones with. `python`: the bindings, with both of these.
+//!
+//! The mathematics knows no file, no clock (but for the pace of the virtual rig) and no Python.
 #![forbid(unsafe_op_in_unsafe_fn)]
 #![cfg_attr(not(feature = "python"), forbid(unsafe_code))]
+#![cfg_attr(docsrs, feature(doc_cfg))]
 
 pub mod error;
 pub mod means;
 
 pub mod fractional;
 pub mod haar;
+pub mod kernels;
 pub mod operational;
 pub mod series;
 
@@ -34,6 +61,7 @@ pub mod equation;
 pub mod regressors;
 
 pub mod estimate;
+pub mod memory;
 pub mod small;
 
 pub mod search;
@@ -41,9 +69,8 @@ pub mod search;
 pub mod metrics;
 pub mod simulate;
 
-pub mod guard;
-pub mod memory;
-pub mod virtual_arm;
+#[cfg(feature = "rig")]
+pub mod rig;
 
 #[cfg(feature = "python")]
 mod python;

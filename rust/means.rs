@@ -3,7 +3,7 @@
 //! Row j of a record holds t = jh. An input that is a command is held over [jh, (j+1)h); a measured signal is read at
 //! jh and taken as linear in between. Samples taken for means bias every estimate, so this step is never skipped.
 
-use crate::error::{Error, Result};
+use crate::error::{check_finite, check_points, Error, Result};
 
 /// What a signal does between two samples.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -20,7 +20,16 @@ pub enum Intersample {
 /// inter-sample behaviour, less integrates it exactly.
 ///
 /// # Errors
-/// Fewer than two samples, or m = 0.
+/// Fewer than two samples, m = 0 or beyond memory, a sample that is not finite.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::means::{pulse_means, Intersample};
+/// assert_eq!(pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Linear)?, [0.5, 2.0]);
+/// assert_eq!(pulse_means(&[0.0, 1.0, 3.0], 2, Intersample::Hold)?, [0.0, 1.0]);
+/// # Ok(())
+/// # }
+/// ```
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Vec<f64>> {
     let Some(intervals) = samples.len().checked_sub(1).filter(|&n| n > 0) else {
@@ -34,6 +43,8 @@ pub fn pulse_means(samples: &[f64], m: usize, between: Intersample) -> Result<Ve
             remedy: "ask for at least one pulse".into(),
         });
     }
+    check_points("m", m)?;
+    check_finite("samples", samples)?;
     // Integral over interval j from its start to a fraction x of it.
     let partial = |j: usize, x: f64| match between {
         Intersample::Hold => samples[j] * x,
@@ -84,7 +95,14 @@ fn slice_integral(samples: &[f64], between: Intersample, j: usize, a: f64, b: f6
 /// Exact means of a held command after a delay of (d+φ)h. `before` stands for the samples before the record.
 ///
 /// # Errors
-/// A delay that is negative or not finite.
+/// A delay that is negative or not finite, a sample that is not finite.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// assert_eq!(ftlm::means::delayed(&[1.0, 2.0, 3.0], 1.5, 0.0)?, [0.0, 0.5, 1.5]);
+/// # Ok(())
+/// # }
+/// ```
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss, clippy::cast_precision_loss)]
 pub fn delayed(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64>> {
     if !(delay >= 0.0 && delay.is_finite()) {
@@ -95,6 +113,8 @@ pub fn delayed(samples: &[f64], delay: f64, before: f64) -> Result<Vec<f64>> {
             remedy: "an input acts after it is given".into(),
         });
     }
+    check_finite("samples", samples)?;
+    check_finite("before", &[before])?;
     let whole = delay.floor();
     let fraction = delay - whole;
     let whole = whole.min(samples.len() as f64) as usize;

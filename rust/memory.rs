@@ -5,7 +5,7 @@
 //! needs one number of state a signal. What lies below the lowest rate is a geometric series and is put on four rates
 //! near zero with its first four moments kept. The rates do not depend on q: all orders on one signal share its states.
 
-use crate::error::{Error, Result};
+use crate::error::{check_finite, Error, Result};
 
 /// The lowest rate of the rule times the longest lag: below it four moments are enough (1e−3⁴/4! < 1e−13).
 const SLOWEST: f64 = 1e-3;
@@ -49,6 +49,9 @@ impl Rates {
         let lowest = SLOWEST / longest;
         // Past this rate a lag of `shortest` leaves less than the tolerance even against t^{q−1} at q near 1.
         let highest = (digits + 8.0) / shortest;
+        if !(highest / lowest).is_finite() {
+            return Err(bad("longest lag", longest, "a range that floating point holds"));
+        }
         #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
         let count = (libm::log(highest / lowest) / spacing).ceil() as usize + 1;
         let mut rates: Vec<f64> = TAIL.iter().map(|f| f * lowest).collect();
@@ -122,4 +125,43 @@ pub fn decay(x: f64) -> (f64, f64, f64) {
     }
     let square = x * x;
     (keep, (1.0 - keep * (1.0 + x)) / square, (x - 1.0 + keep) / square)
+}
+
+/// I^q of a signal that is linear between its samples, sample by sample through the exponentials, and how many numbers
+/// held its past. O(samples · rates).
+///
+/// # Errors
+/// An order outside (0, 1], [`Error::NotFinite`], and as [`Rates::new`] for a step or a tolerance.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// // I^1 of t is t²/2.
+/// let ramp: Vec<f64> = (0..=100).map(|k| 0.01 * f64::from(k)).collect();
+/// let (integral, _) = ftlm::memory::integral_by_memory(&ramp, 1.0, 0.01, 1e-9)?;
+/// assert!((integral[100] - 0.5).abs() < 1e-9);
+/// # Ok(())
+/// # }
+/// ```
+pub fn integral_by_memory(x: &[f64], order: f64, step: f64, tolerance: f64) -> Result<(Vec<f64>, usize)> {
+    check_finite("samples", x)?;
+    if !(order > 0.0 && order <= 1.0) {
+        let (range, remedy) = ("(0, 1]".into(), "integrate whole orders apart".into());
+        return Err(Error::OutOfRange { name: "order".into(), value: order, range, remedy });
+    }
+    #[allow(clippy::cast_precision_loss)]
+    let rates = Rates::new(step, step * (x.len() + 1) as f64, tolerance)?;
+    let weights = rates.weights(order);
+    let scale = libm::pow(step, order) / libm::tgamma(order + 2.0);
+    let decays: Vec<_> = rates.rates().iter().map(|s| decay(s * step)).collect();
+    let mut past = vec![0.0; weights.len()];
+    let mut out = vec![0.0; x.len()];
+    for n in 1..x.len() {
+        let mut value = scale * (x[n] + order * x[n - 1]);
+        for ((z, w), (keep, first, last)) in past.iter_mut().zip(&weights).zip(&decays) {
+            value += w * keep * *z;
+            *z = *z * keep + step * (first * x[n - 1] + last * x[n]);
+        }
+        out[n] = value;
+    }
+    Ok((out, past.len()))
 }

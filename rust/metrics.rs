@@ -1,6 +1,6 @@
 //! How far a response is from a measurement: error (45), RMSE (46), NR (47), fit; correlations for residual tests.
 
-use crate::error::{check_length, Error, Result};
+use crate::error::{check_finite, check_length, Error, Result};
 use crate::fft;
 
 /// The four figures of one output over the M pulses of a record.
@@ -19,13 +19,22 @@ pub struct Metrics {
 /// Compares a measurement with residuals e = y − ŷ of the same length. Not finite where the residuals are not.
 ///
 /// # Errors
-/// [`Error::Length`] for nothing, or for lengths that differ.
+/// [`Error::Length`] for nothing, or for lengths that differ; [`Error::NotFinite`] for the measurement.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// let found = ftlm::metrics::metrics(&[1.0, 3.0], &[0.5, -0.5])?;
+/// assert_eq!((found.error, found.rmse, found.nr, found.fit_percent), (1.0, 0.5, 0.5, 50.0));
+/// # Ok(())
+/// # }
+/// ```
 #[allow(clippy::cast_precision_loss)]
 pub fn metrics(measured: &[f64], residuals: &[f64]) -> Result<Metrics> {
     if measured.is_empty() {
         return Err(Error::Length { name: "measured".into(), expected: 1, found: 0 });
     }
     check_length("residuals", measured.len(), residuals.len())?;
+    check_finite("measured", measured)?;
     let m = measured.len() as f64;
     let mean = measured.iter().sum::<f64>() / m;
     let deviation = measured.iter().map(|y| (y - mean) * (y - mean)).sum::<f64>();
@@ -58,13 +67,24 @@ const WINDOW: f64 = 6.0;
 ///
 /// # Errors
 /// [`Error::Length`] where x and y differ in runs or samples, [`Error::OutOfRange`] where a run has no more samples than
-/// `lags`.
+/// `lags`, [`Error::NotFinite`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// let x = [vec![1.0, -1.0, 1.0, -1.0, 1.0, -1.0]];
+/// let found = ftlm::metrics::correlation(&x, &x, 1)?;
+/// assert!((found.values[1] - 1.0).abs() < 1e-12 && found.values[2] < -0.8);
+/// # Ok(())
+/// # }
+/// ```
 #[allow(clippy::cast_precision_loss)]
 pub fn correlation(x: &[Vec<f64>], y: &[Vec<f64>], lags: usize) -> Result<Correlation> {
     check_length("runs", x.len(), y.len())?;
     let shortest = x.iter().map(Vec::len).min().unwrap_or(0);
     for (a, b) in x.iter().zip(y) {
         check_length("samples", a.len(), b.len())?;
+        check_finite("x", a)?;
+        check_finite("y", b)?;
     }
     if shortest <= lags {
         return Err(Error::OutOfRange {
@@ -130,6 +150,7 @@ pub fn covariances(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
 }
 
 /// The same by definition: the oracle of [`covariances`]. O(N lags).
+#[cfg(feature = "oracles")]
 #[must_use]
 pub fn covariances_naive(x: &[f64], y: &[f64], lags: usize) -> Vec<f64> {
     let sum =

@@ -2,18 +2,20 @@
 //!
 //! Identification and simulation never need them: they apply F^η as a series ([`crate::series`]).
 
+#[cfg(feature = "oracles")]
 use crate::dense;
-use crate::error::{check_step, Result};
-use crate::fractional::{block_pulse_kernel, check_order};
+use crate::error::{check_dense, check_step, Result};
 use crate::haar;
+use crate::kernels::{block_pulse_kernel, check_order};
 
 /// Upper-triangular Toeplitz F^η, row-major m × m (paper (32)); `step` = duration / m.
 ///
 /// # Errors
-/// An order outside [0, 3] or a step that is not positive.
+/// An order outside [0, 3], a step that is not positive, m = 0 or beyond memory.
 pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     check_order("order", eta)?;
     check_step(step)?;
+    check_dense(m)?;
     let kernel = block_pulse_kernel(eta, m, step);
     let mut f = vec![0.0; m * m];
     for (i, row) in f.chunks_exact_mut(m).enumerate() {
@@ -29,10 +31,20 @@ pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
 ///
 /// # Errors
 /// As [`block_pulse_matrix`], and m must be a power of two.
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// // The mean of I^1 of one on [0, 2] is 1.
+/// let p = ftlm::operational::operational_matrix(1.0, 2, 1.0)?;
+/// assert!((p[0] - 1.0).abs() < 1e-12);
+/// # Ok(())
+/// # }
+/// ```
 pub fn operational_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     haar::check_power_of_two(m)?;
     check_order("order", eta)?;
     check_step(step)?;
+    check_dense(m)?;
     // sums[k] holds the sums of 2^k successive kernel values, the last of them at n.
     let mut sums = vec![block_pulse_kernel(eta, m, step)];
     let mut width = 1;
@@ -149,6 +161,7 @@ fn table(rows: &Wavelet, columns: &Wavelet, m: usize, entry: impl Fn(usize) -> f
 ///
 /// # Errors
 /// As [`operational_matrix`].
+#[cfg(feature = "oracles")]
 pub fn operational_matrix_dense(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     let phi = haar::matrix(m)?;
     let f = block_pulse_matrix(eta, m, step)?;
@@ -159,6 +172,7 @@ pub fn operational_matrix_dense(eta: f64, m: usize, step: f64) -> Result<Vec<f64
 }
 
 /// In-place transpose in tiles that fit the first-level cache.
+#[cfg(feature = "oracles")]
 fn transpose(a: &mut [f64], m: usize) {
     const TILE: usize = 32;
     for i0 in (0..m).step_by(TILE) {

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use crate::equation::{grains, tidy};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::fractional::{block_pulse_kernel, power_means};
+use crate::kernels::{block_pulse_kernel, power_means};
 use crate::series::{self, Buffers, Kernel};
 
 /// Largest bank kept in memory; beyond it a search refuses to start.

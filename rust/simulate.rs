@@ -1,9 +1,9 @@
 //! Response of an equation and of a coupled model, the two errors of a model, and the explicit Euler baseline.
 
 use crate::equation::{Equation, Initial, Structure, ORDER_GRAIN};
-use crate::error::{check_length, Error, Result};
+use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::estimate::least_squares;
-use crate::fractional::block_pulse_kernel;
+use crate::kernels::block_pulse_kernel;
 use crate::regressors::Record;
 use crate::series;
 
@@ -28,13 +28,20 @@ pub struct OutputFilter<'a> {
 }
 
 /// The series system A y = b of some equations: their outputs are unknown, every other signal is read from the record.
-struct System {
+///
+/// Coefficients may be of any size here, as the steps of an estimator make them; what people give is checked before.
+pub(crate) struct System<'a> {
+    record: &'a Record,
     matrix: Vec<Vec<Vec<f64>>>,
     rhs: Vec<Vec<f64>>,
 }
 
-impl System {
-    fn new(equations: &[Equation], record: &Record) -> Result<Self> {
+impl<'a> System<'a> {
+    /// The system of equations with distinct outputs.
+    ///
+    /// # Errors
+    /// Orders or signals that make no equation, as many coefficients as terms missing, two equations of one output.
+    pub(crate) fn new(equations: &[Equation], record: &'a Record) -> Result<Self> {
         let m = record.m();
         let n = equations.len();
         let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
@@ -51,6 +58,7 @@ impl System {
         for (i, equation) in equations.iter().enumerate() {
             let structure = &equation.structure;
             structure.check(record.len(), |_| true)?;
+            check_length("coefficients", structure.terms.len(), equation.coefficients.len())?;
             matrix[i][i][0] += 1.0;
             for (k, (term, &c)) in structure.terms.iter().zip(&equation.coefficients).enumerate() {
                 let eta = structure.integration(k);
@@ -66,18 +74,46 @@ impl System {
                 }
             }
         }
-        Ok(Self { matrix, rhs })
+        Ok(Self { record, matrix, rhs })
     }
 
-    /// Solution with given initial terms.
-    fn with_initial(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
+    /// The matrix read at ρz, ρ = e^{−decay}, which makes every model stable for a large enough decay [1/pulse].
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn damped(mut self, decay: f64) -> Self {
+        if decay > 0.0 {
+            for series in self.matrix.iter_mut().flatten() {
+                series.iter_mut().enumerate().for_each(|(k, a)| *a *= libm::exp(-decay * k as f64));
+            }
+        }
+        self
+    }
+
+    /// Free run with given initial terms: (exponent, coefficient) pairs per equation, empty at rest.
+    pub(crate) fn respond(&self, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
         let mut rhs = self.rhs.clone();
         for (b, terms) in rhs.iter_mut().zip(initial) {
             for &(exponent, coefficient) in terms {
-                b.iter_mut().zip(record.initial_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
+                b.iter_mut().zip(self.record.initial_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
             }
         }
         self.solve(&rhs)
+    }
+
+    /// Columns of the inverse of the matrix: `[j][i]` is what a unit pulse in the error of equation i does to output j.
+    pub(crate) fn inverse(&self) -> Result<Vec<Vec<Vec<f64>>>> {
+        let n = self.matrix.len();
+        let mut solver = series::Solver::new(&self.matrix)?;
+        let mut out = vec![Vec::with_capacity(n); n];
+        for i in 0..n {
+            let mut unit = vec![vec![0.0; self.record.m()]; n];
+            if let Some(first) = unit[i].first_mut() {
+                *first = 1.0;
+            }
+            for (row, response) in out.iter_mut().zip(solver.solve(&unit)?) {
+                row.push(response);
+            }
+        }
+        Ok(out)
     }
 
     fn solve(&self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
@@ -93,9 +129,40 @@ impl System {
 /// may leave the range of floating point: the values are then not finite. O(n² m log² m).
 ///
 /// # Errors
-/// Orders or signals that make no equation, [`Error::LeadingZero`] where the outputs cannot be solved for.
+/// Orders or signals that make no equation, coefficients missing or not finite, [`Error::LeadingZero`] where the outputs
+/// cannot be solved for.
+///
+/// ```
+/// use ftlm::equation::{Equation, Structure, Term};
+/// use ftlm::regressors::Record;
+/// # fn main() -> ftlm::error::Result<()> {
+/// // y′ = −y + u.
+/// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+/// let model = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![-1.0, 1.0])?;
+/// let run = Record::new(0.01, vec![vec![0.0; 300], vec![1.0; 300]], None)?;
+/// let response = ftlm::simulate::respond(&[model], &run, &[])?;
+/// assert!((response[0][299] - (1.0 - (-2.995_f64).exp())).abs() < 1e-4);
+/// # Ok(())
+/// # }
+/// ```
 pub fn respond(equations: &[Equation], record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
-    System::new(equations, record)?.with_initial(record, initial)
+    checked(equations, record, initial)?.respond(initial)
+}
+
+/// The system of what people give, refused where it is no number.
+fn checked<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, f64)>]) -> Result<System<'a>> {
+    for equation in equations {
+        equation.check(record.len())?;
+    }
+    if !initial.is_empty() {
+        check_length("initial terms", equations.len(), initial.len())?;
+    }
+    for terms in initial {
+        let (exponents, coefficients): (Vec<f64>, Vec<f64>) = terms.iter().copied().unzip();
+        check_finite("coefficients of the initial terms", &coefficients)?;
+        Initial::Powers(exponents).check()?;
+    }
+    System::new(equations, record)
 }
 
 /// Free run of a damped copy of the equations: the series of their outputs read at ρz, ρ = e^{−decay}, which makes every
@@ -103,20 +170,13 @@ pub fn respond(equations: &[Equation], record: &Record, initial: &[Vec<(f64, f64
 ///
 /// # Errors
 /// As [`respond`].
-#[allow(clippy::cast_precision_loss)]
 pub fn respond_damped(
     equations: &[Equation],
     record: &Record,
     initial: &[Vec<(f64, f64)>],
     decay: f64,
 ) -> Result<Vec<Vec<f64>>> {
-    let mut system = System::new(equations, record)?;
-    if decay > 0.0 {
-        for series in system.matrix.iter_mut().flatten() {
-            series.iter_mut().enumerate().for_each(|(k, a)| *a *= libm::exp(-decay * k as f64));
-        }
-    }
-    system.with_initial(record, initial)
+    checked(equations, record, initial)?.damped(decay).respond(initial)
 }
 
 /// Columns of the inverse of the matrix of the equations: `[j][i]` is what a unit pulse in the error of equation i does
@@ -125,20 +185,7 @@ pub fn respond_damped(
 /// # Errors
 /// As [`respond`].
 pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f64>>>> {
-    let system = System::new(equations, record)?;
-    let n = equations.len();
-    let mut solver = series::Solver::new(&system.matrix)?;
-    let mut out = vec![Vec::with_capacity(n); n];
-    for i in 0..n {
-        let mut unit = vec![vec![0.0; record.m()]; n];
-        if let Some(first) = unit[i].first_mut() {
-            *first = 1.0;
-        }
-        for (row, response) in out.iter_mut().zip(solver.solve(&unit)?) {
-            row.push(response);
-        }
-    }
-    Ok(out)
+    checked(equations, record, &[])?.inverse()
 }
 
 /// Free run whose initial terms are those that bring it closest to the measured outputs.
@@ -154,7 +201,12 @@ pub fn respond_with_initial(
     initial: &Initial,
     filter: Option<OutputFilter<'_>>,
 ) -> Result<Response> {
-    let system = System::new(equations, record)?;
+    let system = checked(equations, record, &[])?;
+    initial.check()?;
+    if let Some(filter) = filter {
+        check_length("filter", record.m(), filter.series.len())?;
+        check_length("filtered outputs", equations.len(), filter.applies.len())?;
+    }
     let n = equations.len();
     let exponents: Vec<Vec<f64>> = equations.iter().map(|e| e.structure.initial_exponents(initial)).collect();
     let through = |mut outputs: Vec<Vec<f64>>| {
@@ -217,9 +269,22 @@ fn weight(y: &[f64]) -> f64 {
 /// least squares at the given coefficients.
 ///
 /// # Errors
-/// Orders or signals that make no equation.
+/// As [`respond`].
+///
+/// ```
+/// use ftlm::equation::{Equation, Initial, Structure, Term};
+/// use ftlm::regressors::Record;
+/// # fn main() -> ftlm::error::Result<()> {
+/// // y′ = −y + u.
+/// let terms = vec![Term { signal: 0, order: 0.0 }, Term { signal: 1, order: 0.0 }];
+/// let model = Equation::new(Structure { output: 0, order: 1.0, terms }, vec![-1.0, 1.0])?;
+/// let run = Record::new(0.01, vec![vec![0.0; 100], vec![0.0; 100]], None)?;
+/// assert_eq!(ftlm::simulate::equation_error(&model, &run, &Initial::Rest)?, vec![0.0; 100]);
+/// # Ok(())
+/// # }
+/// ```
 pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -> Result<Vec<f64>> {
-    equation.structure.check(record.len(), |_| true)?;
+    equation.check(record.len())?;
     let fixed: Vec<Option<f64>> = equation.coefficients.iter().copied().map(Some).collect();
     let records = std::slice::from_ref(record);
     let regression = least_squares::Regression::new(records, &equation.structure, &fixed, initial)?;
@@ -238,15 +303,21 @@ pub fn equation_error(equation: &Equation, record: &Record, initial: &Initial) -
 /// Returns one sample a row for each equation. The values are not finite where Euler's step is unstable.
 ///
 /// # Errors
-/// [`Error::Structure`] naming the equation whose orders are not whole.
+/// [`Error::Structure`] naming the equation whose orders are not whole, and as [`respond`] for equations, signals, step.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 pub fn explicit_euler(equations: &[Equation], signals: &[Vec<f64>], step: f64) -> Result<Vec<Vec<f64>>> {
+    check_step(step)?;
+    for (i, signal) in signals.iter().enumerate() {
+        check_finite(&format!("signal {i}"), signal)?;
+        check_length(&format!("signal {i}"), signals[0].len(), signal.len())?;
+    }
     let whole = |order: f64| (order - order.round()).abs() < ORDER_GRAIN && order >= 0.0;
     let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
     let alpha: Vec<usize> = equations.iter().map(|e| e.structure.order.round() as usize).collect();
     for (i, equation) in equations.iter().enumerate() {
         let structure = &equation.structure;
         structure.check(signals.len(), |s| !outputs.contains(&s))?;
+        equation.check(signals.len())?;
         let fits = |term: &crate::equation::Term| match outputs.iter().position(|&o| o == term.signal) {
             Some(j) => whole(term.order) && (term.order.round() as usize) < alpha[j],
             None => term.order.abs() < ORDER_GRAIN,
@@ -335,6 +406,11 @@ pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -
 /// The divisor 1 − Σ c F^η at z = −1 is 1 − Σ c h^η A(η)/Γ(η+2) with A(η) = 4(1 − 2^{η+2})·ζ(−η−1), the Abel sum of the
 /// alternating kernel (A(1) = 0, A(2) = −1/2). Where it is not positive the scheme has a mode that grows from pulse to
 /// pulse although the model may be stable: the step must be refined. For D²y = −c y the margin is 1 − c·h²/12.
+///
+/// ```
+/// let margin = ftlm::simulate::nyquist_margin(&[(-12.0, 2.0)], 0.5);
+/// assert!((margin - 0.75).abs() < 1e-12);
+/// ```
 #[must_use]
 pub fn nyquist_margin(own_terms: &[(f64, f64)], step: f64) -> f64 {
     1.0 - own_terms

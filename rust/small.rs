@@ -2,7 +2,7 @@
 
 use nalgebra::{DMatrix, DVector};
 
-use crate::error::{Error, Result};
+use crate::error::{check_length, Error, Result};
 use crate::lanes::Lanes;
 
 /// A pivot of a correlation matrix below this marks a regressor that rounding cannot tell from the others:
@@ -12,10 +12,18 @@ pub const PIVOT_FLOOR: f64 = 1e-13;
 /// Row-major inverse of a row-major n × n matrix.
 ///
 /// # Errors
-/// [`Error::LeadingZero`] with the determinant where it is singular.
+/// [`Error::LeadingZero`] with the determinant where it is singular, [`Error::Length`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// assert_eq!(ftlm::small::inverse(&[2.0, 0.0, 0.0, 4.0], 2)?, [0.5, 0.0, 0.0, 0.25]);
+/// # Ok(())
+/// # }
+/// ```
 pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
+    check_length("matrix", n * n, matrix.len())?;
     if n == 1 {
-        let value = matrix.first().copied().unwrap_or(0.0);
+        let value = matrix[0];
         return if value != 0.0 && value.is_finite() {
             Ok(vec![1.0 / value])
         } else {
@@ -33,8 +41,9 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
 /// Row-major inverse of a row-major k × k matrix whose rows and columns may differ in scale by any factor.
 ///
 /// # Errors
-/// [`Error::Singular`] where rounding cannot tell its rows apart.
+/// [`Error::Singular`] where rounding cannot tell its rows apart, [`Error::Length`].
 pub fn scaled_inverse(matrix: &[f64], k: usize) -> Result<Vec<f64>> {
+    check_length("matrix", k * k, matrix.len())?;
     // Rows, then columns, to unit largest element: what is then nearly singular is so whatever the units.
     let largest = |values: &mut dyn Iterator<Item = f64>| values.fold(0.0_f64, |a, v| a.max(v.abs()));
     let mut a = DMatrix::from_row_slice(k, k, matrix);
@@ -157,6 +166,7 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
 }
 
 /// Solution of a symmetric positive definite system by nalgebra's Cholesky factor: the oracle of [`solve_lanes`].
+#[cfg(feature = "oracles")]
 #[must_use]
 pub fn solve_gram_oracle(gram: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
     let k = rhs.len();
@@ -187,23 +197,34 @@ pub struct Recursion {
 
 impl Recursion {
     /// Starts at coefficients `start` with covariance `prior`·I.
-    #[must_use]
-    pub fn new(start: &[f64], prior: f64) -> Self {
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a prior that is not positive and finite.
+    pub fn new(start: &[f64], prior: f64) -> Result<Self> {
         let k = start.len();
-        Self {
+        if !(prior > 0.0 && prior.is_finite()) {
+            return Err(Error::OutOfRange {
+                name: "prior covariance K0".into(),
+                value: prior,
+                range: "(0, ∞)".into(),
+                remedy: "use a large number for a weak prior".into(),
+            });
+        }
+        Ok(Self {
             coefficients: DVector::from_column_slice(start),
             information: DMatrix::from_diagonal_element(k, k, 1.0 / prior),
-        }
+        })
     }
 
     /// One step of (44): the innovation of these rows (newest first or not: the sum does not know).
     ///
     /// # Errors
-    /// [`Error::Diverged`] where the covariance is no longer positive.
+    /// [`Error::Diverged`] where the covariance is no longer positive, [`Error::Length`] for a row of another length.
     pub fn step<'a>(&mut self, rows: impl Iterator<Item = (&'a [f64], f64)> + Clone) -> Result<()> {
         let k = self.coefficients.len();
         let mut gain = DVector::zeros(k);
         for (row, output) in rows.clone() {
+            check_length("row", k, row.len())?;
             let q = DVector::from_column_slice(row);
             gain += &q * (output - q.dot(&self.coefficients));
             self.information.ger(1.0, &q, &q, 1.0);

@@ -2,7 +2,7 @@
 
 use crate::dense;
 use crate::equation::{Initial, Structure};
-use crate::error::{check_length, Error, Result};
+use crate::error::{check_finite, check_length, Error, Result};
 use crate::regressors::Record;
 use crate::small::back_substitute;
 
@@ -38,12 +38,16 @@ impl Regression {
     /// Builds the regressors I^{α−ν} s, and t^e per record, of an equation.
     ///
     /// # Errors
-    /// [`Error::Length`] where `fixed` does not match the terms; no record.
+    /// [`Error::Length`] where `fixed` does not match the terms; no record; a structure that a record cannot carry.
     pub fn new(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Self> {
         check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
         if records.is_empty() {
             return Err(Error::Length { name: "records".into(), expected: 1, found: 0 });
         }
+        let known: Vec<f64> = fixed.iter().flatten().copied().collect();
+        check_finite("fixed coefficients", &known)?;
+        records.iter().try_for_each(|record| structure.check(record.len(), |_| true))?;
+        initial.check()?;
         let exponents = structure.initial_exponents(initial);
         let mut starts = vec![0];
         for record in records {
@@ -103,6 +107,23 @@ impl Regression {
 ///
 /// # Errors
 /// [`Error::Singular`] with the first free term that is a combination of others; [`Error::Length`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::equation::{Initial, Structure, Term};
+/// use ftlm::estimate::least_squares;
+/// use ftlm::regressors::Record;
+/// let input: Vec<f64> = (0..64).map(|k| f64::from(k % 7)).collect();
+/// let record = Record::new(0.1, vec![vec![0.0; 64], input.clone()], None)?;
+/// // y = 3 I^0.5 u.
+/// let output = record.integral(1, 0.5).iter().map(|v| 3.0 * v).collect();
+/// let run = Record::new(0.1, vec![output, input], None)?;
+/// let structure = Structure { output: 0, order: 0.5, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// let found = least_squares::fit(&[run], &structure, &[None], &Initial::Rest)?;
+/// assert!((found.coefficients[0] - 3.0).abs() < 1e-12);
+/// # Ok(())
+/// # }
+/// ```
 pub fn fit(records: &[Record], structure: &Structure, fixed: &[Option<f64>], initial: &Initial) -> Result<Estimate> {
     let regression = Regression::new(records, structure, fixed, initial)?;
     let (solution, dropped) = solve(&regression.columns, &regression.target, regression.free())?;
@@ -116,6 +137,7 @@ pub fn fit(records: &[Record], structure: &Structure, fixed: &[Option<f64>], ini
 /// [`Error::Singular`].
 pub fn solve(columns: &[Vec<f64>], target: &[f64], needed: usize) -> Result<(Vec<f64>, Vec<usize>)> {
     let k = columns.len();
+    columns.iter().try_for_each(|column| check_length("column", target.len(), column.len()))?;
     if k == 0 {
         return Ok((Vec::new(), Vec::new()));
     }

@@ -68,6 +68,25 @@ impl Innovation {
 ///
 /// # Errors
 /// Settings out of range, m not a power of two where Haar rows are asked for, [`Error::Length`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::equation::{Initial, Structure, Term};
+/// use ftlm::estimate::multi_innovation::{closed_form, recursion, Innovation, Rows};
+/// use ftlm::regressors::Record;
+/// let input: Vec<f64> = (0..64).map(|k| f64::from(k % 7)).collect();
+/// let driven = Record::new(0.1, vec![vec![0.0; 64], input.clone()], None)?;
+/// let output = driven.integral(1, 0.5).iter().map(|v| 3.0 * v).collect();
+/// let run = [Record::new(0.1, vec![output, input], None)?];
+/// let structure = Structure { output: 0, order: 0.5, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// let innovation = Innovation { length: 4, prior_covariance: 1e6, rows: Rows::Time };
+/// let end = closed_form(&run, &structure, &[None], &Initial::Rest, &innovation)?;
+/// let (last, trace) = recursion(&run, &structure, &[None], &Initial::Rest, &innovation)?;
+/// assert_eq!(trace.len(), 64);
+/// assert!((end.coefficients[0] - last.coefficients[0]).abs() < 1e-9);
+/// # Ok(())
+/// # }
+/// ```
 pub fn closed_form(
     records: &[Record],
     structure: &Structure,
@@ -118,7 +137,7 @@ pub fn recursion(
 ) -> Result<(Estimate, Vec<Vec<f64>>)> {
     let regression = rows(records, structure, fixed, initial, innovation)?;
     let k = regression.columns.len();
-    let mut state = Recursion::new(&vec![0.0; k], innovation.prior_covariance);
+    let mut state = Recursion::new(&vec![0.0; k], innovation.prior_covariance)?;
     let end = regression.target.len();
     let matrix: Vec<Vec<f64>> = (0..end).map(|i| regression.columns.iter().map(|c| c[i]).collect()).collect();
     let mut trace = Vec::with_capacity(end);

@@ -7,7 +7,8 @@
 
 use crate::equation::Structure;
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::fractional::block_pulse_kernel;
+use crate::estimate::multi_innovation::{Innovation, Rows};
+use crate::kernels::block_pulse_kernel;
 use crate::memory::{decay, Rates};
 use crate::small::Recursion;
 
@@ -114,7 +115,20 @@ impl Streaming {
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a step, length, prior or order of an integral that cannot be used;
-    /// [`Error::Length`] where `fixed` does not match the terms.
+    /// [`Error::Length`] where `fixed` does not match the terms; [`Error::Structure`] for a signal that is not there.
+    ///
+    /// ```
+    /// # fn main() -> ftlm::error::Result<()> {
+    /// use ftlm::equation::{Structure, Term};
+    /// use ftlm::estimate::streaming::Streaming;
+    /// // y = c I^1 u, sampled every 0.1 s.
+    /// let structure = Structure { output: 0, order: 1.0, terms: vec![Term { signal: 1, order: 0.0 }] };
+    /// let mut stream = Streaming::new(0.1, 50, &[false, true], &[(structure, vec![None])], 1, 1e6)?;
+    /// (0..50).try_for_each(|k| stream.push(&[0.3 * f64::from(k), 1.0]))?;
+    /// assert!((stream.coefficients()[0][0] - 3.0).abs() < 1e-3);
+    /// # Ok(())
+    /// # }
+    /// ```
     pub fn new(
         step: f64,
         longest: usize,
@@ -124,11 +138,15 @@ impl Streaming {
         prior: f64,
     ) -> Result<Self> {
         check_step(step)?;
+        Innovation { length, prior_covariance: prior, rows: Rows::Time }.check()?;
         #[allow(clippy::cast_precision_loss)]
         let rates = Rates::new(step, step * (longest.max(2) as f64), TOLERANCE)?;
         let mut fits = Vec::with_capacity(equations.len());
         for (structure, fixed) in equations {
+            structure.check(inputs.len(), |s| inputs[s])?;
             check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
+            let known: Vec<f64> = fixed.iter().flatten().copied().collect();
+            check_finite("fixed coefficients", &known)?;
             let integrals = structure
                 .terms
                 .iter()
@@ -140,8 +158,8 @@ impl Streaming {
                 output: structure.output,
                 integrals,
                 fixed: fixed.clone(),
-                recursion: Recursion::new(&vec![0.0; free], prior),
-                rows: Vec::with_capacity(length),
+                recursion: Recursion::new(&vec![0.0; free], prior)?,
+                rows: Vec::new(),
                 at: 0,
             });
         }

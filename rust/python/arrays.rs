@@ -4,7 +4,7 @@ use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArra
 use pyo3::prelude::*;
 
 use crate::equation::{Equation, Initial, Structure, Term};
-use crate::error::{check_finite, Error};
+use crate::error::check_finite;
 use crate::regressors::Record;
 
 /// (step, signals as rows, series of the sensor filter or None).
@@ -54,31 +54,18 @@ pub fn equations(arguments: Vec<EquationArg>, signals: usize, inputs: &[bool]) -
         .map(|(s, coefficients)| {
             // A model that was estimated under an order law may have an order a little below 0; it is simulated as it is.
             let structure = structure(s, signals, &vec![true; inputs.len()])?;
-            if coefficients.len() != structure.terms.len() {
-                let (expected, found) = (structure.terms.len(), coefficients.len());
-                return Err(Error::Length { name: "coefficients".into(), expected, found }.into());
-            }
-            check_finite("coefficients", &coefficients)?;
-            Ok(Equation { structure, coefficients })
+            Ok(Equation::new(structure, coefficients)?)
         })
         .collect()
 }
 
 pub fn initial(argument: InitialArg) -> PyResult<Initial> {
-    check_finite("exponents of the initial terms", &argument.1)?;
-    if let Some(&bad) = argument.1.iter().find(|&&e| e <= -1.0) {
-        return Err(Error::OutOfRange {
-            name: "exponent of an initial term".into(),
-            value: bad,
-            range: "(-1, ∞)".into(),
-            remedy: "t to this power has no mean over the first pulse".into(),
-        }
-        .into());
-    }
-    Ok(match argument {
-        (true, _) => Initial::Caputo,
-        (false, powers) if powers.is_empty() => Initial::Rest,
-        (false, powers) => Initial::Powers(powers),
+    let powers = Initial::Powers(argument.1);
+    powers.check()?;
+    Ok(match powers {
+        _ if argument.0 => Initial::Caputo,
+        Initial::Powers(powers) if powers.is_empty() => Initial::Rest,
+        powers => powers,
     })
 }
 

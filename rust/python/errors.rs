@@ -31,9 +31,18 @@ fn raise(class: &str, message: String) -> PyErr {
     })
 }
 
-/// Runs detached from Python; a panic becomes InternalError.
+/// The one way into the core for what computes: runs detached from Python; a panic becomes InternalError.
+///
+/// Every `#[pyfunction]` and every method converts its arguments and then makes a single call of this or of [`attached`];
+/// `tests/rust/bindings.rs` sees to it.
 pub fn detached<T: Send>(py: Python<'_>, work: impl FnOnce() -> Result<T, Error> + Send) -> PyResult<T> {
     Ok(py.detach(|| caught(work))?)
+}
+
+/// The one way in for what takes microseconds, between two samples of a rig say, where letting go of Python would cost
+/// more than the work: runs attached; a panic becomes InternalError.
+pub fn attached<T>(work: impl FnOnce() -> Result<T, Error>) -> PyResult<T> {
+    Ok(caught(work)?)
 }
 
 /// Runs; a panic becomes [`Error::Internal`].

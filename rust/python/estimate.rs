@@ -5,15 +5,13 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::arrays::{initial, record, records, rows, stacked, structure, vector, InitialArg, RecordArg, StructureArg};
-use super::errors::detached;
+use super::errors::{attached, detached};
 use crate::equation::{AffineOrder, Initial};
-use crate::error::{check_finite, check_length, Error};
+use crate::error::Error;
 use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::estimate::streaming::Streaming as StreamingFit;
-use crate::estimate::{
-    instrumental_variables as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint,
-};
+use crate::estimate::{iv as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint};
 
 /// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);
@@ -116,27 +114,11 @@ fn affine((constant, weights): AffineArg) -> AffineOrder {
 }
 
 fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
-    let record = record(&argument.0)?;
-    let every = argument.1;
-    if every == 0 || record.m() % every != 0 {
-        let what = format!("{} pulses are no multiple of {every} a sample interval", record.m());
-        return Err(Error::Structure { what, remedy: "refine every interval alike".into() }.into());
-    }
-    let samples = rows(&argument.2);
-    for (i, row) in samples.iter().enumerate() {
-        check_finite(&format!("samples of output {i}"), row)?;
-    }
-    let filter = match &argument.3 {
-        None => None,
-        Some((series, applies)) => {
-            let series = vector("filter", series)?;
-            check_length("filter", record.m(), series.len())?;
-            check_length("filtered outputs", samples.len(), applies.len())?;
-            Some((series, applies.clone()))
-        }
-    };
-    check_finite("weights", &argument.4)?;
-    Ok(joint::Experiment { record, every, samples, filter, weights: argument.4.clone() })
+    let experiment = joint::Experiment::new(record(&argument.0)?, argument.1, rows(&argument.2), argument.4.clone())?;
+    Ok(match &argument.3 {
+        None => experiment,
+        Some((series, applies)) => experiment.with_filter(vector("filter", series)?, applies.clone())?,
+    })
 }
 
 #[pyfunction]
@@ -156,21 +138,17 @@ pub fn output_error<'py>(
     tolerance: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
-    let (orders, coefficients) = (order_bounds.len(), coordinates.len());
-    let signals = experiments.first().map_or(0, |e| e.record.len());
-    let mut equations = Vec::with_capacity(laws.len());
-    for (output, order, terms) in laws {
-        let mut known = Vec::with_capacity(terms.len());
-        for (signal, order, (factor, powers)) in terms {
-            if signal >= signals || output >= signals || powers.iter().any(|&(i, _)| i >= coefficients) {
-                let what = "an equation names a signal or a coefficient that is not there".to_owned();
-                return Err(Error::Structure { what, remedy: "number them from 0".into() }.into());
-            }
-            check_length("weights of an order", orders, order.1.len())?;
-            known.push((signal, affine(order), joint::Monomial { factor, powers }));
-        }
-        equations.push(joint::FreeEquation { output, order: affine(order), terms: known });
-    }
+    let equations = laws
+        .into_iter()
+        .map(|(output, order, terms)| joint::FreeEquation {
+            output,
+            order: affine(order),
+            terms: terms
+                .into_iter()
+                .map(|(signal, order, (factor, powers))| (signal, affine(order), joint::Monomial { factor, powers }))
+                .collect(),
+        })
+        .collect();
     let coordinates = coordinates
         .iter()
         .map(|name| match name.as_str() {
@@ -183,21 +161,12 @@ pub fn output_error<'py>(
             }),
         })
         .collect::<Result<Vec<_>, _>>()?;
-    let mut start = joint::Point { orders: start_orders, coefficients: start_coefficients, delays: Vec::new() };
-    let mut free = Vec::with_capacity(delays.len());
-    for (signal, bounds, delay) in delays {
-        let known = |i: usize| experiments.iter().all(|e| i < e.record.len());
-        if !known(signal) || equations.iter().any(|e| e.output == signal) {
-            let what = format!("signal {signal} has a free delay and is no input");
-            return Err(Error::Structure { what, remedy: "delay inputs only".into() }.into());
-        }
-        if !(0.0 <= bounds.0 && bounds.0 <= bounds.1 && bounds.1.is_finite() && delay.is_finite()) {
-            let what = format!("bounds {} to {} s of a delay", bounds.0, bounds.1);
-            return Err(Error::Structure { what, remedy: "give two rising times from 0".into() }.into());
-        }
-        free.push(joint::FreeDelay { signal, bounds });
-        start.delays.push(delay);
-    }
+    let start = joint::Point {
+        orders: start_orders,
+        coefficients: start_coefficients,
+        delays: delays.iter().map(|&(_, _, delay)| delay).collect(),
+    };
+    let free = delays.into_iter().map(|(signal, bounds, _)| joint::FreeDelay { signal, bounds }).collect();
     let model =
         joint::FreeModel { equations, order_bounds, coordinates, delays: free, coupled, initial: initial(terms)? };
     let settings = joint::Settings { evaluations, tolerance };
@@ -232,8 +201,9 @@ pub struct Streaming {
 #[pymethods]
 impl Streaming {
     #[new]
-    #[allow(clippy::needless_pass_by_value)]
+    #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn new(
+        py: Python<'_>,
         step: f64,
         longest: usize,
         inputs: Vec<bool>,
@@ -241,12 +211,12 @@ impl Streaming {
         length: usize,
         prior_covariance: f64,
     ) -> PyResult<Self> {
-        Innovation { length, prior_covariance, rows: Rows::Time }.check()?;
         let equations = equations
             .into_iter()
             .map(|(equation, fixed)| Ok((structure(equation, inputs.len(), &inputs)?, fixed)))
             .collect::<PyResult<Vec<_>>>()?;
-        Ok(Self { inner: StreamingFit::new(step, longest, &inputs, &equations, length, prior_covariance)? })
+        let inner = detached(py, || StreamingFit::new(step, longest, &inputs, &equations, length, prior_covariance))?;
+        Ok(Self { inner })
     }
 
     /// Takes samples, shape (n, signals).
@@ -258,12 +228,12 @@ impl Streaming {
     }
 
     #[getter]
-    fn coefficients(&self) -> Vec<Vec<f64>> {
-        self.inner.coefficients()
+    fn coefficients(&self) -> PyResult<Vec<Vec<f64>>> {
+        attached(|| Ok(self.inner.coefficients()))
     }
 
     #[getter]
-    fn pulses(&self) -> usize {
-        self.inner.pulses()
+    fn pulses(&self) -> PyResult<usize> {
+        attached(|| Ok(self.inner.pulses()))
     }
 }

@@ -6,8 +6,9 @@ use pyo3::prelude::*;
 use super::arrays::{columns, matrix, rows, stacked, vector};
 use super::errors::detached;
 use crate::equation::Filter;
-use crate::error::{check_finite, check_length, check_step, Error};
+use crate::error::{check_dense, check_finite, check_length, check_points, check_step, Error};
 use crate::fractional::{self, Derivative, IntegralRule};
+use crate::kernels;
 use crate::means::{self, Intersample};
 use crate::{haar, operational, series};
 
@@ -22,39 +23,23 @@ fn choice(name: &str, given: &str, known: &str) -> Error {
 #[pyo3(signature = (order, m, step, *, derivative = false))]
 pub fn block_pulse_kernel(py: Python<'_>, order: f64, m: usize, step: f64, derivative: bool) -> PyResult<Array<'_>> {
     let kernel = detached(py, || {
-        check_points(m)?;
-        fractional::check_order("order", order)?;
+        check_points("m", m)?;
+        kernels::check_order("order", order)?;
         check_step(step)?;
         Ok(if derivative {
-            fractional::block_pulse_kernel_derivative(order, m, step)
+            kernels::block_pulse_kernel_derivative(order, m, step)
         } else {
-            fractional::block_pulse_kernel(order, m, step)
+            kernels::block_pulse_kernel(order, m, step)
         })
     })?;
     Ok(PyArray1::from_vec(py, kernel))
 }
 
-/// More points than any record has would exhaust memory by a slip of the hand.
-const MOST_POINTS: usize = 1 << 27;
-
-fn check_points(m: usize) -> crate::error::Result<()> {
-    if m > MOST_POINTS {
-        #[allow(clippy::cast_precision_loss)]
-        return Err(Error::OutOfRange {
-            name: "m".into(),
-            value: m as f64,
-            range: format!("[0, {MOST_POINTS}]"),
-            remedy: "ask for as many points as the record has".into(),
-        });
-    }
-    Ok(())
-}
-
 #[pyfunction]
 pub fn grunwald_letnikov_weights(py: Python<'_>, order: f64, m: usize) -> PyResult<Array<'_>> {
     let weights = detached(py, || {
-        check_points(m)?;
-        Ok(fractional::grunwald_letnikov_weights(order, m))
+        check_points("m", m)?;
+        Ok(kernels::grunwald_letnikov_weights(order, m))
     })?;
     Ok(PyArray1::from_vec(py, weights))
 }
@@ -83,22 +68,6 @@ fn transformed<'py>(
         Ok(all)
     })?;
     stacked(py, &all)
-}
-
-/// A dense matrix beyond this would exhaust memory by a slip of the hand.
-const LARGEST_DENSE: usize = 1 << 14;
-
-fn check_dense(m: usize) -> crate::error::Result<()> {
-    if m == 0 || m > LARGEST_DENSE {
-        #[allow(clippy::cast_precision_loss)]
-        return Err(Error::OutOfRange {
-            name: "m".into(),
-            value: m as f64,
-            range: format!("[1, {LARGEST_DENSE}]"),
-            remedy: "dense matrices are for study; apply the operator as a series instead".into(),
-        });
-    }
-    Ok(())
 }
 
 #[pyfunction]
@@ -143,8 +112,10 @@ pub fn series_multiply<'py>(
     naive: bool,
 ) -> PyResult<Array<'py>> {
     let (a, b) = (vector("a", &a)?, vector("b", &b)?);
-    let product =
-        detached(py, || Ok(if naive { series::multiply_naive(&a, &b, m) } else { series::multiply(&a, &b, m) }))?;
+    let product = detached(py, || {
+        check_points("m", m)?;
+        Ok(if naive { series::multiply_naive(&a, &b, m) } else { series::multiply(&a, &b, m) })
+    })?;
     Ok(PyArray1::from_vec(py, product))
 }
 
@@ -231,9 +202,9 @@ pub fn pulse_means<'py>(
 }
 
 #[pyfunction]
-pub fn point_samples<'py>(py: Python<'py>, means: PyReadonlyArray1<'py, f64>) -> Array<'py> {
+pub fn point_samples<'py>(py: Python<'py>, means: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
     let values: Vec<f64> = means.as_array().iter().copied().collect();
-    PyArray1::from_vec(py, means::point_samples(&values))
+    Ok(PyArray1::from_vec(py, detached(py, || Ok(means::point_samples(&values)))?))
 }
 
 #[pyfunction]

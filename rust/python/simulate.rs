@@ -7,7 +7,6 @@ use super::arrays::{
     equations, initial, record, rows, stacked, structure, vector, EquationArg, InitialArg, RecordArg, StructureArg,
 };
 use super::errors::detached;
-use crate::error::{check_finite, check_length, check_step};
 use crate::simulate::{self, OutputFilter};
 
 #[pyfunction]
@@ -40,14 +39,7 @@ pub fn respond_with_initial<'py>(
     let initial = initial(terms)?;
     let filter = filter.map(|(series, applies)| Ok::<_, PyErr>((vector("filter", &series)?, applies))).transpose()?;
     let response = detached(py, || {
-        let filter = match &filter {
-            None => None,
-            Some((series, applies)) => {
-                check_length("filter", record.m(), series.len())?;
-                check_length("filtered outputs", equations.len(), applies.len())?;
-                Some(OutputFilter { series, applies })
-            }
-        };
+        let filter = filter.as_ref().map(|(series, applies)| OutputFilter { series, applies });
         simulate::respond_with_initial(&equations, &record, &initial, filter)
     })?;
     Ok((stacked(py, &response.outputs)?, response.exponents, response.initial))
@@ -79,13 +71,7 @@ pub fn explicit_euler<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let signals = rows(&signals);
     let equations = equations(model, signals.len(), &inputs)?;
-    let outputs = detached(py, || {
-        check_step(step)?;
-        for (i, signal) in signals.iter().enumerate() {
-            check_finite(&format!("signal {i}"), signal)?;
-        }
-        simulate::explicit_euler(&equations, &signals, step)
-    })?;
+    let outputs = detached(py, || simulate::explicit_euler(&equations, &signals, step))?;
     stacked(py, &outputs)
 }
 
@@ -106,19 +92,20 @@ pub fn trace_errors<'py>(
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn nyquist_margin(own_terms: Vec<(f64, f64)>, step: f64) -> f64 {
-    simulate::nyquist_margin(&own_terms, step)
+pub fn nyquist_margin(py: Python<'_>, own_terms: Vec<(f64, f64)>, step: f64) -> PyResult<f64> {
+    detached(py, || Ok(simulate::nyquist_margin(&own_terms, step)))
 }
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn metrics(
+    py: Python<'_>,
     measured: PyReadonlyArray1<'_, f64>,
     residuals: PyReadonlyArray1<'_, f64>,
 ) -> PyResult<(f64, f64, f64, f64)> {
     let measured = vector("measured", &measured)?;
     let residuals: Vec<f64> = residuals.as_array().iter().copied().collect();
-    let found = crate::metrics::metrics(&measured, &residuals)?;
+    let found = detached(py, || crate::metrics::metrics(&measured, &residuals))?;
     Ok((found.error, found.rmse, found.nr, found.fit_percent))
 }
 

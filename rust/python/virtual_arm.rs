@@ -4,10 +4,12 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArr
 use pyo3::prelude::*;
 
 use super::arrays::{stacked, vector};
+use super::errors::{attached, detached};
 use crate::error::{check_length, Error};
-use crate::guard::{self, Fault};
-use crate::memory::{decay, Rates};
-use crate::virtual_arm::{Arm, Injection, Pace, Parameters, Plant, Reading, Sensors, Stage};
+use crate::memory::integral_by_memory;
+use crate::rig::arm::{Arm, Parameters, Stage};
+use crate::rig::guard::{self, Fault};
+use crate::rig::virtual_arm::{Injection, Pace, Plant, Reading, Sensors};
 
 /// Columns of a row: written currents, four angles, two measured currents, delay.
 const COLUMNS: usize = 9;
@@ -68,43 +70,49 @@ pub struct Guard {
 impl Guard {
     #[new]
     fn new(settings: GuardSettings) -> PyResult<Self> {
-        Ok(Self { inner: guard::Guard::new(settings.into())? })
+        attached(|| Ok(Self { inner: guard::Guard::new(settings.into())? }))
     }
 
-    fn rest(&mut self, analog: [f64; 4], counts: [i32; 2], switches: [i8; 4]) {
-        self.inner.rest(&Reading { analog, counts, switches });
+    fn rest(&mut self, analog: [f64; 4], counts: [i32; 2], switches: [i8; 4]) -> PyResult<()> {
+        attached(|| {
+            self.inner.rest(&Reading { analog, counts, switches });
+            Ok(())
+        })
     }
 
-    fn read(&mut self, analog: [f64; 4], counts: [i32; 2], switches: [i8; 4], late: f64) -> [f64; 6] {
-        self.inner.read(&Reading { analog, counts, switches }, late)
+    fn read(&mut self, analog: [f64; 4], counts: [i32; 2], switches: [i8; 4], late: f64) -> PyResult<[f64; 6]> {
+        attached(|| Ok(self.inner.read(&Reading { analog, counts, switches }, late)))
     }
 
-    fn command(&mut self, current: [f64; 2]) -> [f64; 2] {
-        self.inner.command(current)
+    fn command(&mut self, current: [f64; 2]) -> PyResult<[f64; 2]> {
+        attached(|| Ok(self.inner.command(current)))
     }
 
-    fn fail(&mut self, why: String) {
-        self.inner.fail(Fault::Rig(why));
-    }
-
-    #[getter]
-    fn fault(&self) -> Option<String> {
-        self.inner.fault().map(ToString::to_string)
-    }
-
-    #[getter]
-    fn written(&self) -> [f64; 2] {
-        self.inner.written()
+    fn fail(&mut self, why: String) -> PyResult<()> {
+        attached(|| {
+            self.inner.fail(Fault::Rig(why));
+            Ok(())
+        })
     }
 
     #[getter]
-    fn bias(&self) -> [f64; 2] {
-        self.inner.bias()
+    fn fault(&self) -> PyResult<Option<String>> {
+        attached(|| Ok(self.inner.fault().map(ToString::to_string)))
     }
 
     #[getter]
-    fn missed(&self) -> u64 {
-        self.inner.missed()
+    fn written(&self) -> PyResult<[f64; 2]> {
+        attached(|| Ok(self.inner.written()))
+    }
+
+    #[getter]
+    fn bias(&self) -> PyResult<[f64; 2]> {
+        attached(|| Ok(self.inner.bias()))
+    }
+
+    #[getter]
+    fn missed(&self) -> PyResult<u64> {
+        attached(|| Ok(self.inner.missed()))
     }
 }
 
@@ -185,23 +193,37 @@ pub struct VirtualArm {
 #[pymethods]
 impl VirtualArm {
     #[new]
-    fn new(arm: ArmArg, sensors: SensorsArg, step: f64, longest_substep: f64, horizon: f64) -> PyResult<Self> {
-        let arm = Arm::new(&arm.into(), step, longest_substep, horizon)?;
-        Ok(Self { plant: Plant::new(arm, sensors.into()), step, pace: None, rows: Vec::new() })
+    fn new(
+        py: Python<'_>,
+        arm: ArmArg,
+        sensors: SensorsArg,
+        step: f64,
+        longest_substep: f64,
+        horizon: f64,
+    ) -> PyResult<Self> {
+        let (arm, sensors) = (arm.into(), sensors.into());
+        let plant = detached(py, || Plant::new(Arm::new(&arm, step, longest_substep, horizon)?, sensors))?;
+        Ok(Self { plant, step, pace: None, rows: Vec::new() })
     }
 
     /// Counts deadlines from now on, or steps as fast as possible.
-    fn start(&mut self, paced: bool) {
-        self.pace = paced.then(|| Pace::new(self.step));
+    fn start(&mut self, paced: bool) -> PyResult<()> {
+        attached(|| {
+            self.pace = if paced { Some(Pace::new(self.step)?) } else { None };
+            Ok(())
+        })
     }
 
-    fn read(&mut self, noise: [f64; 4]) -> ([f64; 4], [i32; 2], [i8; 4]) {
-        let reading = self.plant.read(noise);
-        (reading.analog, reading.counts, reading.switches)
+    fn read(&mut self, noise: [f64; 4]) -> PyResult<([f64; 4], [i32; 2], [i8; 4])> {
+        let reading = attached(|| Ok(self.plant.read(noise)))?;
+        Ok((reading.analog, reading.counts, reading.switches))
     }
 
-    fn advance(&mut self, volts: [f64; 2], enabled: bool) {
-        self.plant.advance(volts, enabled);
+    fn advance(&mut self, volts: [f64; 2], enabled: bool) -> PyResult<()> {
+        attached(|| {
+            self.plant.advance(volts, enabled);
+            Ok(())
+        })
     }
 
     fn inject(&mut self, what: &str, channel: usize, sample: u64, value: f64) -> PyResult<()> {
@@ -218,8 +240,7 @@ impl VirtualArm {
                 return Err(Error::Structure { what, remedy: "see ftlm.rig.INJECTIONS".into() }.into());
             }
         };
-        self.plant.inject(injection);
-        Ok(())
+        attached(|| self.plant.inject(injection))
     }
 
     /// Samples at rest: readings go to the guard, 0 V to the output.
@@ -233,9 +254,12 @@ impl VirtualArm {
     ) -> PyResult<()> {
         check_length("noise", 4, noise.shape()[1])?;
         for noise in noise.as_array().outer_iter() {
-            self.wait(py);
-            let reading = self.plant.read(std::array::from_fn(|i| noise[i]));
-            guard.inner.rest(&reading);
+            self.wait(py)?;
+            attached(|| {
+                let reading = self.plant.read(std::array::from_fn(|i| noise[i]));
+                guard.inner.rest(&reading);
+                Ok(())
+            })?;
             self.write(output, [0.0; 2])?;
             if guard.inner.fault().is_some() {
                 break;
@@ -259,17 +283,20 @@ impl VirtualArm {
         check_length("noise", 4, noise.ncols())?;
         check_length("noise", commands.nrows(), noise.nrows())?;
         for (command, noise) in commands.outer_iter().zip(noise.outer_iter()) {
-            let late = self.wait(py) + self.plant.delay();
+            let late = self.wait(py)? + self.plant.delay();
             if !self.plant.sampling() {
                 guard.inner.fail(Fault::Rig("the board handed over no sample: samples were lost".into()));
                 self.write(output, [0.0; 2])?;
                 break;
             }
-            let reading = self.plant.read(std::array::from_fn(|i| noise[i]));
-            let v = guard.inner.read(&reading, late);
-            let volts = guard.inner.command([command[0], command[1]]);
-            let [i1, i2] = guard.inner.written();
-            self.rows.push([i1, i2, v[0], v[1], v[2], v[3], v[4], v[5], late]);
+            let volts = attached(|| {
+                let reading = self.plant.read(std::array::from_fn(|i| noise[i]));
+                let v = guard.inner.read(&reading, late);
+                let volts = guard.inner.command([command[0], command[1]]);
+                let [i1, i2] = guard.inner.written();
+                self.rows.push([i1, i2, v[0], v[1], v[2], v[3], v[4], v[5], late]);
+                Ok(volts)
+            })?;
             self.write(output, volts)?;
             if guard.inner.fault().is_some() {
                 break;
@@ -280,7 +307,7 @@ impl VirtualArm {
 
     /// Rows since the last call, shape (n, 9).
     fn take<'py>(&mut self, py: Python<'py>) -> PyResult<Bound<'py, PyArray2<f64>>> {
-        let rows: Vec<Vec<f64>> = std::mem::take(&mut self.rows).iter().map(|r| r.to_vec()).collect();
+        let rows: Vec<Vec<f64>> = attached(|| Ok(std::mem::take(&mut self.rows).iter().map(|r| r.to_vec()).collect()))?;
         if rows.is_empty() {
             return Ok(PyArray2::zeros(py, [0, COLUMNS], false));
         }
@@ -288,34 +315,36 @@ impl VirtualArm {
     }
 
     #[getter]
-    fn sample(&self) -> u64 {
-        self.plant.sample()
+    fn sample(&self) -> PyResult<u64> {
+        attached(|| Ok(self.plant.sample()))
     }
 
     #[getter]
-    fn angles(&self) -> [f64; 4] {
-        self.plant.arm.angles()
+    fn angles(&self) -> PyResult<[f64; 4]> {
+        attached(|| Ok(self.plant.arm.angles()))
     }
 
     #[getter]
-    fn memory(&self) -> usize {
-        self.plant.arm.memory()
+    fn memory(&self) -> PyResult<usize> {
+        attached(|| Ok(self.plant.arm.memory()))
     }
 }
 
 impl VirtualArm {
-    fn wait(&mut self, py: Python<'_>) -> f64 {
+    fn wait(&mut self, py: Python<'_>) -> PyResult<f64> {
         match &mut self.pace {
-            Some(pace) => py.detach(|| pace.wait()),
-            None => 0.0,
+            Some(pace) => detached(py, || Ok(pace.wait())),
+            None => Ok(0.0),
         }
     }
 
     /// Hands volts to the output stage and steps the arm under what the stage lets through.
     fn write(&mut self, output: &Bound<'_, PyAny>, volts: [f64; 2]) -> PyResult<()> {
         let (through, enabled): ([f64; 2], bool) = output.call1((volts[0], volts[1]))?.extract()?;
-        self.plant.advance(through, enabled);
-        Ok(())
+        attached(|| {
+            self.plant.advance(through, enabled);
+            Ok(())
+        })
     }
 }
 
@@ -330,24 +359,6 @@ pub fn fractional_memory<'py>(
     tolerance: f64,
 ) -> PyResult<(Bound<'py, PyArray1<f64>>, usize)> {
     let x = vector("samples", &samples)?;
-    if !(order > 0.0 && order <= 1.0) {
-        let (range, remedy) = ("(0, 1]".into(), "integrate whole orders apart".into());
-        return Err(Error::OutOfRange { name: "order".into(), value: order, range, remedy }.into());
-    }
-    #[allow(clippy::cast_precision_loss)]
-    let rates = Rates::new(step, step * (x.len() + 1) as f64, tolerance)?;
-    let weights = rates.weights(order);
-    let scale = libm::pow(step, order) / libm::tgamma(order + 2.0);
-    let decays: Vec<_> = rates.rates().iter().map(|s| decay(s * step)).collect();
-    let mut past = vec![0.0; weights.len()];
-    let mut out = vec![0.0; x.len()];
-    for n in 1..x.len() {
-        let mut value = scale * (x[n] + order * x[n - 1]);
-        for ((z, w), (keep, first, last)) in past.iter_mut().zip(&weights).zip(&decays) {
-            value += w * keep * *z;
-            *z = *z * keep + step * (first * x[n - 1] + last * x[n]);
-        }
-        out[n] = value;
-    }
-    Ok((PyArray1::from_vec(py, out), past.len()))
+    let (integral, memory) = detached(py, || integral_by_memory(&x, order, step, tolerance))?;
+    Ok((PyArray1::from_vec(py, integral), memory))
 }

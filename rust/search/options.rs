@@ -2,7 +2,7 @@
 
 use crate::equation::Initial;
 use crate::error::{check_finite, Error, Result};
-use crate::estimate::instrumental_variables::Settings;
+use crate::estimate::iv::Settings;
 use crate::estimate::multi_innovation::Innovation;
 
 /// Which error ranks the candidates.

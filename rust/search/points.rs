@@ -6,14 +6,13 @@ use rayon::prelude::*;
 
 use crate::equation::{Structure, Term};
 use crate::error::{check_finite, check_length, Error, Result};
-use crate::fractional::block_pulse_kernel;
+use crate::kernels::block_pulse_kernel;
 use crate::regressors::{Key, Record};
 use crate::search::candidate::march::March;
 use crate::search::control::Control;
 use crate::search::options::Norm;
 use crate::search::outcome::Verdict;
 use crate::search::threads::{pool, PerThread};
-use crate::series;
 
 /// Memory for regressors kept from one call to the next; a population that has settled asks for the same ones again.
 const KEPT_BYTES: usize = 256 << 20;
@@ -202,6 +201,7 @@ impl Points {
 ///
 /// # Panics
 /// Where the record does not hold a signal.
+#[cfg(feature = "oracles")]
 #[must_use]
 pub fn score_naive(record: &Record, output: usize, signals: &[usize], point: &Point) -> f64 {
     let m = record.m();
@@ -212,10 +212,10 @@ pub fn score_naive(record: &Record, output: usize, signals: &[usize], point: &Po
         if signal == output {
             divisor.iter_mut().zip(&kernel).for_each(|(d, v)| *d -= c * v);
         } else {
-            let integral = series::multiply_naive(&kernel, record.signal(signal), m);
+            let integral = crate::series::multiply_naive(&kernel, record.signal(signal), m);
             numerator.iter_mut().zip(integral).for_each(|(n, v)| *n += c * v);
         }
     }
-    series::divide_naive(&numerator, &divisor)
+    crate::series::divide_naive(&numerator, &divisor)
         .map_or(f64::INFINITY, |response| record.signal(output).iter().zip(response).map(|(y, v)| (y - v).abs()).sum())
 }

@@ -395,7 +395,7 @@ fn banks_hold_the_integrals() {
         assert_eq!(bank.column(1), record.signal(1));
         assert_eq!(bank.column(2), record.initial_term(0.9));
         assert!(relative_distance(bank.column(3), &record.integral(2, 1.35)) < 1e-14);
-        assert_eq!(bank.kernel(0), ftlm::fractional::block_pulse_kernel(0.9, 200, 0.02));
+        assert_eq!(bank.kernel(0), ftlm::kernels::block_pulse_kernel(0.9, 200, 0.02));
         assert!([1, 2, 3].iter().all(|&p| bank.kernel(p).is_empty()));
     }
 }

@@ -1,7 +1,8 @@
 //! Fractional integrals, derivatives and responses: their orders of convergence against closed forms.
 
 use ftlm::error::Error;
-use ftlm::fractional::{fractional_derivative, fractional_integral, power_means, Derivative, IntegralRule};
+use ftlm::fractional::{fractional_derivative, fractional_integral, Derivative, IntegralRule};
+use ftlm::kernels::power_means;
 use ftlm::means::point_samples;
 use ftlm::simulate;
 use proptest::prelude::*;

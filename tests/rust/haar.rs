@@ -1,7 +1,7 @@
 //! Haar coordinates and operational matrices: orthogonality, and the fast paths against the dense ones.
 
 use ftlm::error::Error;
-use ftlm::fractional::block_pulse_kernel;
+use ftlm::kernels::block_pulse_kernel;
 use ftlm::{dense, haar, operational, series};
 use proptest::prelude::*;
 

@@ -1,6 +1,6 @@
 //! Kernels of I^η and of ∂/∂η, the digamma function, Grünwald–Letnikov weights and means of powers, against mpmath.
 
-use ftlm::fractional::{
+use ftlm::kernels::{
     block_pulse_kernel, block_pulse_kernel_derivative, digamma, grunwald_letnikov_weights, power_means,
     second_difference,
 };

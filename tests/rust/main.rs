@@ -5,21 +5,24 @@
 
 mod common;
 
+mod bindings;
 mod equation;
 mod estimators;
 mod fractional;
 mod haar;
-mod instrumental_variables;
+mod iv;
+mod joint;
 mod kernels;
+mod levenberg_marquardt;
 mod means;
 mod metrics;
-mod multivariable;
 mod output_error;
 mod plants;
 mod points;
 mod refusals;
 mod rig;
 mod search;
+mod search_refusals;
 mod series;
 mod simulate;
 mod stage;

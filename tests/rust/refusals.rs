@@ -1,208 +1,214 @@
-//! What searches refuse at the door, in words, instead of a panic, a hang or a wrong table later.
+//! What would panic, hang or exhaust memory later is refused at the door, in words.
 
-use std::borrow::Cow;
+use ftlm::equation::{Equation, Filter, Initial};
+use ftlm::error::{check_dense, check_points, Error, MOST_POINTS};
+use ftlm::estimate::iv;
+use ftlm::estimate::least_squares::{self, Regression};
+use ftlm::estimate::output_error::Experiment;
+use ftlm::estimate::streaming::Streaming;
+use ftlm::kernels::digamma;
+use ftlm::means::{delayed, pulse_means, Intersample};
+use ftlm::memory::{integral_by_memory, Rates};
+use ftlm::rig::arm::{Arm, Parameters, Stage};
+use ftlm::rig::virtual_arm::{Injection, Pace, Plant, Sensors};
+use ftlm::simulate::{self, OutputFilter};
+use ftlm::small::{self, Recursion};
+use ftlm::{fft, haar, metrics, operational, series};
 
-use ftlm::equation::{AffineOrder, Initial};
-use ftlm::error::{Error, Result};
-use ftlm::estimate::instrumental_variables::Settings;
-use ftlm::regressors::{Bank, Index, Key, Record};
-use ftlm::search::control::{Checkpoint, Control, Place};
-use ftlm::search::lattice::{Lattice, LawEquation, LawLattice, TermAxis};
-use ftlm::search::options::{Estimator, Options};
-use ftlm::search::outcome::{Counts, Failure, Part, Row, Verdict};
-use ftlm::search::rounds::{rounds, search, waves, Search};
-use ftlm::search::stage::{self, Span, Stage};
-use ftlm::search::threads::{pool, MAX_THREADS};
+use crate::common::{equation, record, structure};
 
-use crate::common::Random;
-
-fn axis(signal: usize, values: &[f64]) -> TermAxis {
-    TermAxis { signal, values: values.to_vec(), interchangeable: true }
-}
-
-fn data() -> Record {
-    let mut random = Random::new(5);
-    Record::new(0.1, vec![random.signal(64), random.signal(64)], None).unwrap()
-}
-
-fn small() -> Lattice {
-    Lattice::new(0, &[1.0, 1.5], &[axis(0, &[0.0, 0.5]), axis(1, &[0.0])], |s| s == 1).unwrap()
-}
-
-fn run(fixed: &[Option<f64>], options: &Options) -> Result<()> {
-    search(&[data()], &small(), fixed, options, &Control::default()).map(|_| ())
-}
-
-#[test]
-fn lattices_refuse_orders_that_are_no_numbers() {
-    for bad in [f64::NAN, f64::INFINITY, f64::NEG_INFINITY] {
-        let found = Lattice::new(0, &[1.0, bad], &[axis(0, &[0.0])], |_| false);
-        assert!(matches!(found, Err(Error::NotFinite { index: 1, .. })));
-        let found = Lattice::new(0, &[1.0], &[axis(1, &[0.0]), axis(0, &[0.0, 0.5, bad])], |_| false);
-        match found {
-            Err(Error::NotFinite { name, index: 2, .. }) => assert_eq!(name, "orders of term 1"),
-            other => panic!("{other:?}"),
-        }
+/// Fails unless this is refused, and with more than a few words.
+#[track_caller]
+fn refused<T>(result: Result<T, Error>) {
+    match result {
+        Ok(_) => panic!("not refused"),
+        Err(Error::Internal { what }) => panic!("a fault: {what}"),
+        Err(error) => assert!(error.to_string().len() > 20, "{error}"),
     }
 }
 
 #[test]
-fn lattices_refuse_more_terms_than_can_be_counted() {
-    let terms = |count: usize| vec![axis(0, &[0.0]); count];
-    // 34 terms of one signal are looked at (and do not fit on one order), 35 are refused.
-    assert!(matches!(Lattice::new(0, &[1.0], &terms(34), |_| false), Err(Error::EmptyLattice { .. })));
-    let found = Lattice::new(0, &[1.0], &terms(35), |_| false);
-    assert!(matches!(found, Err(Error::Structure { what, .. }) if what == "signal 0 has 35 terms, more than 34"));
-    // Products over many signals leave 128 bits.
-    let values: Vec<f64> = (0..5).map(|i| 0.1 * f64::from(i)).collect();
-    let many: Vec<TermAxis> =
-        (0..100).map(|k| TermAxis { signal: 1 + k / 5, values: values.clone(), interchangeable: false }).collect();
-    assert!(matches!(Lattice::new(0, &[1.0], &many, |_| false), Err(Error::LatticeTooLarge { .. })));
+fn lengths_beyond_memory() {
+    for m in [MOST_POINTS + 1, 1 << 31, 1 << 60, usize::MAX] {
+        refused(check_points("m", m));
+        refused(check_dense(m));
+        refused(pulse_means(&[0.0, 1.0], m, Intersample::Hold));
+        refused(Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 1.0)] }.series(m, 0.1));
+        refused(haar::matrix(m));
+        refused(operational::block_pulse_matrix(0.5, m, 0.1));
+        refused(operational::operational_matrix(0.5, m, 0.1));
+    }
+    refused(check_dense(0));
+    check_points("m", MOST_POINTS).unwrap();
 }
 
 #[test]
-fn a_structure_beyond_the_last_is_the_last() {
-    let lattice = small();
-    assert_eq!(lattice.structure(u64::MAX), lattice.structure(lattice.count() - 1));
-}
-
-fn law(constant: f64, weights: &[f64]) -> AffineOrder {
-    AffineOrder { constant, weights: weights.to_vec() }
-}
-
-fn one_law() -> LawEquation {
-    LawEquation { output: 0, order: law(0.0, &[1.0]), terms: vec![(0, law(0.0, &[])), (1, law(0.0, &[]))] }
+fn equations_that_miss_something() {
+    let s = structure(0, 2.0, &[(0, 1.0), (1, 0.0)]);
+    refused(Equation::new(s.clone(), vec![1.0]));
+    refused(Equation::new(s.clone(), vec![1.0, f64::NAN]));
+    let whole = Equation::new(s.clone(), vec![-1.0, 2.0]).unwrap();
+    whole.check(2).unwrap();
+    refused(whole.check(1));
+    let run = record(0.1, vec![vec![0.5; 20], vec![1.0; 20]]);
+    let short = Equation { structure: s.clone(), coefficients: vec![1.0] };
+    let missing = equation(0, 2.0, &[(5, 0.0, 1.0)]);
+    let nan = equation(0, 2.0, &[(1, 0.0, f64::NAN)]);
+    for bad in [&short, &missing, &nan] {
+        let bad = std::slice::from_ref(bad);
+        refused(simulate::respond(bad, &run, &[]));
+        refused(simulate::respond_damped(bad, &run, &[], 0.1));
+        refused(simulate::inverse(bad, &run));
+        refused(simulate::respond_with_initial(bad, &run, &Initial::Rest, None));
+        refused(simulate::equation_error(&bad[0], &run, &Initial::Rest));
+    }
+    let good = std::slice::from_ref(&whole);
+    refused(simulate::respond(good, &run, &[vec![(0.0, f64::NAN)]]));
+    refused(simulate::respond(good, &run, &[vec![(-1.0, 1.0)]]));
+    refused(simulate::respond(good, &run, &[vec![], vec![]]));
+    refused(simulate::respond_with_initial(good, &run, &Initial::Powers(vec![-2.0]), None));
+    let filter = |series, applies| Some(OutputFilter { series, applies });
+    refused(simulate::respond_with_initial(good, &run, &Initial::Rest, filter(&[1.0], &[true])));
+    refused(simulate::respond_with_initial(good, &run, &Initial::Rest, filter(&[1.0; 20], &[])));
+    refused(simulate::explicit_euler(std::slice::from_ref(&short), &[vec![0.0; 5], vec![0.0; 5]], 0.1));
+    let euler = [equation(0, 2.0, &[(1, 0.0, 1.0)])];
+    refused(simulate::explicit_euler(&euler, &[vec![0.0; 5], vec![0.0; 4]], 0.1));
+    refused(simulate::explicit_euler(&euler, &[vec![0.0; 5], vec![f64::NAN; 5]], 0.1));
+    refused(simulate::explicit_euler(&euler, &[vec![0.0; 5], vec![0.0; 5]], 0.0));
 }
 
 #[test]
-fn law_lattices_refuse_what_their_laws_cannot_mean() {
-    let made = |axes: &[Vec<f64>], change: &dyn Fn(&mut LawEquation)| {
-        let mut equation = one_law();
-        change(&mut equation);
-        LawLattice::new(axes, &[equation], &[false, true])
+fn regressions_that_cannot_be_made() {
+    let run = [record(0.1, vec![vec![0.5; 20], vec![1.0; 20]])];
+    let there = structure(0, 1.0, &[(1, 0.0)]);
+    refused(Regression::new(&run, &structure(0, 1.0, &[(7, 0.0)]), &[None], &Initial::Rest).map(|_| ()));
+    refused(Regression::new(&run, &structure(9, 1.0, &[(1, 0.0)]), &[None], &Initial::Rest).map(|_| ()));
+    refused(least_squares::fit(&run, &there, &[Some(f64::NAN)], &Initial::Rest));
+    refused(least_squares::fit(&run, &there, &[None], &Initial::Powers(vec![f64::NAN])));
+    refused(least_squares::fit(&[], &there, &[None], &Initial::Rest));
+    refused(least_squares::solve(&[vec![1.0; 3]], &[1.0; 4], 1));
+    refused(iv::fit(&run, &[], &[], &Initial::Rest, iv::Settings::default()));
+    refused(iv::fit(&run, &[structure(0, 1.0, &[(7, 0.0)])], &[vec![None]], &Initial::Rest, iv::Settings::default()));
+}
+
+#[test]
+fn streams_that_cannot_run() {
+    let s = structure(0, 1.0, &[(1, 0.0)]);
+    let stream = |length, prior, s: &ftlm::equation::Structure, fixed: Option<f64>| {
+        Streaming::new(0.1, 50, &[false, true], &[(s.clone(), vec![fixed])], length, prior)
     };
-    let axes = [vec![1.0, 1.5]];
-    assert!(made(&axes, &|_| {}).is_ok());
-    assert!(matches!(made(&[vec![1.0, f64::NAN]], &|_| {}), Err(Error::NotFinite { index: 1, .. })));
-    assert!(matches!(made(&axes, &|e| e.order.constant = f64::INFINITY), Err(Error::NotFinite { .. })));
-    assert!(matches!(made(&axes, &|e| e.terms[0].1.weights = vec![f64::NAN]), Err(Error::NotFinite { .. })));
-    assert!(matches!(made(&axes, &|e| e.terms[0].1.weights = vec![0.0, 1.0]), Err(Error::Structure { .. })));
-    assert!(matches!(made(&axes, &|e| e.output = 2), Err(Error::Structure { .. })));
-    assert!(matches!(made(&axes, &|e| e.terms[0].0 = 7), Err(Error::Structure { .. })));
-    assert!(matches!(LawLattice::new(&axes, &[], &[false]), Err(Error::Structure { .. })));
+    refused(stream(0, 1.0, &s, None));
+    refused(stream(1, 0.0, &s, None));
+    refused(stream(1, f64::NAN, &s, None));
+    refused(stream(1, 1.0, &structure(0, 1.0, &[(4, 0.0)]), None));
+    refused(stream(1, 1.0, &s, Some(f64::INFINITY)));
+    // Longer than the run is no innovation that memory must hold beforehand.
+    stream(usize::MAX, 1.0, &s, None).unwrap();
 }
 
 #[test]
-fn searches_refuse_settings_out_of_range() {
-    let with = |options: Options| run(&[None; 2], &options);
-    assert!(with(Options::default()).is_ok());
-    assert!(matches!(with(Options { keep: 0, ..Options::default() }), Err(Error::OutOfRange { .. })));
-    for threads in [0, MAX_THREADS + 1, usize::MAX] {
-        assert!(matches!(with(Options { threads, ..Options::default() }), Err(Error::OutOfRange { .. })));
-        assert!(matches!(pool(threads), Err(Error::OutOfRange { .. })));
-    }
-    for (iterations, tolerance) in [(0, 1e-4), (3, f64::NAN), (3, -1.0), (3, f64::INFINITY)] {
-        let estimator = Estimator::InstrumentalVariables(Settings { iterations, tolerance });
-        assert!(matches!(with(Options { estimator, ..Options::default() }), Err(Error::OutOfRange { .. })));
-    }
-    let powers = |powers: &[f64]| Options { initial: Initial::Powers(powers.to_vec()), ..Options::default() };
-    assert!(matches!(with(powers(&[0.0, -1.0])), Err(Error::OutOfRange { .. })));
-    assert!(matches!(with(powers(&[f64::NAN])), Err(Error::NotFinite { .. })));
-    assert!(matches!(run(&[None], &Options::default()), Err(Error::Length { .. })));
-    assert!(matches!(run(&[None, Some(f64::NAN)], &Options::default()), Err(Error::NotFinite { .. })));
-    // As many rows as there are, however many are asked for.
-    let all = Options { keep: usize::MAX, ..Options::default() };
-    let found = search(&[data()], &small(), &[None; 2], &all, &Control::default()).unwrap();
-    assert_eq!(found.counts.kept + found.counts.singular + found.counts.diverged, small().count());
-    assert_eq!((rounds(0, &all), waves(0)), (0, vec![]));
+fn experiments_that_cannot_be_compared() {
+    let run = record(0.1, vec![vec![0.5; 20], vec![1.0; 20]]);
+    let experiment =
+        |every, samples: Vec<f64>, weight| Experiment::new(run.clone(), every, vec![samples], vec![weight]);
+    refused(experiment(0, vec![0.0; 21], 1.0));
+    refused(experiment(3, vec![0.0; 21], 1.0));
+    refused(experiment(1, vec![0.0; 20], 1.0));
+    refused(experiment(1, vec![f64::NAN; 21], 1.0));
+    refused(experiment(1, vec![0.0; 21], f64::NAN));
+    refused(Experiment::new(run.clone(), 1, vec![vec![0.0; 21]], vec![]));
+    let good = experiment(2, vec![0.0; 11], 1.0).unwrap();
+    refused(good.clone().with_filter(vec![1.0], vec![true]));
+    refused(good.clone().with_filter(vec![f64::NAN; 20], vec![true]));
+    refused(good.with_filter(vec![1.0; 20], vec![]));
 }
 
 #[test]
-fn searches_refuse_records_without_their_signals() {
-    let lattice = Lattice::new(0, &[1.0], &[axis(2, &[0.0])], |_| false).unwrap();
-    let found = search(&[data()], &lattice, &[None], &Options::default(), &Control::default());
-    assert!(matches!(found, Err(Error::Structure { .. })));
-    let mut stage = one_law();
-    stage.terms[1].0 = 2;
-    let lattice = LawLattice::new(&[vec![1.0]], &[stage], &[false, false, true]).unwrap();
-    let fixed = [vec![None; 2]];
-    let found = stage::search(&[data()], &lattice, &fixed, &[1.0], &Options::default(), &Control::default());
-    assert!(matches!(found, Err(Error::Structure { .. })));
-    let mut index = Index::default();
-    index.insert(Key::integral(2, 0.5));
-    assert!(matches!(Bank::new(&index, &data(), 0).err(), Some(Error::Structure { .. })));
-    let found = Record::new(0.1, vec![vec![1.0; 2]], Some(vec![1.0, f64::NAN]));
-    assert!(matches!(found, Err(Error::NotFinite { index: 1, .. })));
+fn numbers_that_are_none() {
+    refused(pulse_means(&[0.0, f64::NAN], 2, Intersample::Linear));
+    refused(delayed(&[0.0, f64::NAN], 1.0, 0.0));
+    refused(delayed(&[0.0, 1.0], 1.0, f64::NAN));
+    refused(metrics::metrics(&[f64::NAN], &[0.0]));
+    refused(metrics::correlation(&[vec![f64::NAN; 9]], &[vec![0.0; 9]], 2));
+    refused(Filter { numerator: vec![(f64::NAN, 0.0)], denominator: vec![(1.0, 1.0)] }.series(9, 0.1));
+    refused(Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 1.0)] }.series(9, f64::NAN));
+    refused(Recursion::new(&[0.0], f64::NAN));
+    refused(small::inverse(&[1.0, 2.0], 2));
+    refused(small::scaled_inverse(&[1.0, 2.0], 2));
+    refused(Recursion::new(&[0.0], 1.0).unwrap().step([(&[1.0, 2.0][..], 1.0)].into_iter()));
+    refused(series::divide_naive(&[1.0, 2.0], &[1.0]));
+    refused(Rates::new(1e-300, 1e300, 1e-6));
+    refused(integral_by_memory(&[0.0, f64::NAN], 0.5, 0.1, 1e-6));
+    refused(integral_by_memory(&[0.0, 1.0], 2.0, 0.1, 1e-6));
+    assert!([f64::NAN, -1e300, 0.0].iter().all(|&x| digamma(x).is_nan()));
 }
 
-#[test]
-fn rounds_refuse_what_belongs_to_another_search() {
-    let (lattice, options, control, pool) = (small(), Options::default(), Control::default(), pool(1).unwrap());
-    let ready = Search::new(&[data()], Cow::Borrowed(&lattice), &[None; 2], &options, &pool, &control).unwrap();
-    let refused = |first, last, seed: &[(u64, f64)], from| {
-        let found = ready.rounds(first, last, seed, from, &pool, &control);
-        assert!(matches!(found, Err(Error::Structure { .. })), "{found:?}");
+fn arm(step: f64, substep: f64, horizon: f64) -> Result<Arm, Error> {
+    let stage = Stage {
+        hub_orders: [0.1, 0.95, 0.75],
+        hub: [60.0, -6.0, 1.5, 14.0],
+        deflection_orders: [0.1, 1.05, 0.85],
+        deflection: [-84.0, 6.0, -2.1, -14.0],
+        coulomb: 0.05,
     };
-    let place = Place { round: 0, followed: 0, end: 0, size: 0, limit: f64::INFINITY };
-    assert_eq!(rounds(lattice.count(), &options), 1);
-    refused(0, 2, &[], None);
-    refused(1, 0, &[], None);
-    refused(u64::MAX, u64::MAX, &[], None);
-    refused(0, 1, &[(lattice.count(), 1.0)], None);
-    refused(0, 1, &[(0, f64::NAN)], None);
-    refused(0, 1, &[(0, -1.0)], None);
-    let at = |place| Some(Checkpoint { place, part: Part::default() });
-    for place in [
-        Place { round: 2, ..place },
-        Place { followed: 1, ..place },
-        Place { end: 1, ..place },
-        Place { end: 1, size: 1, limit: f64::NAN, ..place },
-        Place { end: 1, size: 1, limit: -1.0, ..place },
-        Place { end: 1, size: 1, followed: 2, ..place },
-        Place { end: u64::MAX, size: u64::MAX, ..place },
-    ] {
-        refused(0, 1, &[], at(place));
+    Arm::new(&Parameters { stages: [stage.clone(), stage], coupling: 1.0, inertia_ratio: 0.02 }, step, substep, horizon)
+}
+
+fn sensors() -> Sensors {
+    Sensors {
+        strain_scale: [0.0136, 0.0187],
+        strain_bias: [0.12, -0.2],
+        noise: [0.0; 4],
+        sense_bias: [0.0; 2],
+        sense_scale: 2.0,
+        command_scale: 0.5,
+        encoder_scale: [1.5e-5, 3e-5],
+        range: 10.0,
+        bits: 16,
+        current_limit: [0.94, 1.2],
+        travel: [1.57, 1.57],
     }
-    let row = |index, score, width| Row { index, score, coefficients: vec![0.0; width], initial: vec![vec![]] };
-    let with = |part| Some(Checkpoint { place, part });
-    for row in [row(lattice.count(), 1.0, 2), row(0, 1.0, 3), row(0, f64::NAN, 2)] {
-        refused(0, 1, &[], with(Part { rows: vec![row], ..Part::default() }));
-    }
-    refused(0, 1, &[], with(Part { failures: vec![(lattice.count(), Failure::Singular)], ..Part::default() }));
-    let counts = Counts { beaten: u64::MAX, ..Counts::default() };
-    refused(0, 1, &[], with(Part { counts, ..Part::default() }));
-    assert!(ready.rounds(0, 1, &[(0, 1.0)], at(place), &pool, &control).is_ok());
 }
 
 #[test]
-fn stages_refuse_scales_spans_and_verdicts_that_are_not_theirs() {
-    let (options, control, pool) = (Options::default(), Control::default(), pool(1).unwrap());
-    let lattice = |values: &[f64]| LawLattice::new(&[values.to_vec()], &[one_law()], &[false, true]).unwrap();
-    let made = |lattice: LawLattice, scale: f64| {
-        Stage::new(&[data()], Cow::Owned(lattice), &[vec![None; 2]], &[scale], &options, &pool, &control)
-    };
-    for scale in [0.0, -1.0, f64::NAN, f64::INFINITY] {
-        assert!(matches!(made(lattice(&[1.0]), scale).err(), Some(Error::OutOfRange { .. })));
+fn an_arm_that_would_never_end() {
+    refused(arm(0.002, 1e-3, f64::NAN));
+    refused(arm(0.002, 1e-3, f64::INFINITY));
+    refused(arm(1.0, 1e-12, 5.0));
+    refused(arm(f64::NAN, 1e-3, 5.0));
+    let changes: [fn(&mut Sensors); 13] = [
+        |s| s.range = f64::NAN,
+        |s| s.range = -10.0,
+        |s| s.range = 0.0,
+        |s| s.strain_scale[1] = -1.0,
+        |s| s.encoder_scale[0] = 0.0,
+        |s| s.sense_scale = -2.0,
+        |s| s.command_scale = f64::INFINITY,
+        |s| s.current_limit[0] = f64::NAN,
+        |s| s.noise[2] = -1e-3,
+        |s| s.travel[0] = f64::NAN,
+        |s| s.strain_bias[0] = f64::NAN,
+        |s| s.sense_bias[1] = f64::INFINITY,
+        |s| s.bits = 53,
+    ];
+    for change in changes {
+        let mut bad = sensors();
+        change(&mut bad);
+        refused(Plant::new(arm(0.002, 1e-3, 5.0).unwrap(), bad));
     }
-    let (stage, mut course) = made(lattice(&[1.0, 1.5]), 1.0).unwrap();
-    let span = Span { equation: 0, first: 0, last: 2, limit: f64::INFINITY };
-    for span in [
-        Span { equation: 9, first: 0, last: 0, ..span },
-        Span { first: 2, last: 1, ..span },
-        Span { last: 3, ..span },
-        Span { last: usize::MAX, ..span },
-        Span { limit: f64::NAN, ..span },
-    ] {
-        assert!(matches!(stage.evaluate(&[span], &pool, &control), Err(Error::Structure { .. })), "{span:?}");
+    let mut plant = Plant::new(arm(0.002, 1e-3, 5.0).unwrap(), sensors()).unwrap();
+    refused(plant.inject(Injection::DeadEncoder { stage: 2, from: 0 }));
+    refused(plant.inject(Injection::LimitSwitch { line: 4, from: 0 }));
+    refused(plant.inject(Injection::Deflection { stage: 0, from: 0, angle: f64::NAN }));
+    refused(plant.inject(Injection::Late { at: 0, seconds: f64::NAN }));
+    for step in [0.0, -1.0, f64::NAN, f64::INFINITY, 1e300] {
+        refused(Pace::new(step));
     }
-    let verdicts = stage.evaluate(course.wanted(), &pool, &control).unwrap();
-    let (other, _) = made(lattice(&[1.0, 1.2, 1.5]), 1.0).unwrap();
-    assert!(matches!(course.take(&other, &verdicts, &pool, &control), Err(Error::Structure { .. })));
-    assert!(matches!(course.take(&stage, &verdicts[1..], &pool, &control), Err(Error::Structure { .. })));
-    let strange = [Verdict::Score(f64::NAN), Verdict::Score(1.0)];
-    assert!(matches!(course.take(&stage, &strange, &pool, &control), Err(Error::Structure { .. })));
-    assert!(matches!(stage.outcome(&course, &control), Err(Error::Structure { .. })));
-    course.take(&stage, &verdicts, &pool, &control).unwrap();
-    assert!(matches!(other.outcome(&course, &control), Err(Error::Structure { .. })));
-    assert_eq!(stage.outcome(&course, &control).unwrap().counts.candidates, 2);
+}
+
+#[test]
+#[should_panic(expected = "a transform of 10 points")]
+fn a_transform_of_another_length_does_not_return_zeros() {
+    let plan = fft::plan(10);
+    plan.forward(&mut [0.0; 8], &mut vec![fft::Complex::default(); plan.bins()], &mut fft::Workspace::new());
 }

@@ -1,8 +1,8 @@
 //! The rig's guard under a million random commands, and the arm's bounded memory.
 
-use ftlm::guard::{Fault, Guard, Settings};
 use ftlm::memory::{decay, Rates};
-use ftlm::virtual_arm::Reading;
+use ftlm::rig::guard::{Fault, Guard, Settings};
+use ftlm::rig::virtual_arm::Reading;
 
 use crate::common::Random;
 

@@ -5,7 +5,7 @@ use std::sync::atomic::Ordering;
 
 use ftlm::equation::{Equation, Initial, Structure};
 use ftlm::error::{Error, Kind};
-use ftlm::estimate::instrumental_variables::Settings;
+use ftlm::estimate::iv::Settings;
 use ftlm::estimate::least_squares::{self, Estimate};
 use ftlm::estimate::multi_innovation::{closed_form, Innovation, Rows};
 use ftlm::regressors::Record;

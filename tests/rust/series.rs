@@ -3,7 +3,7 @@
 
 use ftlm::error::Error;
 use ftlm::fft;
-use ftlm::fractional::{block_pulse_kernel, power_means};
+use ftlm::kernels::{block_pulse_kernel, power_means};
 use ftlm::series::{self, Buffers, Division, Kernel, Solver, SumOfProducts, BLOCK};
 use proptest::prelude::*;
 

@@ -3,7 +3,7 @@
 use ftlm::equation::{Equation, Initial};
 use ftlm::error::Error;
 use ftlm::estimate::least_squares;
-use ftlm::fractional::block_pulse_kernel;
+use ftlm::kernels::block_pulse_kernel;
 use ftlm::regressors::Record;
 use ftlm::series;
 use ftlm::simulate::{

@@ -6,7 +6,7 @@ use pyo3::types::PyDict;
 use super::super::arrays::{initial, records, InitialArg, RecordArg};
 use crate::equation::{AffineOrder, Initial};
 use crate::error::Error;
-use crate::estimate::instrumental_variables::{with_projections, Settings};
+use crate::estimate::iv::{with_projections, Settings};
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::regressors::Record;
 use crate::search::control::{another, Checkpoint, Place};

@@ -2,7 +2,7 @@
 //! all candidates.
 
 use crate::error::{Error, Result};
-use crate::estimate::instrumental_variables::{low_pass, power_frequency, refine, Scratch, Settings, Source};
+use crate::estimate::iv::{low_pass, power_frequency, refine, Scratch, Settings, Source};
 use crate::regressors::{Bank, Index, Record};
 use crate::search::outcome::Failure;
 use crate::series::Kernel;

@@ -2,7 +2,7 @@
 
 use crate::equation::{tidy, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
-use crate::fractional::MAX_ORDER;
+use crate::kernels::MAX_ORDER;
 use crate::search::lattice::tuples::{Group, Slice};
 
 /// Most candidates that one search takes: an hour or so where bounds and early stopping do their work.

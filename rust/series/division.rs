@@ -1,262 +1,16 @@
-//! Truncated power series in the one-step delay: multiply, divide, apply, and the naive oracles beside them.
+//! Division of series by forward substitution in blocks that are joined by transforms, O(m log² m).
 //!
-//! A causal operator on pulse means is a polynomial in the delay z cut off at z^m; F^η is one of them
-//! ([`crate::fractional::block_pulse_kernel`]). All such operators commute. Products are convolutions by FFT,
-//! O(m log m). Division is forward substitution in blocks joined by FFT products, O(m log² m): exact for every
-//! divisor with a leading coefficient, stable or not. [`Division`] hands out the quotient block by block, so that a
-//! search can stop reading a candidate that has lost.
+//! Exact for every divisor with a leading coefficient, stable or not. [`Division`] hands out the quotient block by block,
+//! so that a search can stop reading a candidate that has lost.
 
-use crate::error::{check_length, Error, Result};
 use crate::fft::{self, Bin, Plan, Workspace};
 use crate::lanes;
-
-/// Below this length a product is formed directly: it is faster there and free of transform rounding.
-const DIRECT: usize = 64;
 
 /// Length of a block of forward substitution; measured best of 16, 32, 64, 128 at m = 2048.
 pub const BLOCK: usize = 64;
 
-/// Product mod z^m by definition: the oracle of [`multiply`]. O(m²).
-#[must_use]
-pub fn multiply_naive(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
-    let mut out = vec![0.0; m];
-    for (i, &x) in a.iter().enumerate().take(m) {
-        for (value, &y) in out[i..].iter_mut().zip(b) {
-            *value += x * y;
-        }
-    }
-    out
-}
-
-/// Product mod z^m, equivalently the causal convolution of a kernel with a signal. O(m log m).
-#[must_use]
-pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
-    let (a, b) = (&a[..a.len().min(m)], &b[..b.len().min(m)]);
-    if a.len().min(b.len()) <= DIRECT {
-        return multiply_naive(a, b, m);
-    }
-    let kernel = Kernel::with_length(a, a.len() + b.len());
-    let mut out = vec![0.0; m];
-    kernel.apply(b, &mut out, &mut Buffers::default());
-    out
-}
-
-/// Reusable memory of the transforms of one thread.
-#[derive(Default)]
-pub struct Buffers {
-    time: Vec<f64>,
-    spectrum: Vec<Bin>,
-    workspace: Workspace,
-}
-
-/// A series with its spectrum, to be applied to many signals: two transforms each.
-pub struct Kernel {
-    plan: Plan,
-    spectrum: Vec<Bin>,
-}
-
-impl Kernel {
-    /// Caches a series of length m for signals of up to m points.
-    #[must_use]
-    pub fn new(series: &[f64]) -> Self {
-        Self::with_length(series, 2 * series.len())
-    }
-
-    /// Caches a series for products of up to `total` terms in all factors together.
-    #[must_use]
-    pub fn with_length(series: &[f64], total: usize) -> Self {
-        let plan = fft::plan(fft::fast_length(total));
-        let mut time = vec![0.0; plan.len()];
-        time[..series.len()].copy_from_slice(series);
-        let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-        plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
-        Self { plan, spectrum }
-    }
-
-    /// The first `out.len()` terms of the product with `signal`; neither longer than the length cached for.
-    pub fn apply(&self, signal: &[f64], out: &mut [f64], buffers: &mut Buffers) {
-        buffers.time.clear();
-        buffers.time.extend_from_slice(signal);
-        buffers.time.resize(self.plan.len(), 0.0);
-        buffers.spectrum.resize(self.plan.bins(), Bin::new(0.0, 0.0));
-        let spectrum = &mut buffers.spectrum[..self.plan.bins()];
-        self.plan.forward(&mut buffers.time, spectrum, &mut buffers.workspace);
-        for (x, k) in spectrum.iter_mut().zip(&self.spectrum) {
-            *x *= k;
-        }
-        self.plan.inverse(spectrum, &mut buffers.time, &mut buffers.workspace);
-        let read = out.len().min(buffers.time.len());
-        out[..read].copy_from_slice(&buffers.time[..read]);
-    }
-
-    /// The first `out.len()` terms of the product with another cached series of the same length: one transform.
-    pub fn times(&self, other: &Self, out: &mut [f64], buffers: &mut Buffers) {
-        buffers.spectrum.clear();
-        buffers.spectrum.extend(self.spectrum.iter().zip(&other.spectrum).map(|(x, y)| x * y));
-        buffers.time.resize(self.plan.len(), 0.0);
-        let time = &mut buffers.time[..self.plan.len()];
-        self.plan.inverse(&mut buffers.spectrum, time, &mut buffers.workspace);
-        out.copy_from_slice(&time[..out.len()]);
-    }
-}
-
-/// A sum of products of series, formed in the frequency domain: one inverse transform however many products.
-pub struct SumOfProducts {
-    plan: Plan,
-    spectrum: Vec<Bin>,
-}
-
-impl SumOfProducts {
-    /// An empty sum of products of series of m terms.
-    #[must_use]
-    pub fn new(m: usize) -> Self {
-        Self::with_length(2 * m)
-    }
-
-    /// An empty sum of products of up to `total` terms in all factors together: three factors of m terms need 3m.
-    #[must_use]
-    pub fn with_length(total: usize) -> Self {
-        let plan = fft::plan(fft::fast_length(total));
-        let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-        Self { plan, spectrum }
-    }
-
-    /// Forgets what was added.
-    pub fn clear(&mut self) {
-        self.spectrum.fill(Bin::new(0.0, 0.0));
-    }
-
-    /// Adds a series by itself.
-    pub fn add_series(&mut self, series: &Kernel) {
-        self.spectrum.iter_mut().zip(&series.spectrum).for_each(|(sum, x)| *sum += x);
-    }
-
-    /// Adds the product of another sum with a series; all cached for the same number of terms.
-    pub fn add_product(&mut self, other: &Self, series: &Kernel) {
-        for ((sum, x), y) in self.spectrum.iter_mut().zip(&other.spectrum).zip(&series.spectrum) {
-            *sum += x * y;
-        }
-    }
-
-    /// Adds weight·a·b; both cached for the same m as the sum.
-    pub fn add(&mut self, weight: f64, a: &Kernel, b: &Kernel) {
-        for ((sum, x), y) in self.spectrum.iter_mut().zip(&a.spectrum).zip(&b.spectrum) {
-            *sum += x * y * weight;
-        }
-    }
-
-    /// The first `out.len()` terms of the sum, which is left empty.
-    pub fn take(&mut self, out: &mut [f64], buffers: &mut Buffers) {
-        buffers.time.resize(self.plan.len(), 0.0);
-        let time = &mut buffers.time[..self.plan.len()];
-        self.plan.inverse(&mut self.spectrum, time, &mut buffers.workspace);
-        out.copy_from_slice(&time[..out.len()]);
-        self.spectrum.fill(Bin::new(0.0, 0.0));
-    }
-}
-
-/// Quotient `numerator / divisor` mod z^m by plain forward substitution: the oracle of [`divide`]. O(m²).
-///
-/// # Errors
-/// [`Error::LeadingZero`] where the divisor starts with zero.
-pub fn divide_naive(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
-    let leading = check_leading(divisor)?;
-    let mut quotient = numerator.to_vec();
-    for k in 0..quotient.len() {
-        quotient[k] /= leading;
-        let value = quotient[k];
-        for (rest, &d) in quotient[k + 1..].iter_mut().zip(&divisor[1..]) {
-            *rest -= d * value;
-        }
-    }
-    Ok(quotient)
-}
-
-/// Quotient mod z^m, m the numerator's length; exact whether or not the divisor is stable. O(m log² m).
-///
-/// # Errors
-/// [`Error::LeadingZero`] where the divisor starts with zero, [`Error::Length`] where it is shorter than m.
-pub fn divide(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
-    let quotient = solve(&[vec![divisor]], &[numerator])?;
-    quotient.into_iter().next().ok_or_else(|| Error::Internal { what: "a division without a quotient".into() })
-}
-
-fn check_leading(divisor: &[f64]) -> Result<f64> {
-    match divisor.first() {
-        Some(&d) if d != 0.0 && d.is_finite() => Ok(d),
-        first => Err(Error::LeadingZero { leading: first.copied().unwrap_or(0.0) }),
-    }
-}
-
-/// Solves the n × n system Σ_j A_ij y_j = b_i of series mod z^m, A_ij of length m at least. O(n² m log² m).
-///
-/// # Errors
-/// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
-pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<Vec<f64>>> {
-    let n = rhs.len();
-    let m = rhs.first().map_or(0, |b| b.len());
-    check_length("matrix of series", n, matrix.len())?;
-    for row in matrix {
-        check_length("row of the matrix of series", n, row.len())?;
-        for series in row {
-            if series.as_ref().len() < m {
-                return Err(Error::Length { name: "series".into(), expected: m, found: series.as_ref().len() });
-            }
-        }
-    }
-    for b in rhs {
-        check_length("right-hand side", m, b.len())?;
-    }
-    // An empty series starts with nothing, which cannot be divided by either.
-    let first = |s: &S| s.as_ref().first().copied().unwrap_or(0.0);
-    let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(first)).collect();
-    let inverse = crate::small::inverse(&leading, n)?;
-    let mut division = Division::new(n, m);
-    division.run(matrix, &inverse, rhs);
-    Ok(division.into_quotients())
-}
-
-/// A system of series that is solved for many right-hand sides: the spectra of its matrix are made once.
-pub struct Solver<'a> {
-    matrix: &'a [Vec<Vec<f64>>],
-    inverse: Vec<f64>,
-    division: Division,
-}
-
-impl<'a> Solver<'a> {
-    /// Takes an n × n matrix of series of m terms.
-    ///
-    /// # Errors
-    /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
-    pub fn new(matrix: &'a [Vec<Vec<f64>>]) -> Result<Self> {
-        let n = matrix.len();
-        let m = matrix.first().and_then(|row| row.first()).map_or(0, Vec::len);
-        for row in matrix {
-            check_length("row of the matrix of series", n, row.len())?;
-            for series in row {
-                check_length("series", m, series.len())?;
-            }
-        }
-        let first = |s: &Vec<f64>| s.first().copied().unwrap_or(0.0);
-        let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(first)).collect();
-        Ok(Self { matrix, inverse: crate::small::inverse(&leading, n)?, division: Division::new(n, m) })
-    }
-
-    /// Solves for one right-hand side of n series of m terms.
-    ///
-    /// # Errors
-    /// [`Error::Length`].
-    pub fn solve(&mut self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
-        check_length("right-hand sides", self.matrix.len(), rhs.len())?;
-        for b in rhs {
-            check_length("right-hand side", self.division.terms(), b.len())?;
-        }
-        let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
-        self.division.restart();
-        self.division.run(self.matrix, &self.inverse, &borrowed);
-        Ok(self.division.rest.clone())
-    }
-}
+/// Up to this half length blocks are joined directly: it is faster there and free of transform rounding.
+const JOINED_DIRECTLY: usize = 64;
 
 /// Terms whose sums stay in registers while a tile of solved ones is taken off them.
 const TILE: usize = 8;
@@ -399,7 +153,7 @@ impl Division {
     }
 
     /// Solves for whole right-hand sides.
-    fn run<S: AsRef<[f64]>>(&mut self, matrix: &[Vec<S>], inverse: &[f64], rhs: &[&[f64]]) {
+    pub(super) fn run<S: AsRef<[f64]>>(&mut self, matrix: &[Vec<S>], inverse: &[f64], rhs: &[&[f64]]) {
         for (i, b) in rhs.iter().enumerate() {
             self.add(i, 0, b);
         }
@@ -425,6 +179,11 @@ impl Division {
     #[must_use]
     pub fn quotient(&self, i: usize) -> &[f64] {
         &self.rest[i][..self.solved]
+    }
+
+    /// All quotients, as far as they are solved; the rest is what is still to be divided.
+    pub(super) fn quotients(&self) -> &[Vec<f64>] {
+        &self.rest
     }
 
     /// All quotients.
@@ -476,7 +235,7 @@ impl Division {
         let level = blocks.trailing_zeros() as usize;
         let half = BLOCK << level;
         let end = (hi + half).min(self.m);
-        if half <= DIRECT {
+        if half <= JOINED_DIRECTLY {
             for i in 0..n {
                 for j in 0..n {
                     let a = series(i, j, (2 * half).min(self.m));

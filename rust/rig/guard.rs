@@ -4,7 +4,7 @@
 use thiserror::Error;
 
 use crate::error::{Error, Result};
-use crate::virtual_arm::Reading;
+use crate::rig::virtual_arm::Reading;
 
 /// Numbers of the arm that limits and faults are judged by; pairs are stage 1 and stage 2.
 #[derive(Debug, Clone, PartialEq)]
@@ -66,6 +66,17 @@ impl Settings {
             ("fastest", self.fastest),
             ("late_limit", self.late_limit),
         ];
+        if let Some((frequency, damping)) = self.filter {
+            if !(frequency > 0.0 && frequency.is_finite() && damping > 0.0 && damping.is_finite()) {
+                let value = if frequency > 0.0 && frequency.is_finite() { damping } else { frequency };
+                return Err(Error::OutOfRange {
+                    name: "sensor filter".into(),
+                    value,
+                    range: "(0, ∞)".into(),
+                    remedy: "give its frequency in rad/s and its damping".into(),
+                });
+            }
+        }
         let all = pairs.iter().flat_map(|(name, v)| v.map(|v| (*name, v))).chain(single);
         for (name, value) in all {
             if !(value > 0.0 && value.is_finite()) {
@@ -180,6 +191,34 @@ impl Guard {
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a setting that is not a positive, finite number.
+    ///
+    /// ```
+    /// # fn main() -> ftlm::error::Result<()> {
+    /// use ftlm::rig::guard::{Guard, Settings};
+    /// let mut guard = Guard::new(Settings {
+    ///     step: 0.002,
+    ///     strain_scale: [0.0136, 0.0187],
+    ///     sense_scale: 2.0,
+    ///     command_scale: 0.5,
+    ///     encoder_scale: [1.5e-5, 3.1e-5],
+    ///     current_limit: [0.9, 1.2],
+    ///     slew: [50.0, 80.0],
+    ///     continuous: [0.6, 0.8],
+    ///     thermal_time: 1.0,
+    ///     deflection_limit: [0.09, 0.13],
+    ///     saturation: 9.99,
+    ///     moving_current: 0.25,
+    ///     standstill: 0.5,
+    ///     fastest: 20.0,
+    ///     late_limit: 0.05,
+    ///     missed_limit: 20,
+    ///     filter: None,
+    /// })?;
+    /// // A step of 5 A is slewed to 0.1 A, 50 A/s for 2 ms.
+    /// assert!((guard.command([5.0, 0.0])[0] + 0.2).abs() < 1e-12);
+    /// # Ok(())
+    /// # }
+    /// ```
     pub fn new(settings: Settings) -> Result<Self> {
         settings.check()?;
         let filters = settings.filter.map(|(w, damping)| [Filter::new(w, damping, settings.step); 2]);
@@ -344,7 +383,7 @@ impl Guard {
         } else {
             self.missed = 0;
         }
-        if late > s.late_limit {
+        if late.is_nan() || late > s.late_limit {
             self.fail(Fault::Late { milliseconds: 1e3 * late, limit: 1e3 * self.settings.late_limit });
         } else if self.missed > s.missed_limit {
             self.fail(Fault::Missed { count: self.missed });

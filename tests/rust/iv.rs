@@ -2,11 +2,11 @@
 
 use ftlm::equation::{Equation, Initial};
 use ftlm::error::Error;
-use ftlm::estimate::instrumental_variables::{
+use ftlm::estimate::iv::{
     damped_inverse, fit, low_pass, power_frequency, project, refine, step, Scratch, Settings, Source,
 };
 use ftlm::estimate::least_squares;
-use ftlm::fractional::block_pulse_kernel;
+use ftlm::kernels::block_pulse_kernel;
 use ftlm::regressors::Record;
 use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis};

@@ -1,4 +1,4 @@
-//! Refined instrumental variables of several equations that drive each other (Jakeman and Young, Refined instrumental
+//! All equations that drive each other together (Jakeman and Young, Refined instrumental
 //! variable methods of recursive time-series analysis, part II, Int. J. Control 29, 1979, 621-644).
 //!
 //! One equation filtered by its own 1/D̂ is left with the noise of every other measured output in it. Filtered by the
@@ -7,14 +7,14 @@
 //! term what a change of its coefficient does to the free run, so where the steps stand still the weighted output error
 //! does, too.
 
+use super::common::{dot, equations, initial_terms, long_run, unmoved, Dropped, Settings, Solution};
+use super::filter::grows;
 use crate::equation::Structure;
 use crate::error::Result;
-use crate::estimate::instrumental_variables::{
-    dot, equations, grows, initial_terms, long_run, unmoved, Dropped, Settings, Solution,
-};
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
-use crate::{simulate, small};
+use crate::simulate::System;
+use crate::small;
 
 /// A step that raises the cost is halved, at most so many times in a row.
 const SHORTENED: usize = 8;
@@ -139,7 +139,7 @@ impl Problem<'_> {
         let mut count = 0;
         for (r, record) in self.clean.iter().enumerate() {
             let initial = initial_terms(r, self.structures, self.exponents, solutions);
-            let outputs = simulate::respond(&equations, record, &initial)?;
+            let outputs = System::new(&equations, record)?.respond(&initial)?;
             for ((response, equation), sum) in outputs.iter().zip(&equations).zip(&mut sums) {
                 let measured = self.records[r].signal(equation.structure.output);
                 let size = measured.iter().fold(f64::MIN_POSITIVE, |a, v| a.max(v.abs()));
@@ -172,7 +172,7 @@ impl Problem<'_> {
         let mut parts = Vec::with_capacity(self.records.len());
         for (r, record) in self.records.iter().enumerate() {
             let m = record.m();
-            let inverse = simulate::inverse(&equations, record)?;
+            let inverse = System::new(&equations, record)?.inverse()?;
             if inverse.iter().flatten().any(|series| grows(series)) {
                 return Ok(None);
             }

@@ -1,0 +1,84 @@
+//! What the estimators by instrumental variables share: settings, solutions, sums of products, long-run covariances.
+
+use crate::equation::{Equation, Structure};
+
+/// How long to iterate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Settings {
+    /// Most steps.
+    pub iterations: usize,
+    /// Change of every coefficient, relative to its size, at which the steps end.
+    pub tolerance: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { iterations: 30, tolerance: 1e-7 }
+    }
+}
+
+/// Coefficients of terms, then of the initial terms record by record.
+pub type Solution = Vec<f64>;
+
+/// (record, position) of the initial terms left out.
+pub type Dropped = Vec<(usize, usize)>;
+
+/// The equations that solutions make.
+pub(super) fn equations(structures: &[Structure], solutions: &[Solution]) -> Vec<Equation> {
+    let pairs = structures.iter().zip(solutions);
+    pairs.map(|(s, x)| Equation { structure: s.clone(), coefficients: x[..s.terms.len()].to_vec() }).collect()
+}
+
+/// (exponent, coefficient) of the initial terms of record r that solutions hold, per equation.
+pub(super) fn initial_terms(
+    r: usize,
+    structures: &[Structure],
+    exponents: &[Vec<f64>],
+    solutions: &[Solution],
+) -> Vec<Vec<(f64, f64)>> {
+    exponents
+        .iter()
+        .zip(structures)
+        .zip(solutions)
+        .map(|((exponents, s), x)| {
+            let first = s.terms.len() + r * exponents.len();
+            exponents.iter().copied().zip(x[first..].iter().copied()).collect()
+        })
+        .collect()
+}
+
+pub(super) fn unmoved(before: &[f64], after: &[f64], terms: usize, tolerance: f64) -> bool {
+    let largest = after[..terms].iter().fold(0.0_f64, |a, v| a.max(v.abs()));
+    before[..terms].iter().zip(after).all(|(a, b)| (a - b).abs() <= tolerance * b.abs().max(1e-9 * largest))
+}
+
+pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
+    // Four sums: one alone would wait for itself.
+    let mut sums = [0.0; 4];
+    let (left, right) = (a.chunks_exact(4), b.chunks_exact(4));
+    let tail: f64 = left.remainder().iter().zip(right.remainder()).map(|(x, y)| x * y).sum();
+    for (x, y) in left.zip(right) {
+        for (sum, (x, y)) in sums.iter_mut().zip(x.iter().zip(y)) {
+            *sum += x * y;
+        }
+    }
+    (sums[0] + sums[1]) + (sums[2] + sums[3]) + tail
+}
+
+/// Adds the long-run covariance of the sums of scores to a k × k matrix, with Bartlett weights
+/// (doi:10.2307/1913610): what the filter leaves behind is not white where other measured outputs enter the equation.
+#[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+pub(super) fn long_run(scores: &[Vec<f64>], places: &[usize], meat: &mut [f64], k: usize) {
+    let m = scores.first().map_or(0, Vec::len);
+    let lags = ((4.0 * libm::cbrt(m as f64)) as usize).min(m.saturating_sub(1));
+    for (left, &a) in scores.iter().zip(places) {
+        for (right, &b) in scores.iter().zip(places) {
+            meat[a * k + b] += dot(left, right);
+            for lag in 1..=lags {
+                let weight = 1.0 - lag as f64 / (lags + 1) as f64;
+                let both = dot(&left[lag..], &right[..m - lag]) + dot(&left[..m - lag], &right[lag..]);
+                meat[a * k + b] += weight * both;
+            }
+        }
+    }
+}

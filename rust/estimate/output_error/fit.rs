@@ -1,0 +1,171 @@
+//! The fit: a model, its experiments and a start become a least-squares problem, and its minimum a result.
+
+use super::experiment::Experiment;
+use super::free_run::Evaluation;
+use super::levenberg_marquardt::{minimise, Problem, Settings, Status};
+use super::model::{FreeDelay, FreeModel, Point};
+use crate::error::{check_finite, check_length, Error, Result};
+
+/// The optimum and what describes it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fit {
+    /// Free orders, coefficients and delays.
+    pub point: Point,
+    /// Half the weighted sum of squared residuals.
+    pub cost: f64,
+    /// Weighted residuals (y − ŷ)/σ, records one after the other, outputs within.
+    pub residuals: Vec<f64>,
+    /// Their derivatives with respect to orders, coefficients (plain coordinates), then delays, initial terms projected
+    /// out.
+    pub jacobian: Vec<Vec<f64>>,
+    /// Coefficients of the initial terms per record and equation.
+    pub initial: Vec<Vec<Vec<f64>>>,
+    /// Exponents of the initial terms per equation.
+    pub exponents: Vec<Vec<f64>>,
+    /// Evaluations of residuals.
+    pub evaluations: usize,
+    /// How it ended.
+    pub status: Status,
+}
+
+/// The output error of a model on its experiments, as a problem of least squares.
+struct OutputError<'a> {
+    model: &'a FreeModel,
+    experiments: &'a [Experiment],
+}
+
+impl Problem for OutputError<'_> {
+    type Point = Point;
+    type Evaluation = Evaluation;
+
+    fn evaluate(&self, point: &Point) -> Result<Evaluation> {
+        self.model.evaluate(self.experiments, point)
+    }
+
+    fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
+        &evaluation.residuals
+    }
+
+    fn jacobian(&self, point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
+        self.model.jacobian(self.experiments, point, evaluation)
+    }
+
+    fn moved(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
+        stepped(self.model, point, steps)
+    }
+
+    fn stretch(&self, point: &Point, parameter: usize) -> f64 {
+        parameter
+            .checked_sub(point.orders.len())
+            .filter(|j| *j < point.coefficients.len())
+            .map_or(1.0, |j| self.model.coordinates[j].stretch(point.coefficients[j]))
+    }
+
+    /// Where the grids see all of each equation: a fit would follow noise with what they do not see.
+    fn trusted(&self, point: &Point) -> bool {
+        self.model.resolved(self.experiments, point)
+    }
+}
+
+/// A point moved by steps in its coordinates, within bounds, and how far: orders as they are, coefficients as a share
+/// of themselves, delays as a share of their interval.
+fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
+    let mut next = point.clone();
+    let mut moved: f64 = 0.0;
+    let (orders, rest) = deltas.split_at(point.orders.len());
+    let (coefficients, delays) = rest.split_at(point.coefficients.len());
+    for ((order, &(low, high)), delta) in next.orders.iter_mut().zip(&model.order_bounds).zip(orders) {
+        let before = *order;
+        *order = (before + delta).clamp(low, high);
+        moved = moved.max((*order - before).abs());
+    }
+    for ((value, &coordinate), &delta) in next.coefficients.iter_mut().zip(&model.coordinates).zip(coefficients) {
+        let before = *value;
+        *value = coordinate.shifted(before, delta);
+        moved = moved.max((*value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
+    }
+    for ((delay, FreeDelay { bounds: (low, high), .. }), delta) in next.delays.iter_mut().zip(&model.delays).zip(delays)
+    {
+        let before = *delay;
+        *delay = (before + delta).clamp(*low, *high);
+        moved = moved.max((*delay - before).abs() / (high - low).max(f64::MIN_POSITIVE));
+    }
+    (next, moved)
+}
+
+/// Weighted least squares on the output error from a start, by Levenberg–Marquardt with columns scaled by the Jacobian.
+///
+/// # Errors
+/// A start whose free run is not finite ([`Error::Diverged`]), or that lies outside its coordinates; a model that names
+/// what is not there, experiments that do not fit it ([`FreeModel::check`]).
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::equation::{AffineOrder, Initial};
+/// use ftlm::estimate::output_error::*;
+/// use ftlm::means::point_samples;
+/// use ftlm::regressors::Record;
+/// // D^a y = c u with the truth a = 0.8, c = 3.
+/// let input: Vec<f64> = (0..100).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();
+/// let run = Record::new(0.05, vec![vec![0.0; 100], input], None)?;
+/// let output: Vec<f64> = run.integral(1, 0.8).iter().map(|v| 3.0 * v).collect();
+/// let experiment = Experiment::new(run, 1, vec![point_samples(&output)], vec![1.0])?;
+/// let model = FreeModel {
+///     equations: vec![FreeEquation {
+///         output: 0,
+///         order: AffineOrder { constant: 0.0, weights: vec![1.0] },
+///         terms: vec![(
+///             1,
+///             AffineOrder { constant: 0.0, weights: vec![0.0] },
+///             Monomial { factor: 1.0, powers: vec![(0, 1)] },
+///         )],
+///     }],
+///     order_bounds: vec![(0.1, 2.0)],
+///     coordinates: vec![Coordinate::Logarithm],
+///     delays: vec![],
+///     coupled: false,
+///     initial: Initial::Rest,
+/// };
+/// let start = Point { orders: vec![1.0], coefficients: vec![1.0], delays: vec![] };
+/// let found = fit(&model, &[experiment], &start, Settings::default())?;
+/// assert!((found.point.orders[0] - 0.8).abs() < 1e-6 && (found.point.coefficients[0] - 3.0).abs() < 1e-6);
+/// # Ok(())
+/// # }
+/// ```
+pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+    check_length("orders", model.order_bounds.len(), start.orders.len())?;
+    check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
+    check_length("delays", model.delays.len(), start.delays.len())?;
+    model.check(experiments)?;
+    check_start(model, start)?;
+    let mut point = start.clone();
+    point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
+    point.delays.iter_mut().zip(&model.delays).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
+    let found = minimise(&OutputError { model, experiments }, point, settings)?;
+    Ok(Fit {
+        point: found.point,
+        cost: found.cost,
+        residuals: found.evaluation.residuals,
+        jacobian: found.jacobian,
+        initial: found.evaluation.initial,
+        exponents: found.evaluation.exponents,
+        evaluations: found.evaluations,
+        status: found.status,
+    })
+}
+
+/// Refuses a start that its coordinates cannot move, or that is no number.
+fn check_start(model: &FreeModel, start: &Point) -> Result<()> {
+    for (i, (&c, coordinate)) in start.coefficients.iter().zip(&model.coordinates).enumerate() {
+        if !coordinate.holds(c) {
+            return Err(Error::OutOfRange {
+                name: format!("start of coefficient {i}"),
+                value: c,
+                range: "its coordinate".into(),
+                remedy: "start a logarithmic coefficient away from 0, a ratio above 1".into(),
+            });
+        }
+    }
+    check_finite("orders of the start", &start.orders)?;
+    check_finite("delays of the start", &start.delays)
+}

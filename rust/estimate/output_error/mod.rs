@@ -1,0 +1,19 @@
+//! Joint output error: all equations of a model, all records, all orders continuous, by Levenberg–Marquardt.
+//!
+//! For white noise on the outputs this is maximum likelihood. The free run solves A y = b in series, by exact division.
+//! Its sensitivity to a parameter is A⁻¹(∂b − ∂A y), a sum of products of three series: with the spectra of A⁻¹ at hand,
+//! one inverse transform a parameter and output. Rejected steps cost no Jacobian. Initial terms are linear and projected
+//! out (variable projection, Kaufman's form, doi:10.1007/BF01932995). Records are compared sample by sample: y_k with the
+//! mean of the pulses on either side of kh, on a grid that may be finer than the samples.
+
+pub mod experiment;
+pub mod fit;
+mod free_run;
+pub mod levenberg_marquardt;
+pub mod model;
+mod sensitivities;
+
+pub use experiment::Experiment;
+pub use fit::{fit, Fit};
+pub use levenberg_marquardt::{Settings, Status};
+pub use model::{Coordinate, FreeDelay, FreeEquation, FreeModel, Monomial, Point};

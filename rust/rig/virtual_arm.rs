@@ -1,0 +1,316 @@
+//! The arm behind its sensors and converters, stepped and paced in real time or not, and what goes wrong on purpose.
+
+use std::time::{Duration, Instant};
+
+use super::arm::Arm;
+use crate::error::{check_finite, check_step, Error, Result};
+
+/// What the arm's sensors and converters make of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Sensors {
+    /// Deflection per volt of strain gauge \[rad/V\].
+    pub strain_scale: [f64; 2],
+    /// Volts of the gauges at rest.
+    pub strain_bias: [f64; 2],
+    /// Standard deviation of the noise on strain 1, 2 and current sense 1, 2 \[V\].
+    pub noise: [f64; 4],
+    /// Offset of the current sense \[V\].
+    pub sense_bias: [f64; 2],
+    /// Current per volt of the sense \[A/V\].
+    pub sense_scale: f64,
+    /// Current per volt of the command \[A/V\].
+    pub command_scale: f64,
+    /// Hub angle per count \[rad\].
+    pub encoder_scale: [f64; 2],
+    /// Volts from end to end of the converters' range are twice this.
+    pub range: f64,
+    /// Bits of the converters; 0 for none.
+    pub bits: u32,
+    /// Largest current of the amplifiers \[A\].
+    pub current_limit: [f64; 2],
+    /// Hub angle at which a limit switch opens \[rad\].
+    pub travel: [f64; 2],
+}
+
+/// What goes wrong on purpose, from a sample on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Injection {
+    /// The encoder stops counting.
+    DeadEncoder {
+        /// Stage, from 0.
+        stage: usize,
+        /// First sample.
+        from: u64,
+    },
+    /// The gauge's amplifier sits at its rail.
+    SaturatedGauge {
+        /// Stage, from 0.
+        stage: usize,
+        /// First sample.
+        from: u64,
+    },
+    /// A limit switch opens.
+    LimitSwitch {
+        /// Line, from 0.
+        line: usize,
+        /// First sample.
+        from: u64,
+    },
+    /// The link bends by this much more \[rad\].
+    Deflection {
+        /// Stage, from 0.
+        stage: usize,
+        /// First sample.
+        from: u64,
+        /// Angle \[rad\].
+        angle: f64,
+    },
+    /// The loop is late by this much at one sample \[s\], on the virtual clock.
+    Late {
+        /// Sample.
+        at: u64,
+        /// Delay \[s\].
+        seconds: f64,
+    },
+    /// The board hands over no samples any more.
+    LostSamples {
+        /// First sample.
+        from: u64,
+    },
+}
+
+/// One reading of all channels at one instant.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Reading {
+    /// Strain 1, 2, current sense 1, 2 \[V\].
+    pub analog: [f64; 4],
+    /// Encoder counts.
+    pub counts: [i32; 2],
+    /// Limit switches; 0 is tripped.
+    pub switches: [i8; 4],
+}
+
+/// The arm behind its converters.
+#[derive(Debug, Clone)]
+pub struct Plant {
+    /// The arm itself.
+    pub arm: Arm,
+    sensors: Sensors,
+    current: [f64; 2],
+    frozen: [Option<i32>; 2],
+    injections: Vec<Injection>,
+    sample: u64,
+}
+
+impl Plant {
+    /// An arm at rest with no current.
+    ///
+    /// # Errors
+    /// As [`Sensors::check`].
+    pub fn new(arm: Arm, sensors: Sensors) -> Result<Self> {
+        sensors.check()?;
+        Ok(Self { arm, sensors, current: [0.0; 2], frozen: [None; 2], injections: Vec::new(), sample: 0 })
+    }
+
+    /// Adds something that goes wrong.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a stage or a line that is not there, [`Error::NotFinite`] for its number.
+    pub fn inject(&mut self, injection: Injection) -> Result<()> {
+        let place = |name: &str, index: usize, count: usize| {
+            if index < count {
+                return Ok(());
+            }
+            #[allow(clippy::cast_precision_loss)]
+            Err(outside(name, index as f64, &format!("[0, {count})")))
+        };
+        match injection {
+            Injection::DeadEncoder { stage, .. } | Injection::SaturatedGauge { stage, .. } => place("stage", stage, 2)?,
+            Injection::LimitSwitch { line, .. } => place("line", line, 4)?,
+            Injection::Deflection { stage, angle, .. } => {
+                place("stage", stage, 2)?;
+                check_finite("injected deflection", &[angle])?;
+            }
+            Injection::Late { seconds, .. } => check_finite("injected delay", &[seconds])?,
+            Injection::LostSamples { .. } => {}
+        }
+        self.injections.push(injection);
+        Ok(())
+    }
+
+    /// Number of the sample that [`Self::read`] reads next.
+    #[must_use]
+    pub fn sample(&self) -> u64 {
+        self.sample
+    }
+
+    /// All channels now; `noise` is standard normal, for strain 1, 2 and sense 1, 2.
+    pub fn read(&mut self, noise: [f64; 4]) -> Reading {
+        let s = &self.sensors;
+        let angles = self.arm.angles();
+        let mut bend = [angles[1], angles[3]];
+        let mut analog = [0.0; 4];
+        let mut switches = [1_i8; 4];
+        let mut rail = [false; 2];
+        for injection in &self.injections {
+            match *injection {
+                Injection::SaturatedGauge { stage, from } => rail[stage] |= self.sample >= from,
+                Injection::LimitSwitch { line, from } if self.sample >= from => switches[line] = 0,
+                Injection::Deflection { stage, from, angle } if self.sample >= from => bend[stage] += angle,
+                _ => {}
+            }
+        }
+        for j in 0..2 {
+            let strain = s.strain_bias[j] - bend[j] / s.strain_scale[j] + s.noise[j] * noise[j];
+            analog[j] = s.convert(if rail[j] { s.range } else { strain });
+            let sense = s.sense_bias[j] - self.current[j] / s.sense_scale + s.noise[2 + j] * noise[2 + j];
+            analog[2 + j] = s.convert(sense);
+            for (line, beyond) in [(2 * j, -angles[2 * j]), (2 * j + 1, angles[2 * j])] {
+                if beyond > s.travel[j] {
+                    switches[line] = 0;
+                }
+            }
+        }
+        // The arm rests in the middle of a count, so that counting has no bias.
+        #[allow(clippy::cast_possible_truncation)]
+        let mut counts: [i32; 2] = std::array::from_fn(|j| (angles[2 * j] / s.encoder_scale[j] + 0.5).floor() as i32);
+        for injection in &self.injections {
+            if let Injection::DeadEncoder { stage, from } = *injection {
+                if self.sample >= from {
+                    counts[stage] = *self.frozen[stage].get_or_insert(counts[stage]);
+                }
+            }
+        }
+        Reading { analog, counts, switches }
+    }
+
+    /// Whether the board still hands over samples.
+    #[must_use]
+    pub fn sampling(&self) -> bool {
+        !self.injections.iter().any(|i| matches!(i, Injection::LostSamples { from } if self.sample >= *from))
+    }
+
+    /// The injected delay at this sample \[s\].
+    #[must_use]
+    pub fn delay(&self) -> f64 {
+        let late = |i: &Injection| match *i {
+            Injection::Late { at, seconds } if at == self.sample => seconds,
+            _ => 0.0,
+        };
+        self.injections.iter().map(late).sum()
+    }
+
+    /// One sample under these volts at the amplifiers' inputs; disabled amplifiers give no current.
+    pub fn advance(&mut self, volts: [f64; 2], enabled: bool) {
+        let s = &self.sensors;
+        for ((current, volts), limit) in self.current.iter_mut().zip(volts).zip(s.current_limit) {
+            let asked = -s.convert(volts) * s.command_scale;
+            *current = if enabled { asked.clamp(-limit, limit) } else { 0.0 };
+        }
+        self.arm.advance(self.current);
+        self.sample += 1;
+    }
+}
+
+/// A number of the virtual arm outside its range.
+fn outside(name: &str, value: f64, range: &str) -> Error {
+    Error::OutOfRange {
+        name: name.into(),
+        value,
+        range: range.into(),
+        remedy: "correct the parameters of the virtual arm".into(),
+    }
+}
+
+/// Finest converters: beyond these bits a step is below the rounding of the volts.
+const MOST_BITS: u32 = 52;
+
+impl Sensors {
+    /// Refuses scales, limits and a range that are not positive, noise that is negative, offsets that are not finite and
+    /// converters of more bits than a number has.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`], [`Error::NotFinite`].
+    pub fn check(&self) -> Result<()> {
+        let pairs = [
+            ("strain_scale", self.strain_scale),
+            ("encoder_scale", self.encoder_scale),
+            ("current_limit", self.current_limit),
+            ("travel", self.travel),
+        ];
+        let single = [("sense_scale", self.sense_scale), ("command_scale", self.command_scale), ("range", self.range)];
+        for (name, value) in pairs.iter().flat_map(|(name, v)| v.map(|v| (*name, v))).chain(single) {
+            if !(value > 0.0 && value.is_finite()) {
+                return Err(outside(name, value, "(0, ∞)"));
+            }
+        }
+        if let Some(&noise) = self.noise.iter().find(|v| !(**v >= 0.0 && v.is_finite())) {
+            return Err(outside("noise", noise, "[0, ∞) V"));
+        }
+        check_finite("strain_bias", &self.strain_bias)?;
+        check_finite("sense_bias", &self.sense_bias)?;
+        if self.bits > MOST_BITS {
+            return Err(outside("bits", f64::from(self.bits), &format!("[0, {MOST_BITS}]")));
+        }
+        Ok(())
+    }
+
+    /// Clips to the converters' range and rounds to their steps; what is not a number becomes 0 V.
+    fn convert(&self, volts: f64) -> f64 {
+        if !volts.is_finite() {
+            return 0.0;
+        }
+        if self.bits == 0 {
+            return volts;
+        }
+        let codes = libm::ldexp(1.0, i32::try_from(self.bits).unwrap_or(16));
+        let step = 2.0 * self.range / codes;
+        (volts / step).round().clamp(-codes / 2.0, codes / 2.0 - 1.0) * step
+    }
+}
+
+/// Deadlines of a loop in real time, counted from its start.
+#[derive(Debug)]
+pub struct Pace {
+    start: Instant,
+    step: f64,
+    samples: u64,
+}
+
+/// The system's sleep ends late by some tens of microseconds; the rest is waited out awake.
+const AWAKE: Duration = Duration::from_micros(120);
+
+/// A loop in real time has its next sample within a day \[s\]: no instant overflows.
+const LONGEST_STEP: f64 = 86_400.0;
+
+impl Pace {
+    /// Starts now, with a deadline every `step` s.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a step that is not positive, or longer than a day.
+    pub fn new(step: f64) -> Result<Self> {
+        check_step(step)?;
+        if step > LONGEST_STEP {
+            return Err(outside("step", step, "(0, 86400] s"));
+        }
+        Ok(Self { start: Instant::now(), step, samples: 0 })
+    }
+
+    /// Waits for the next sample instant; how late it is when it returns \[s\].
+    pub fn wait(&mut self) -> f64 {
+        #[allow(clippy::cast_precision_loss)]
+        let due = Duration::try_from_secs_f64(self.step * self.samples as f64)
+            .ok()
+            .and_then(|since| self.start.checked_add(since))
+            .unwrap_or(self.start);
+        self.samples += 1;
+        loop {
+            let now = Instant::now();
+            match due.checked_duration_since(now) {
+                None => return now.duration_since(due).as_secs_f64(),
+                Some(left) if left > AWAKE => std::thread::sleep(left - AWAKE),
+                Some(_) => std::hint::spin_loop(),
+            }
+        }
+    }
+}

@@ -1,0 +1,147 @@
+//! Products of series mod z^m by real transforms, O(m log m), with spectra that are kept for many products.
+
+use crate::fft::{self, Bin, Plan, Workspace};
+
+/// Below this length a product is formed directly: it is faster there and free of transform rounding.
+const DIRECT: usize = 64;
+
+/// Product mod z^m by definition. O(m²).
+pub(super) fn direct(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
+    let mut out = vec![0.0; m];
+    for (i, &x) in a.iter().enumerate().take(m) {
+        for (value, &y) in out[i..].iter_mut().zip(b) {
+            *value += x * y;
+        }
+    }
+    out
+}
+
+/// Product mod z^m, equivalently the causal convolution of a kernel with a signal. O(m log m).
+///
+/// # Panics
+/// Where m points exceed what memory holds, as `vec![0.0; m]` does.
+#[must_use]
+pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
+    let (a, b) = (&a[..a.len().min(m)], &b[..b.len().min(m)]);
+    if a.len().min(b.len()) <= DIRECT {
+        return direct(a, b, m);
+    }
+    let kernel = Kernel::with_length(a, a.len() + b.len());
+    let mut out = vec![0.0; m];
+    kernel.apply(b, &mut out, &mut Buffers::default());
+    out
+}
+
+/// Reusable memory of the transforms of one thread.
+#[derive(Default)]
+pub struct Buffers {
+    time: Vec<f64>,
+    spectrum: Vec<Bin>,
+    workspace: Workspace,
+}
+
+/// A series with its spectrum, to be applied to many signals: two transforms each.
+pub struct Kernel {
+    plan: Plan,
+    spectrum: Vec<Bin>,
+}
+
+impl Kernel {
+    /// Caches a series of length m for signals of up to m points.
+    #[must_use]
+    pub fn new(series: &[f64]) -> Self {
+        Self::with_length(series, 2 * series.len())
+    }
+
+    /// Caches a series for products of up to `total` terms in all factors together.
+    #[must_use]
+    pub fn with_length(series: &[f64], total: usize) -> Self {
+        let plan = fft::plan(fft::fast_length(total));
+        let mut time = vec![0.0; plan.len()];
+        time[..series.len()].copy_from_slice(series);
+        let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
+        plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+        Self { plan, spectrum }
+    }
+
+    /// The first `out.len()` terms of the product with `signal`; neither longer than the length cached for.
+    pub fn apply(&self, signal: &[f64], out: &mut [f64], buffers: &mut Buffers) {
+        buffers.time.clear();
+        buffers.time.extend_from_slice(signal);
+        buffers.time.resize(self.plan.len(), 0.0);
+        buffers.spectrum.resize(self.plan.bins(), Bin::new(0.0, 0.0));
+        let spectrum = &mut buffers.spectrum[..self.plan.bins()];
+        self.plan.forward(&mut buffers.time, spectrum, &mut buffers.workspace);
+        for (x, k) in spectrum.iter_mut().zip(&self.spectrum) {
+            *x *= k;
+        }
+        self.plan.inverse(spectrum, &mut buffers.time, &mut buffers.workspace);
+        let read = out.len().min(buffers.time.len());
+        out[..read].copy_from_slice(&buffers.time[..read]);
+    }
+
+    /// The first `out.len()` terms of the product with another cached series of the same length: one transform.
+    pub fn times(&self, other: &Self, out: &mut [f64], buffers: &mut Buffers) {
+        buffers.spectrum.clear();
+        buffers.spectrum.extend(self.spectrum.iter().zip(&other.spectrum).map(|(x, y)| x * y));
+        buffers.time.resize(self.plan.len(), 0.0);
+        let time = &mut buffers.time[..self.plan.len()];
+        self.plan.inverse(&mut buffers.spectrum, time, &mut buffers.workspace);
+        out.copy_from_slice(&time[..out.len()]);
+    }
+}
+
+/// A sum of products of series, formed in the frequency domain: one inverse transform however many products.
+pub struct SumOfProducts {
+    plan: Plan,
+    spectrum: Vec<Bin>,
+}
+
+impl SumOfProducts {
+    /// An empty sum of products of series of m terms.
+    #[must_use]
+    pub fn new(m: usize) -> Self {
+        Self::with_length(2 * m)
+    }
+
+    /// An empty sum of products of up to `total` terms in all factors together: three factors of m terms need 3m.
+    #[must_use]
+    pub fn with_length(total: usize) -> Self {
+        let plan = fft::plan(fft::fast_length(total));
+        let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
+        Self { plan, spectrum }
+    }
+
+    /// Forgets what was added.
+    pub fn clear(&mut self) {
+        self.spectrum.fill(Bin::new(0.0, 0.0));
+    }
+
+    /// Adds a series by itself.
+    pub fn add_series(&mut self, series: &Kernel) {
+        self.spectrum.iter_mut().zip(&series.spectrum).for_each(|(sum, x)| *sum += x);
+    }
+
+    /// Adds the product of another sum with a series; all cached for the same number of terms.
+    pub fn add_product(&mut self, other: &Self, series: &Kernel) {
+        for ((sum, x), y) in self.spectrum.iter_mut().zip(&other.spectrum).zip(&series.spectrum) {
+            *sum += x * y;
+        }
+    }
+
+    /// Adds weight·a·b; both cached for the same m as the sum.
+    pub fn add(&mut self, weight: f64, a: &Kernel, b: &Kernel) {
+        for ((sum, x), y) in self.spectrum.iter_mut().zip(&a.spectrum).zip(&b.spectrum) {
+            *sum += x * y * weight;
+        }
+    }
+
+    /// The first `out.len()` terms of the sum, which is left empty.
+    pub fn take(&mut self, out: &mut [f64], buffers: &mut Buffers) {
+        buffers.time.resize(self.plan.len(), 0.0);
+        let time = &mut buffers.time[..self.plan.len()];
+        self.plan.inverse(&mut self.spectrum, time, &mut buffers.workspace);
+        out.copy_from_slice(&time[..out.len()]);
+        self.spectrum.fill(Bin::new(0.0, 0.0));
+    }
+}

@@ -1,0 +1,84 @@
+//! Quotients of series, and systems of series solved for one right-hand side or for many.
+
+use super::division::Division;
+use crate::error::{check_length, Error, Result};
+use crate::small;
+
+/// Quotient mod z^m, m the numerator's length; exact whether or not the divisor is stable. O(m log² m).
+///
+/// # Errors
+/// [`Error::LeadingZero`] where the divisor starts with zero, [`Error::Length`] where it is shorter than m.
+pub fn divide(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
+    let quotient = solve(&[vec![divisor]], &[numerator])?;
+    quotient.into_iter().next().ok_or_else(|| Error::Internal { what: "a division without a quotient".into() })
+}
+
+/// Solves the n × n system Σ_j A_ij y_j = b_i of series mod z^m, A_ij of length m at least. O(n² m log² m).
+///
+/// # Errors
+/// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
+pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<Vec<f64>>> {
+    let n = rhs.len();
+    let m = rhs.first().map_or(0, |b| b.len());
+    check_length("matrix of series", n, matrix.len())?;
+    for row in matrix {
+        check_length("row of the matrix of series", n, row.len())?;
+        for series in row {
+            if series.as_ref().len() < m {
+                return Err(Error::Length { name: "series".into(), expected: m, found: series.as_ref().len() });
+            }
+        }
+    }
+    for b in rhs {
+        check_length("right-hand side", m, b.len())?;
+    }
+    // An empty series starts with nothing, which cannot be divided by either.
+    let first = |s: &S| s.as_ref().first().copied().unwrap_or(0.0);
+    let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(first)).collect();
+    let inverse = small::inverse(&leading, n)?;
+    let mut division = Division::new(n, m);
+    division.run(matrix, &inverse, rhs);
+    Ok(division.into_quotients())
+}
+
+/// A system of series that is solved for many right-hand sides: the spectra of its matrix are made once.
+pub struct Solver<'a> {
+    matrix: &'a [Vec<Vec<f64>>],
+    inverse: Vec<f64>,
+    division: Division,
+}
+
+impl<'a> Solver<'a> {
+    /// Takes an n × n matrix of series of m terms.
+    ///
+    /// # Errors
+    /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
+    pub fn new(matrix: &'a [Vec<Vec<f64>>]) -> Result<Self> {
+        let n = matrix.len();
+        let m = matrix.first().and_then(|row| row.first()).map_or(0, Vec::len);
+        for row in matrix {
+            check_length("row of the matrix of series", n, row.len())?;
+            for series in row {
+                check_length("series", m, series.len())?;
+            }
+        }
+        let first = |s: &Vec<f64>| s.first().copied().unwrap_or(0.0);
+        let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(first)).collect();
+        Ok(Self { matrix, inverse: small::inverse(&leading, n)?, division: Division::new(n, m) })
+    }
+
+    /// Solves for one right-hand side of n series of m terms.
+    ///
+    /// # Errors
+    /// [`Error::Length`].
+    pub fn solve(&mut self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
+        check_length("right-hand sides", self.matrix.len(), rhs.len())?;
+        for b in rhs {
+            check_length("right-hand side", self.division.terms(), b.len())?;
+        }
+        let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
+        self.division.restart();
+        self.division.run(self.matrix, &self.inverse, &borrowed);
+        Ok(self.division.quotients().to_vec())
+    }
+}

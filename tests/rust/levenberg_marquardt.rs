@@ -1,0 +1,117 @@
+//! Levenberg–Marquardt by itself: problems whose minimum is known in closed form, and one that no step can lower.
+
+use ftlm::error::{Error, Result};
+use ftlm::estimate::output_error::levenberg_marquardt::{minimise, Problem, Settings, Status};
+
+use crate::common::{check, dense_solve, distance, Random};
+
+/// Residuals and their derivatives by formula, every parameter stepped as it is.
+struct Closed<R, J> {
+    residuals: R,
+    jacobian: J,
+}
+
+impl<R, J> Problem for Closed<R, J>
+where
+    R: Fn(&[f64]) -> Result<Vec<f64>>,
+    J: Fn(&[f64]) -> Vec<Vec<f64>>,
+{
+    type Point = Vec<f64>;
+    type Evaluation = Vec<f64>;
+
+    fn evaluate(&self, point: &Vec<f64>) -> Result<Vec<f64>> {
+        (self.residuals)(point)
+    }
+
+    fn residuals<'a>(&self, evaluation: &'a Vec<f64>) -> &'a [f64] {
+        evaluation
+    }
+
+    fn jacobian(&self, point: &Vec<f64>, _: &Vec<f64>) -> Result<Vec<Vec<f64>>> {
+        Ok((self.jacobian)(point))
+    }
+
+    fn moved(&self, point: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
+        let next = point.iter().zip(steps).map(|(x, d)| x + d).collect();
+        (next, steps.iter().fold(0.0, |a, d| a.max(d.abs())))
+    }
+}
+
+fn settings(evaluations: usize) -> Settings {
+    Settings { evaluations, tolerance: 1e-14 }
+}
+
+#[test]
+fn the_bottom_of_rosenbrocks_valley_is_found() {
+    let problem = Closed {
+        residuals: |x: &[f64]| Ok(vec![1.0 - x[0], 10.0 * (x[1] - x[0] * x[0])]),
+        jacobian: |x: &[f64]| vec![vec![-1.0, -20.0 * x[0]], vec![0.0, 10.0]],
+    };
+    let found = minimise(&problem, vec![-1.2, 1.0], settings(200)).unwrap();
+    assert_eq!(found.status, Status::Converged);
+    check("distance from (1, 1)", distance(&found.point, &[1.0, 1.0]), 1e-10);
+    check("cost", found.cost, 1e-20);
+}
+
+#[test]
+fn a_linear_problem_is_solved_like_its_normal_equations() {
+    let mut random = Random::new(501);
+    let (n, k) = (40, 4);
+    let columns: Vec<Vec<f64>> = (0..k).map(|_| random.signal(n)).collect();
+    let target = random.signal(n);
+    let problem = Closed {
+        residuals: |x: &[f64]| {
+            Ok((0..n).map(|i| columns.iter().zip(x).map(|(c, x)| c[i] * x).sum::<f64>() - target[i]).collect())
+        },
+        jacobian: |_: &[f64]| columns.clone(),
+    };
+    let found = minimise(&problem, vec![0.0; k], settings(50)).unwrap();
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+    let gram: Vec<f64> = columns.iter().flat_map(|a| columns.iter().map(|b| dot(a, b))).collect();
+    let rhs: Vec<f64> = columns.iter().map(|a| dot(a, &target)).collect();
+    assert_eq!(found.status, Status::Converged);
+    check("linear least squares", distance(&found.point, &dense_solve(&gram, &rhs)), 1e-9);
+}
+
+#[test]
+fn a_problem_whose_slopes_lie_stalls() {
+    // The derivative has the wrong sign: every step, however short, raises the cost.
+    let problem =
+        Closed { residuals: |x: &[f64]| Ok(vec![1.0 + x[0] * x[0] + x[0]]), jacobian: |_: &[f64]| vec![vec![-1.0]] };
+    let found = minimise(&problem, vec![0.0], Settings { evaluations: 1000, tolerance: 0.0 }).unwrap();
+    assert_eq!(found.status, Status::Stalled);
+    assert_eq!(found.point, [0.0]);
+}
+
+#[test]
+fn steps_into_where_nothing_is_defined_are_shortened() {
+    // ln x − 3 from x = 1: the full step is past nothing, but from x = 0.01 Gauss–Newton's is.
+    let problem = Closed {
+        residuals: |x: &[f64]| {
+            if x[0] > 25.0 || x[0] <= 0.0 {
+                return Err(Error::Diverged { what: "logarithm".into(), index: 0 });
+            }
+            Ok(vec![x[0].ln() - 3.0])
+        },
+        jacobian: |x: &[f64]| vec![vec![1.0 / x[0]]],
+    };
+    let found = minimise(&problem, vec![24.9], settings(200)).unwrap();
+    check("e^3", (found.point[0] - 3.0_f64.exp()).abs(), 1e-9);
+}
+
+#[test]
+fn few_evaluations_and_bad_columns_are_said() {
+    let rosenbrock = Closed {
+        residuals: |x: &[f64]| Ok(vec![1.0 - x[0], 10.0 * (x[1] - x[0] * x[0])]),
+        jacobian: |x: &[f64]| vec![vec![-1.0, -20.0 * x[0]], vec![0.0, 10.0]],
+    };
+    let found = minimise(&rosenbrock, vec![-1.2, 1.0], settings(3)).unwrap();
+    assert_eq!((found.status, found.evaluations), (Status::Exhausted, 3));
+    let short = Closed { residuals: |_: &[f64]| Ok(vec![1.0, 2.0]), jacobian: |_: &[f64]| vec![vec![1.0]] };
+    assert!(matches!(minimise(&short, vec![0.0], settings(3)), Err(Error::Length { .. })));
+    let nowhere = Closed {
+        residuals: |_: &[f64]| Err(Error::Diverged { what: "free run".into(), index: 3 }),
+        jacobian: |_: &[f64]| Vec::new(),
+    };
+    assert!(matches!(minimise(&nowhere, vec![0.0], settings(3)), Err(Error::Diverged { .. })));
+}
