@@ -363,14 +363,12 @@ def _path(line: _Line, plot: _Plot, points: int) -> str:
     if kept.size == 0:
         return ""
     xs, ys = plot.tenths(line.x[kept], line.y[kept])
-    missing = np.cumsum(~np.isfinite(line.y))[kept]
-    parts: list[str] = []
-    for i in range(kept.size):
-        if i == 0 or missing[i] != missing[i - 1]:
-            # A line of no length: a lone point between gaps still shows, as a dot.
-            parts.append(f"M{xs[i]} {ys[i]}h0")
-        else:
-            parts.append(f"l{xs[i] - xs[i - 1]} {ys[i] - ys[i - 1]}")
+    starts = np.diff(np.cumsum(~np.isfinite(line.y))[kept], prepend=-1) != 0
+    # A line of no length, h0: a lone point between gaps still shows, as a dot.
+    parts = [
+        f"M{x} {y}h0" if start else f"l{x - before} {y - above}"
+        for x, y, before, above, start in zip(xs, ys, [0, *xs], [0, *ys], starts.tolist(), strict=False)
+    ]
     return "".join(parts).replace(" -", "-")
 
 
