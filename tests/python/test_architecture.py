@@ -174,7 +174,7 @@ def test_one_file_uses_a_crate_of_linear_algebra_or_transforms(crate, home):
 @pytest.mark.parametrize("crate", ["pyo3", "numpy"])
 def test_only_the_bindings_know_python(crate):
     users = {name_of(path.parent) for path in RUST if uses(path, crate)}
-    assert users == {"rust/python"}
+    assert users == {"rust/python", "rust/python/search"}
 
 
 def test_bindings_are_an_optional_feature():
@@ -190,7 +190,7 @@ def test_rust_does_no_files_clocks_or_unsafe_code():
         code = code_of(path)
         assert "std::fs" not in code, path
         assert not re.search(r"\bunsafe\b(?!_)", code), path
-        if path.name not in ("virtual_arm.rs", "search.rs"):
+        if path.name not in ("virtual_arm.rs", "watch.rs"):
             assert "std::time" not in code, path
 
 

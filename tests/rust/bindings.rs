@@ -39,10 +39,11 @@ fn entries(text: &str) -> Vec<(String, String)> {
 fn every_entry_goes_through_a_wrapper() {
     let folder = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("rust/python");
     let mut count = 0;
-    for file in ["estimate.rs", "operators.rs", "simulate.rs", "virtual_arm.rs"] {
+    let searches = ["search/orders.rs", "search/stage.rs", "search/points.rs"];
+    for file in ["estimate.rs", "operators.rs", "simulate.rs", "virtual_arm.rs"].into_iter().chain(searches) {
         let text = std::fs::read_to_string(folder.join(file)).unwrap();
         for (name, body) in entries(&text) {
-            let ways = ["detached(py", "attached(", "transformed(py"];
+            let ways = ["detached(py", "attached(", "transformed(py", "watched(py", "saved(py"];
             assert!(ways.iter().any(|way| body.contains(way)), "{file}: {name} computes outside the wrappers");
             count += 1;
         }
