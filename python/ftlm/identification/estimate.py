@@ -21,7 +21,7 @@ from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.identification.judged import Task
 from ftlm.identification.warnings import broken_law, uncertain
-from ftlm.judge.comparison import compare
+from ftlm.judge.comparison import compare_means
 from ftlm.model.model import Model
 from ftlm.search.job import run_job
 from ftlm.search.orders import make_job
@@ -170,7 +170,7 @@ def coupled_rank(task: Task, settings: Settings, m: int | None, search: SearchRe
         at_orders = task.structure.with_orders(row.orders)
         try:
             fit = estimate_coefficients(task.runs, at_orders, settings, m)
-            comparison = compare(Model(at_orders.with_coefficients(fit.values), m=fit.m), task.runs, m=fit.m)
+            comparison = compare_means(Model(at_orders.with_coefficients(fit.values), m=fit.m), task.runs, m=fit.m)
         except FtlmError:
             # It has a score in the table, but no model.
             continue

@@ -20,10 +20,11 @@ from ftlm.identification.estimate import Fit, by_genetic_algorithm, by_lattice, 
 from ftlm.identification.judged import Task
 from ftlm.identification.result import Identification
 from ftlm.identification.warnings import discretisation, growing, unexcited
-from ftlm.judge.comparison import Comparison, compare
+from ftlm.judge.comparison import Comparison, compared_samples, free_runs
 from ftlm.judge.criteria import InformationCriteria, information_criteria
 from ftlm.judge.metrics import finite
-from ftlm.judge.residuals import Residuals, resid, residual_warnings
+from ftlm.judge.residuals import LAGS, Residuals, residual_warnings, tested_residuals
+from ftlm.solve.records import default_m
 
 METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
 #: Residuals of an output-error fit below this share of the output are rounding and discretisation.
@@ -131,14 +132,15 @@ def identify(
 
 def judged(fit: Fit) -> Identification:
     """Both errors, residual tests, information criteria and everything that makes a fit doubtful."""
-    runs, model = fit.task.runs, fit.model
-    comparison = compare(model, runs, m=model.m)
+    runs, model = as_runs(fit.task.runs), fit.model
+    free = free_runs(model, runs)
+    comparison = compared_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
     warnings = [*comparison.warnings, *fit.warnings]
     warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings] + unexcited(runs, fit.task.structure)
     warnings += discretisation(model, comparison) + growing(model)
     tests, criteria = None, None
     try:
-        tests = resid(model, runs)
+        tests = tested_residuals(model, runs, free, lags=LAGS)
         criteria = information_criteria(tests, fit.parameters)
     except DataError:
         # A run that is too short for correlations; everything else can be told.

@@ -17,8 +17,8 @@ from ftlm.paint.text import number, symbol
 
 
 def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
-    """Return the middle of every block pulse of a run of a comparison [s], at which its means are drawn."""
-    return np.asarray((np.arange(comparison.m) + 0.5) * comparison.step[run], dtype=np.float64)
+    """Return when each value of a run of a comparison holds [s]: its instants, or the middle of every block pulse."""
+    return comparison.times[run]
 
 
 def comparison_charts(

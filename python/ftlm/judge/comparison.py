@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import astuple, dataclass, field
+from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.frames import to_frame
 from ftlm.data.run import Run
-from ftlm.data.several import as_runs
+from ftlm.data.several import Runs, as_runs
 from ftlm.data.solved import Solved, check_solved
 from ftlm.data.structures import Structure
 from ftlm.judge.metrics import Metrics, pooled
@@ -21,6 +21,7 @@ from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol_html
 from ftlm.solve.free_run import compared, respond
 from ftlm.solve.records import Record, check_m, default_m, equation_tuple, initial_tuple, records
+from ftlm.solve.sampled import Sampled, measured_samples, refined
 
 #: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
 NEAR_IDENTITY = 0.25
@@ -30,6 +31,11 @@ FLATTERED = 5.0
 LOST = 20.0
 #: A free run with a normalised residual above this explains nothing.
 USELESS = 0.5
+#: Free runs are refined until halving the step moves them by less than this share of their largest value,
+STILL = 1e-6
+#: or to so many pulses; what still moves by more than VISIBLE then is said.
+LARGEST_M = 1 << 20
+VISIBLE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -44,16 +50,20 @@ class Comparison:
     per_run
         The same for each run by name: (equation error, output error).
     simulated, measured
-        Pulse means by output, one array a run.
+        By output, one array a run: samples at the run's instants, or pulse means (see ``sampled``).
     step
-        Pulse width of each run [s].
+        Pulse width of each run [s], of the equation error.
     m
-        Number of block pulses.
+        Number of block pulses of the equation error.
     initial
         Coefficients of the initial terms of the free run, one mapping a run: output -> exponent -> value. They belong
         to that run alone.
     warnings
         What makes these figures doubtful, in words.
+    times
+        When each value of ``simulated`` and ``measured`` holds [s since the first row], one array a run.
+    sampled
+        Whether the output error is that of samples at the run's instants; False for pulse means, as the paper has them.
     """
 
     output_error: dict[str, Metrics]
@@ -65,6 +75,8 @@ class Comparison:
     m: int
     initial: list[dict[str, dict[float, float]]]
     warnings: tuple[str, ...] = field(default=())
+    times: list[Floats] = field(default_factory=list)
+    sampled: bool = True
 
     @property
     def fit_percent(self) -> dict[str, float]:
@@ -107,7 +119,11 @@ class Comparison:
                 lines.append(
                     f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>10.4g}"
                 )
-        lines.append(f"over {self.m} block pulses a run")
+        if self.sampled:
+            count = sum(t.size for t in self.times)
+            lines.append(f"output error over {count} samples, equation error over {self.m} block pulses a run")
+        else:
+            lines.append(f"over {self.m} block pulses a run")
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
 
@@ -118,6 +134,10 @@ class Comparison:
 def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
     """Equation error and output error of a model on measured runs.
 
+    The output error compares sample by sample: y[k], after the input of its row has acted, with the free run at that
+    instant on a grid refined until it stands still (as :func:`ftlm.simulate` has it), initial terms fitted to the run's
+    samples. Its fit is 100 (1 - ‖y - ŷ‖ / ‖y - mean y‖), in percent.
+
     Parameters
     ----------
     model
@@ -125,7 +145,7 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
     runs
         One run or several with the same names and units.
     m
-        Number of block pulses a run; default that of the identification, or what the runs carry.
+        Number of block pulses a run for the equation error; default that of the identification, or what the runs carry.
 
     Returns
     -------
@@ -139,6 +159,52 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
     ModelError
         An m that the runs do not carry.
     """
+    several, m = _checked(model, runs, m)
+    return compared_samples(model, several, free_runs(model, several), m=m)
+
+
+def free_runs(model: Solved, runs: Sequence[Run]) -> list[Sampled]:
+    """The free run on each run, with initial terms fitted to it, on a grid fine enough not to matter."""
+    return [refined(model, run, None, tolerance=STILL, largest_m=max(LARGEST_M, 2 * run.length)) for run in runs]
+
+
+def compared_samples(model: Solved, runs: Runs, free: Sequence[Sampled], *, m: int) -> Comparison:
+    """Compare free runs, sample by sample, and the equation error on m pulses, with these runs."""
+    full = records(runs, model.structure, m)
+    parts = []
+    for run, sampled, rec in zip(runs, free, full, strict=True):
+        measured = dict(zip(model.outputs, measured_samples(model, run, sampled.refinement), strict=True))
+        simulated = dict(zip(model.outputs, sampled.outputs, strict=True))
+        parts.append(_beside(model, rec, simulated, measured, sampled.initial))
+    found = _comparison(model, runs, parts, m, [run.time for run in runs], sampled=True)
+    restless = [run.name for run, sampled in zip(runs, free, strict=True) if _moves(sampled)]
+    words = f"the free run on {', '.join(restless)} still moves with the step at the finest grid: the model is stiffer "
+    words += "than these samples can show, and its output error is provisional"
+    return replace(found, warnings=(*found.warnings, words)) if restless else found
+
+
+def _moves(sampled: Sampled) -> bool:
+    """Whether halving the step still moves a finite run visibly."""
+    return bool(np.all(np.isfinite(sampled.outputs)) and np.any(sampled.change > VISIBLE))
+
+
+def compare_means(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
+    """Both errors on the pulse means of m block pulses, as the paper's tables have them.
+
+    Means average neighbours: with noise they flatter, and where few pulses carry a period they condemn.
+    """
+    several, m = _checked(model, runs, m)
+    pairs = zip(compared(several, model, m), records(several, model.structure, m), strict=True)
+    parts = []
+    for free, full in pairs:
+        responses, initial = respond(model, free)
+        parts.append(_beside(model, full, responses, {o: free.of(o) for o in model.outputs}, initial))
+    middles = [np.asarray((np.arange(m) + 0.5) * p.step, dtype=np.float64) for p in parts]
+    return _comparison(model, several, parts, m, middles, sampled=False)
+
+
+def _checked(model: Solved, runs: Run | Sequence[Run], m: int | None) -> tuple[Runs, int]:
+    """Runs that hold what the model needs, and the number of pulses."""
     check_solved(model)
     several = as_runs(runs)
     carried = min(run.length for run in several) - 1
@@ -146,15 +212,7 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
     m = check_m(chosen, several, power_of_two=False)
     for run in several:
         run.require_outputs([o for o in model.outputs if o in run])
-    pairs = zip(compared(several, model, m), records(several, model.structure, m), strict=True)
-    parts = [_beside(model, free, full) for free, full in pairs]
-    equation_error, output_error = _figures(parts)
-    return Comparison(
-        output_error, equation_error, [(run.name, *_figures([p])) for run, p in zip(several, parts, strict=True)],
-        {o: [p.simulated[o] for p in parts] for o in model.outputs},
-        {o: [p.measured[o] for p in parts] for o in model.outputs}, [p.step for p in parts], m,
-        [p.initial for p in parts], tuple(near_identity(model.structure, equation_error, output_error)),
-    )  # fmt: skip
+    return several, m
 
 
 @dataclass(frozen=True)
@@ -169,15 +227,29 @@ class _Beside:
     missed: dict[str, Floats]
 
 
-def _beside(model: Solved, free: Record, full: Record) -> _Beside:
-    """Free run and equation error on one run: as it is compared, and with all signals behind the sensor filter."""
-    responses, initial = respond(model, free)
+def _beside(
+    model: Solved, full: Record, simulated: dict[str, Floats], measured: dict[str, Floats],
+    initial: dict[str, dict[float, float]],
+) -> _Beside:  # fmt: skip
+    """A free run with what it is compared with, and the equation error, with all signals behind the sensor filter."""
     core, inputs, powers = full.core(), list(full.inputs), initial_tuple(full.initial)
     missed = {
         e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers) for e in model.equations
     }
-    measured, equated = ({o: rec.of(o) for o in model.outputs} for rec in (free, full))
-    return _Beside(free.step, initial, responses, measured, equated, missed)
+    return _Beside(full.step, initial, simulated, measured, {o: full.of(o) for o in model.outputs}, missed)
+
+
+def _comparison(
+    model: Solved, runs: Sequence[Run], parts: Sequence[_Beside], m: int, times: list[Floats], *, sampled: bool
+) -> Comparison:
+    """All runs together."""
+    equation_error, output_error = _figures(parts)
+    return Comparison(
+        output_error, equation_error, [(run.name, *_figures([p])) for run, p in zip(runs, parts, strict=True)],
+        {o: [p.simulated[o] for p in parts] for o in model.outputs},
+        {o: [p.measured[o] for p in parts] for o in model.outputs}, [p.step for p in parts], m,
+        [p.initial for p in parts], tuple(near_identity(model.structure, equation_error, output_error)), times, sampled,
+    )  # fmt: skip
 
 
 def _figures(parts: Sequence[_Beside]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:

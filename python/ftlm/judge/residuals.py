@@ -18,17 +18,14 @@ from ftlm.base.checks import whole_number
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.statistics import LEVEL, NORMAL_99, chi_squared_99, ljung_box
 from ftlm.data.run import Run
-from ftlm.data.several import as_runs
+from ftlm.data.several import Runs, as_runs
 from ftlm.data.solved import Solved, check_solved
+from ftlm.judge.comparison import free_runs
 from ftlm.judge.metrics import finite
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, symbol_html
-from ftlm.solve.free_run import compared, respond
+from ftlm.solve.sampled import Sampled, measured_samples
 
-#: Refinement of the grid ends when it changes residuals by less than this share of their size.
-SETTLED = 0.05
-#: ... or at this many pulses.
-LARGEST_M = 1 << 18
 #: Residuals below this share of the output's deviation are discretisation or quantisation, not a missing term.
 NEGLIGIBLE = 1e-3
 
@@ -192,7 +189,11 @@ class Residuals:
         return residuals_html(self)
 
 
-def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = 25) -> Residuals:
+#: Lags of the tests that every identification makes; the convention of the field.
+LAGS = 25
+
+
+def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Residuals:
     """Test whether the residuals of a model's free run are white, and independent of the inputs.
 
     Residuals are measured samples minus the free run at the same instants, with initial terms fitted to each run, on a
@@ -233,56 +234,40 @@ def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = 25) -> Residu
     count = whole_number(lags)
     if count is None or count < 1:
         raise ModelError(f"lags = {lags!r} is no number of lags; give a whole number, at least 1")
+    check_length(several, count)
     for run in several:
-        if run.length < 2 * count + 3:
+        run.require_outputs([o for o in model.outputs if o in run])
+    return tested_residuals(model, several, free_runs(model, several), lags=count)
+
+
+def check_length(runs: Runs, lags: int) -> None:
+    """Refuse runs that are too short for these lags."""
+    for run in runs:
+        if run.length < 2 * lags + 3:
             raise DataError(
-                f"run {run.name!r} has {run.length} rows, correlations up to {count} lags need {2 * count + 3}; "
+                f"run {run.name!r} has {run.length} rows, correlations up to {lags} lags need {2 * lags + 3}; "
                 "give a longer run or fewer lags"
             )
-        run.require_outputs([o for o in model.outputs if o in run])
-    refinement, residuals, initial_terms = _settled(model, several)
-    read = [s for s in model.structure.signals if s not in model.outputs and s in several[0]]
-    inputs = list(dict.fromkeys([*several[0].inputs, *read]))
-    signals = {n: [np.ascontiguousarray(run[n][1:-1]) for run in several] for n in inputs}
+
+
+def tested_residuals(model: Solved, runs: Runs, free: Sequence[Sampled], *, lags: int) -> Residuals:
+    """Both tests of the residuals of free runs at the inner samples of these runs; refuse runs that are too short."""
+    check_length(runs, lags)
+    residuals: dict[str, list[Floats]] = {o: [] for o in model.outputs}
+    for run, sampled in zip(runs, free, strict=True):
+        with np.errstate(invalid="ignore"):
+            missed = measured_samples(model, run, sampled.refinement) - sampled.outputs
+        for name, series in zip(model.outputs, missed, strict=True):
+            residuals[name].append(np.ascontiguousarray(series[1:-1]))
+    read = [s for s in model.structure.signals if s not in model.outputs and s in runs[0]]
+    inputs = list(dict.fromkeys([*runs[0].inputs, *read]))
+    signals = {n: [np.ascontiguousarray(run[n][1:-1]) for run in runs] for n in inputs}
     outputs = {}
     for name in model.outputs:
-        deviation = math.sqrt(float(np.mean([np.var(run[name]) for run in several])))
-        outputs[name] = _tested(residuals[name], signals, count, deviation)
-    steps = tuple(run.step for run in several)
-    return Residuals(outputs, tuple(run.name for run in several), steps, refinement, initial_terms)
-
-
-def _settled(model: Solved, runs: Sequence[Run]) -> tuple[int, dict[str, list[Floats]], int]:
-    """Residuals on a grid refined until they stand still, and the number of initial terms fitted."""
-    every = 1
-    residuals, terms = _residuals(model, runs, every)
-    while 2 * every * max(run.length for run in runs) <= LARGEST_M:
-        finer, terms = _residuals(model, runs, 2 * every)
-        pairs = [(a, b) for name in residuals for a, b in zip(residuals[name], finer[name], strict=True)]
-        residuals, every = finer, 2 * every
-        with np.errstate(over="ignore", invalid="ignore"):
-            moved = [float(np.linalg.norm(a - b)) > SETTLED * float(np.linalg.norm(b)) for a, b in pairs]
-        if not any(moved):
-            break
-    return every, residuals, terms
-
-
-def _residuals(model: Solved, runs: Sequence[Run], every: int) -> tuple[dict[str, list[Floats]], int]:
-    """Residuals at the inner samples of each run, on ``every`` pulses a sample interval."""
-    out: dict[str, list[Floats]] = {o: [] for o in model.outputs}
-    terms = 0
-    sensor = model.structure.sensor_filter
-    for run in runs:
-        (rec,) = compared([run], model, (run.length - 1) * every)
-        responses, initial = respond(model, rec)
-        terms += sum(len(t) for t in initial.values())
-        for name in model.outputs:
-            through = rec.sensor is None or (sensor is not None and name in sensor.outputs)
-            # An equation compared in filtered signals has its measured output filtered, too.
-            measured = run[name] if through else _core.point_samples(rec.of(name))[::every]
-            simulated = _core.point_samples(responses[name])[::every]
-            out[name].append(np.ascontiguousarray((measured - simulated)[1:-1]))
-    return out, terms
+        deviation = math.sqrt(float(np.mean([np.var(run[name]) for run in runs])))
+        outputs[name] = _tested(residuals[name], signals, lags, deviation)
+    steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
+    return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
 
 
 def _tested(series: list[Floats], signals: Mapping[str, list[Floats]], lags: int, deviation: float) -> OutputResiduals:

@@ -21,7 +21,7 @@ from ftlm.fit.recursion import Trace, multi_innovation_trace
 from ftlm.identification.identify import identify
 from ftlm.identification.result import Identification
 from ftlm.judge.charts import pulse_times
-from ftlm.judge.comparison import Comparison, compare
+from ftlm.judge.comparison import Comparison, compare_means
 from ftlm.judge.metrics import metrics
 from ftlm.model.model import Model
 from ftlm.paper import printed
@@ -109,15 +109,13 @@ class StageWork:
         alike = self.preset.alike
         m = default_m([self.on], power_of_two=True) if alike else model.m
         model = model if model.m == m else replace(model, m=m)
-        own = () if result is None or result.task is None else result.task.runs
-        known = result.comparison if result is not None and any(run is self.on for run in own) else None
-        estimation = known if known is not None and known.m == m else compare(model, self.on)
-        validation = None if self.off is None else compare(model, self.off)
+        estimation = compare_means(model, self.on)
+        validation = None if self.off is None else compare_means(model, self.off)
         alone = {}
         if alike and len(model.equations) > 1:
             coupled = replace(model, structure=replace(model.structure, coupling="simulated"))
             runs = [run for run in (self.on, self.off) if run is not None]
-            alone = {run.name: compare(coupled, run).output_error for run in runs}
+            alone = {run.name: compare_means(coupled, run).output_error for run in runs}
         return Candidate(label, model, estimation, validation, alone, result)
 
     def identified(self, label: str, run: Run, structure: Structure, **options: Any) -> Candidate:
@@ -270,7 +268,7 @@ class StageWork:
             terms = [replace(t, order=Order(order)) if t.signal in self.on.inputs else t for t in item.terms]
             equations.append(replace(item, terms=tuple(terms)) if item.output == output else item)
         other = replace(model, structure=replace(model.structure, equations=tuple(equations)))
-        published, derived = (compare(m, self.on) for m in (model, other))
+        published, derived = (compare_means(m, self.on) for m in (model, other))
         return Derived(
             output, order, pulse_times(published), published.simulated[output][0], derived.simulated[output][0]
         )

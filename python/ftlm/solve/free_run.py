@@ -15,10 +15,7 @@ from ftlm.data.run import Run
 from ftlm.data.solved import Solved, check_solved
 from ftlm.data.structures import check_initial
 from ftlm.solve.records import MAX_M, Record, equation_tuple, initial_tuple, records, sensor_series
-
-#: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
-#: least from which a sample follows that no jump of a held input at its instant has reached.
-FIRST_REFINEMENT = 2
+from ftlm.solve.sampled import refined
 
 
 def compared(runs: Sequence[Run], model: Solved, m: int) -> list[Record]:
@@ -73,7 +70,8 @@ def simulate(
 
     The grid is the record's own, refined under the inputs' inter-sample behaviour (a held command stays exact) and
     extrapolated in the step (second order), until halving the step moves no output by more than ``tolerance`` of its
-    largest value. A sample is read before the input of its row acts, so that a run at rest starts with zeros.
+    largest value. A sample belongs to its instant after the input of its row has acted: a term of the equation's own
+    order (direct feed-through) shows at once, everything else is continuous there.
 
     Parameters
     ----------
@@ -115,28 +113,23 @@ def simulate(
     largest_m = min(largest_m, MAX_M)
     if own > largest_m:
         raise ModelError(f"run {run.name!r} has {own} intervals, more than {largest_m}; slice it")
-    refinement = FIRST_REFINEMENT
-    complete = _completed(run, model)
-    coarse = _samples(model, complete, own * refinement, initial)
-    extrapolated: Floats | None = None
-    while True:
-        refinement *= 2
-        if own * refinement > largest_m:
+    free = refined(model, _completed(run, model), initial or {}, tolerance=tolerance, largest_m=largest_m)
+    for name, samples in zip(model.outputs, free.outputs, strict=True):
+        if not np.all(np.isfinite(samples)):
+            at = int(np.argmax(~np.isfinite(samples))) * run.step
             raise ConvergenceError(
-                f"the response of {', '.join(model.outputs)} still moves by more than {tolerance:g} of its size at "
-                f"{own * refinement // 2} pulses; raise tolerance or largest_m, or check that the model is stable"
+                f"the free run of {name} leaves the range of numbers {at:.4g} s into run {run.name!r}; "
+                "the model is unstable: check its orders and coefficients"
             )
-        fine = _samples(model, complete, own * refinement, initial)
-        best = (4.0 * fine - coarse) / 3.0
-        if extrapolated is not None:
-            change = np.max(np.abs(best - extrapolated), axis=1)
-            if np.all(change <= tolerance * np.max(np.abs(best), axis=1)):
-                break
-        extrapolated, coarse = best, fine
+    if not np.all(free.change <= tolerance):
+        raise ConvergenceError(
+            f"the response of {', '.join(model.outputs)} still moves by more than {tolerance:g} of its size at "
+            f"{own * free.refinement} pulses; raise tolerance or largest_m, or check that the model is stable"
+        )
     return Run.from_arrays(
         step=run.step,
         inputs={n: run[n] for n in run.inputs},
-        outputs={n: best[i] for i, n in enumerate(model.outputs)},
+        outputs={n: free.outputs[i] for i, n in enumerate(model.outputs)},
         units={n: u for n, u in _units(model, run).items() if u},
         intersample=run.intersample,
         name=f"{run.name}, simulated",
@@ -168,67 +161,6 @@ def _completed(run: Run, model: Solved) -> Run:
         intersample=run.intersample,
         name=run.name,
     )
-
-
-def _samples(model: Solved, run: Run, m: int, initial: Mapping[str, Mapping[float, float]] | None) -> Floats:
-    """Point samples at the run's instants from a simulation on m pulses."""
-    structure = model.structure
-    coupled = structure.coupling == "simulated"
-    (rec,) = compared([run], model, m)
-    equations = [equation_tuple(e, rec.signals) for e in model.equations]
-    terms = [sorted((initial or {}).get(o, {}).items()) for o in model.outputs]
-    inputs = list(rec.inputs)
-    if coupled:
-        means = _core.respond(rec.core(), equations, inputs, terms)
-        series = sensor_series(structure, m, rec.step)
-        if series is not None and structure.sensor_filter is not None:
-            for i, name in enumerate(model.outputs):
-                if name in structure.sensor_filter.outputs and np.all(np.isfinite(means[i])):
-                    means[i] = _core.series_multiply(series, means[i], m)
-    else:
-        means = np.concatenate(
-            [_core.respond(rec.core(), [e], inputs, [t]) for e, t in zip(equations, terms, strict=True)]
-        )
-    for i, name in enumerate(model.outputs):
-        if not np.all(np.isfinite(means[i])):
-            at = int(np.argmax(~np.isfinite(means[i]))) * run.duration / m
-            raise ConvergenceError(
-                f"the free run of {name} leaves the range of numbers {at:.4g} s into run {run.name!r}; "
-                "the model is unstable: check its orders and coefficients"
-            )
-    # The last two pulses before each instant, extended to it: a command that changes there has not acted yet, so the
-    # extrapolation crosses none of the kinks t^alpha that jumps of a held input leave.
-    every = m // (run.length - 1)
-    samples = 1.5 * means[:, every - 1 :: every] - 0.5 * means[:, every - 2 :: every]
-    return np.concatenate([_first(model, run, initial)[:, None], samples], axis=1)
-
-
-def _first(model: Solved, run: Run, initial: Mapping[str, Mapping[float, float]] | None) -> Floats:
-    """Return the outputs at the first instant, before a held input acts: initial terms and direct feed-through."""
-    structure, names = model.structure, model.outputs
-    coupled, sensor = structure.coupling == "simulated", structure.sensor_filter
-    gain = 1.0
-    if sensor is not None:
-        highest = max(order for coefficient, order in sensor.denominator if coefficient)
-        top = [sum(c for c, order in part if order == highest) for part in (sensor.numerator, sensor.denominator)]
-        gain = top[0] / top[1]
-    system, known = np.eye(len(names)), np.zeros(len(names))
-    for i, item in enumerate(model.equations):
-        known[i] = (initial or {}).get(item.output, {}).get(0.0, 0.0)
-        for term in item.terms:
-            signal, factor = term.signal, float(term.fixed or 0.0)
-            if term.order.constant != item.order.constant or signal not in (*names, *run.signals):
-                continue
-            if coupled and signal in names:
-                system[i, names.index(signal)] -= factor
-            elif run.intersample.get(signal) != "zoh" and not structure.delay.get(signal):
-                through = sensor is not None and not coupled and signal not in sensor.outputs
-                known[i] += factor * float(run[signal][0]) * (gain if through else 1.0)
-    first: Floats = np.asarray(np.linalg.lstsq(system, known, rcond=None)[0], dtype=np.float64)
-    for i, name in enumerate(names):
-        if coupled and sensor is not None and name in sensor.outputs:
-            first[i] *= gain
-    return first
 
 
 def explicit_euler(model: Solved, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:
