@@ -9,7 +9,7 @@ import pytest
 import ftlm
 import oracles
 from ftlm import _core
-from ftlm.judge.comparison import near_identity
+from ftlm.judge.comparison import compare_means, near_identity
 
 
 def noisy(run, sigma, seed):
@@ -88,7 +88,7 @@ def test_the_true_model_fits_its_own_run(small_model, small_run):
 def test_free_run_and_equation_error_are_the_oracles(small_model, small_run, with_noise):
     run = with_noise(small_run, 0.02, 1)
     m, duration = 128, run.duration
-    found = small_model.compare(run, m=m)
+    found = compare_means(small_model, run, m=m)
     y, u = (oracles.pulse_means(run[n], m, how) for n, how in (("y", "foh"), ("u", "zoh")))
     free = oracles.free_run([(-3, 0.6), (-8, 0.0)], [(5, 0.0, u)], 1.6, m, duration)
     q = oracles.regressors([y, y, u], [0.6, 0.0, 0.0], 1.6, duration, haar=False)
@@ -146,8 +146,8 @@ def test_initial_terms_are_fitted_anew_for_every_run(small_model):
 
 def test_several_runs_are_pooled_about_their_own_means(small_model, small_run):
     first, second = noisy(small_run, 0.01, 1), noisy(small_run.slice(0, 6), 0.05, 2)
-    together = small_model.compare([first, second], m=256)
-    alone = [small_model.compare(run, m=256) for run in (first, second)]
+    together = compare_means(small_model, [first, second], m=256)
+    alone = [compare_means(small_model, run, m=256) for run in (first, second)]
     for kind in ("output_error", "equation_error"):
         pooled, parts = getattr(together, kind)["y"], [getattr(c, kind)["y"] for c in alone]
         assert pooled.error == pytest.approx(sum(p.error for p in parts), rel=1e-12)
@@ -176,7 +176,9 @@ def test_comparison_prints_and_is_json(small_model, small_run):
     lines = str(found).splitlines()
     assert lines[0].split() == ["output", "error", "RMSE", "NR", "fit", "%"]
     assert [line.split()[:3] for line in lines[1:3]] == [["y", "equation", "error"], ["y", "output", "error"]]
-    assert lines[3] == "over 64 block pulses a run"
+    assert lines[3] == "output error over 1026 samples, equation error over 64 block pulses a run"
+    means = str(compare_means(small_model, small_run, m=64)).splitlines()
+    assert means[3] == "over 64 block pulses a run"
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["m"] == 64
     assert document["output_error"]["y"]["fit"] == found.fit_percent["y"]

@@ -13,6 +13,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
+from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
@@ -77,25 +78,46 @@ def refined(model: Solved, run: Run, initial: Terms | None, *, tolerance: float,
     """
     own = run.length - 1
     every = FIRST_REFINEMENT
-    coarse, terms = sampled(model, run, every, initial)
+    coarse, known = _tried(model, run, every, initial)
+    terms = known
     best, change = coarse, np.full(len(model.outputs), np.inf)
     extrapolated: Floats | None = None
     lost = 0
     while 2 * every * own <= largest_m and lost < 2:
         every *= 2
-        fine, terms = sampled(model, run, every, initial)
+        fine, found = _tried(model, run, every, initial, last=lost == 1)
         # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
         lost = 0 if np.all(np.isfinite(fine)) else lost + 1
-        with np.errstate(invalid="ignore", over="ignore"):
-            best = (4.0 * fine - coarse) / 3.0 if np.all(np.isfinite(coarse)) else fine
+        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+            both = bool(np.all(np.isfinite(coarse)))
+            best = (4.0 * fine - coarse) / 3.0 if both else fine
+            terms = _limit(known, found) if both else found
             if extrapolated is not None:
                 size = np.max(np.abs(best), axis=1)
                 moved = np.max(np.abs(best - extrapolated), axis=1)
-                change = np.where(moved <= tolerance * size, moved / np.where(size > 0, size, 1.0), moved / size)
-        extrapolated, coarse = best, fine
+                change = np.where(moved == 0.0, 0.0, moved / size)
+        extrapolated, coarse, known = best, fine, found
         if np.all(change <= tolerance):
             break
     return Sampled(best, terms, every, change)
+
+
+def _limit(coarse: Terms, fine: Terms) -> dict[str, dict[float, float]]:
+    """Initial terms in the limit of the step, which two grids tell (Richardson)."""
+    return {o: {e: (4.0 * v - coarse[o][e]) / 3.0 for e, v in terms.items()} for o, terms in fine.items()}
+
+
+def _tried(
+    model: Solved, run: Run, every: int, initial: Terms | None, *, last: bool = False
+) -> tuple[Floats, dict[str, dict[float, float]]]:
+    """Samples on one grid; no numbers where it happens to make the equations unsolvable, unless it is the last try."""
+    try:
+        return sampled(model, run, every, initial)
+    except ModelError:
+        # An own coefficient c meets 1 = c h^alpha / gamma(alpha + 2) on one step, not on two.
+        if last:
+            raise
+        return np.full((len(model.outputs), run.length), np.nan), {o: {} for o in model.outputs}
 
 
 def sampled(model: Solved, run: Run, every: int, initial: Terms | None) -> tuple[Floats, dict[str, dict[float, float]]]:
@@ -134,8 +156,9 @@ def _fitted(
     """Initial terms that bring the run closest to what was measured, by least squares, and the run with them."""
     deviation = np.std(measured, axis=1, keepdims=True)
     weight = 1.0 / np.where(deviation > 0, deviation, 1.0)
-    basis = np.stack([(weight * c).ravel() for c in columns], axis=1)
-    sizes = np.linalg.norm(basis, axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        basis = np.stack([(weight * c).ravel() for c in columns], axis=1)
+        sizes = np.linalg.norm(basis, axis=0)
     usable = np.isfinite(sizes) & (sizes > 0)
     scaled = basis[:, usable] / sizes[usable]
     x = np.zeros(len(names))
@@ -144,7 +167,8 @@ def _fitted(
     total = driven.copy()
     for (output, power), value, column in zip(names, x.tolist(), columns, strict=True):
         terms[output][power] = value
-        total += value * np.where(value == 0.0, 0.0, column)
+        if value:
+            total += value * column
     return total, terms
 
 
