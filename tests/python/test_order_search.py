@@ -19,6 +19,7 @@ import oracles
 from ftlm import _core
 from ftlm.base.checks import available_threads, check_threads
 from ftlm.data.settings import Settings
+from ftlm.judge.comparison import compare_means
 
 EQUATION = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 GRID = {"alpha": [1.4, 1.6, 1.8], "beta": [0.0, 0.3, 0.6, 0.9], "mu": [0.0, 0.3, 0.6, 0.9], "nu": [0.0, 0.2]}
@@ -509,7 +510,7 @@ def test_the_model_is_that_of_the_first_row(run):
     )
     assert found.coefficients == found.model.coefficients
     assert found.score == found.table[0].score
-    compared = found.model.compare(run, m=M)
+    compared = compare_means(found.model, run, m=M)
     assert compared.output_error["y"].error == pytest.approx(found.score, rel=1e-9)
     assert found.model.m == found.m == M
     assert found.model.units == {"u": "A", "y": "rad"}

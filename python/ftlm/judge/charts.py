@@ -18,7 +18,9 @@ from ftlm.paint.text import number, symbol
 
 def pulse_times(comparison: Comparison, run: int = 0) -> Floats:
     """Return when each value of a run of a comparison holds [s]: its instants, or the middle of every block pulse."""
-    return comparison.times[run]
+    if comparison.times:
+        return comparison.times[run]
+    return np.asarray((np.arange(comparison.m) + 0.5) * comparison.step[run], dtype=np.float64)
 
 
 def comparison_charts(
