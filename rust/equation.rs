@@ -4,7 +4,7 @@
 //! y = Σ_k c_k I^{α−ν_k} s_k + initial terms, which is how everything else reads it.
 
 use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
-use crate::kernels::{block_pulse_kernel, MAX_ORDER};
+use crate::kernels::{block_pulse_kernel, MAX_ORDER, MIN_INPUT_ORDER};
 use crate::series;
 
 /// Orders closer than this are one order: lattices are written in steps, not in rounding errors.
@@ -104,7 +104,7 @@ impl Initial {
 }
 
 impl Structure {
-    /// Refuses orders that make no equation: α outside (0, 3], an own-output order outside [0, α), another
+    /// Refuses orders that make no equation: α outside (0, 10], an own-output order outside [0, α), another
     /// outside [0, α] (an input's may be negative down to −3).
     ///
     /// # Errors
@@ -135,7 +135,7 @@ impl Structure {
             } else {
                 let input = is_input(term.signal);
                 if !order_fits(self.order, term.order, false, input) {
-                    let lowest = if input { -MAX_ORDER } else { 0.0 };
+                    let lowest = if input { MIN_INPUT_ORDER } else { 0.0 };
                     let allowed = format!("[{lowest}, {}]", self.order);
                     return Err(range(name, term.order, allowed, "an order must not exceed alpha"));
                 }
@@ -170,7 +170,7 @@ impl Structure {
     }
 }
 
-/// Whether a highest order is in (0, 3].
+/// Whether a highest order is in (0, 10].
 #[must_use]
 pub fn alpha_fits(alpha: f64) -> bool {
     alpha > 0.0 && alpha <= MAX_ORDER
@@ -183,7 +183,7 @@ pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
     if own {
         order >= 0.0 && order < alpha - ORDER_GRAIN
     } else {
-        order >= if input { -MAX_ORDER } else { 0.0 } && order <= alpha + ORDER_GRAIN
+        order >= if input { MIN_INPUT_ORDER } else { 0.0 } && order <= alpha + ORDER_GRAIN
     }
 }
 
@@ -196,7 +196,7 @@ fn missing(signal: usize, signals: usize) -> Error {
 
 /// 0, 1, … below `order`: the powers of t that D^order annihilates.
 fn whole_below(order: f64) -> impl Iterator<Item = f64> {
-    (0..4).map(f64::from).take_while(move |&i| i < order - ORDER_GRAIN)
+    (0_u32..).map(f64::from).take_while(move |&i| i < order.min(MAX_ORDER) - ORDER_GRAIN)
 }
 
 /// An order rounded to the grain, so that equal orders are equal bits.
@@ -245,7 +245,7 @@ impl Filter {
     /// The filter as a series of m pulses of `step` s, at rest before the record. O(terms · m + m log² m).
     ///
     /// # Errors
-    /// An improper filter, an order outside [0, 3], a denominator that starts with zero, a number that is not finite, a
+    /// An improper filter, an order outside [0, 10], a denominator that starts with zero, a number that is not finite, a
     /// step that is not positive, more points than memory holds.
     ///
     /// ```

@@ -15,6 +15,9 @@ pub enum IntegralRule {
     GrunwaldLetnikov,
 }
 
+/// Highest order of a derivative of samples: every one multiplies their noise by 1/h.
+pub const MAX_DERIVATIVE: f64 = 3.0;
+
 /// Which fractional derivative.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Derivative {
@@ -30,7 +33,7 @@ pub enum Derivative {
 /// I^η of uniformly sampled `x`, lower limit at the first sample.
 ///
 /// # Errors
-/// An order outside [0, 3], a step that is not positive, or a value that is not finite.
+/// An order outside [0, 10], a step that is not positive, or a value that is not finite.
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -113,7 +116,14 @@ pub fn fractional_derivative(
     initial: &[f64],
 ) -> Result<Vec<f64>> {
     check_step(step)?;
-    check_order("order", alpha)?;
+    if !(0.0..=MAX_DERIVATIVE).contains(&alpha) {
+        return Err(Error::OutOfRange {
+            name: "order".into(),
+            value: alpha,
+            range: format!("[0, {MAX_DERIVATIVE}]"),
+            remedy: "differentiate what was differentiated, or put the order into an equation".into(),
+        });
+    }
     check_finite("x", x)?;
     check_finite("initial", initial)?;
     let m = x.len();

@@ -11,7 +11,7 @@ use crate::kernels::{block_pulse_kernel, check_order};
 /// Upper-triangular Toeplitz F^η, row-major m × m (paper (32)); `step` = duration / m.
 ///
 /// # Errors
-/// An order outside [0, 3], a step that is not positive, m = 0 or beyond memory.
+/// An order outside [0, 10], a step that is not positive, m = 0 or beyond memory.
 pub fn block_pulse_matrix(eta: f64, m: usize, step: f64) -> Result<Vec<f64>> {
     check_order("order", eta)?;
     check_step(step)?;

@@ -129,7 +129,7 @@ impl Record {
         &self.signals[index]
     }
 
-    /// I^η of a signal, as [`Record::m`] pulse means; η in [0, 3]. O(m log m).
+    /// I^η of a signal, as [`Record::m`] pulse means; η in [0, 10]. O(m log m).
     ///
     /// # Panics
     /// Where there is no such signal.

@@ -670,8 +670,8 @@ def test_settings_that_mean_nothing_are_refused(run, options, message):
         (lambda: ftlm.lattice(step=0), "order alpha: step 0 is not positive; the paper's is 0.05"),
         (lambda: ftlm.lattice(step=-0.1), "step -0.1 is not positive"),
         (lambda: ftlm.lattice(step="0.1"), "= '0.1' is not a number"),
-        (lambda: ftlm.lattice(alpha=(0, 2)), "alpha interval 0:2 starts outside (0, 3]"),
-        (lambda: ftlm.lattice(alpha=(1, 4)), "order alpha = 4 is outside [-3, 3]"),
+        (lambda: ftlm.lattice(alpha=(0, 2)), "alpha interval 0:2 starts outside (0, 10]"),
+        (lambda: ftlm.lattice(alpha=(1, 11)), "order alpha = 11 is outside [-3, 10]"),
         (lambda: ftlm.lattice(alpha=(2, 1)), "order alpha: interval 2:1 is empty"),
         (lambda: ftlm.lattice(alpha=2.0), "alpha = 2.0 is no interval; write (low, high)"),
         (lambda: ftlm.lattice(alpha=(1, 2, 3)), "alpha = (1, 2, 3) is no interval"),
@@ -696,7 +696,7 @@ TOO_MANY = "candidates, more than the limit of"
     ("text", "lattice", "message"),
     [
         (EQUATION, {"orders": {"alpha": [0.5], "beta": [1.0]}}, "the lattice holds no candidate"),
-        (EQUATION, {"orders": {"alpha": [0.0]}}, "order alpha = 0 is outside (0, 3]; move the interval of alpha"),
+        (EQUATION, {"orders": {"alpha": [0.0]}}, "order alpha = 0 is outside (0, 10]; move the interval of alpha"),
         ("D^alpha y = a D^b y + c D^e y + d D^f y + g D^h y + u", {"step": 0.002}, TOO_MANY),
         # Refused from the lengths of the axes: to go through them would take minutes.
         (EQUATION, {"step": 0.001}, TOO_MANY),

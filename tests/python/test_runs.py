@@ -482,7 +482,9 @@ def test_resample_of_a_run():
     np.testing.assert_array_equal(finer["u"], np.repeat(pulses(), 2)[:-1])
     np.testing.assert_allclose(finer["v"], np.linspace(-1, 1, 99), atol=1e-15)
     assert (finer.step, finer.length, finer.duration) == (0.005, 99, run.duration)
-    assert "resampled from 0.01 s to 0.005 s (held: u; others linear" in finer.warnings[0]
+    assert (
+        "resampled from 0.01 s to 0.005 s (held: u, by means over the new intervals; others linear" in finer.warnings[0]
+    )
     back = finer.resample(0.01)
     for name in run.signals:
         np.testing.assert_allclose(back[name], run[name], atol=1e-15)

@@ -53,7 +53,9 @@ class ReadingOptions:
         Texts, Option("--intersample", metavar="NAME=zoh|foh", help="foh for a measured input; a command is zoh.")
     ] = None
     sliced: Annotated[Text, Option("--slice", metavar="FROM:TO", help="Seconds since the first row.")] = None
-    resample: Annotated[Number, Option(metavar="STEP", help="Interpolate onto this step [s].")] = None
+    resample: Annotated[
+        Number, Option(metavar="STEP", help="Interpolate onto this step [s], held inputs by their means.")
+    ] = None
 
     def runs(self, files: Sequence[str] | None, *, apart: bool = False) -> list[Run]:
         """Each file a run; .mat files that hold one signal each are one run together, unless they stand apart."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from ftlm.base.checks import real_number
 from ftlm.base.errors import ModelError
-from ftlm.data.orders import MAX_ORDER, Order
+from ftlm.data.orders import MAX_ORDER, MIN_INPUT_ORDER, Order
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Equation:
             raise ModelError(f"{min(both)} names an order and a coefficient; rename one")
         if not self.order.names and not 0 < self.order.constant <= MAX_ORDER:
             raise ModelError(
-                f"order alpha = {self.order.constant:g} of {self.output} is outside (0, 3]; choose another"
+                f"order alpha = {self.order.constant:g} of {self.output} is outside (0, 10]; choose another"
             )
         for term in self.terms:
             if term.factor == 0 or not math.isfinite(term.factor):
@@ -109,7 +109,7 @@ class Equation:
             own, alpha, order = term.signal == self.output, self.order.constant, term.order.constant
             if own and not 0 <= order < alpha:
                 raise ModelError(f"own-output order {order:g} of {self.output} is outside [0, {alpha:g}); lower it")
-            if not own and not -MAX_ORDER <= order <= alpha:
+            if not own and not MIN_INPUT_ORDER <= order <= alpha:
                 raise ModelError(f"order {order:g} of {term.signal} is above alpha = {alpha:g}; lower it")
 
     @property

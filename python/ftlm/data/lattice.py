@@ -82,7 +82,7 @@ def lattice(step: float = STEP, alpha: tuple[float, float] = ALPHA, **orders: Va
     step
         Step, positive; the paper's is 0.05.
     alpha
-        (low, high) of the highest order, in (0, 3].
+        (low, high) of the highest order, in (0, 10].
     **orders
         Other orders by name, see :class:`Lattice`.
 
@@ -100,7 +100,7 @@ def lattice(step: float = STEP, alpha: tuple[float, float] = ALPHA, **orders: Va
         raise ModelError(f"alpha = {alpha!r} is no interval; write (low, high), such as {ALPHA}")
     low, high = (real_number("alpha", a) for a in alpha)
     if not 0 < low <= MAX_ORDER:
-        raise ModelError(f"alpha interval {low:g}:{high:g} starts outside (0, 3]; choose a positive order")
+        raise ModelError(f"alpha interval {low:g}:{high:g} starts outside (0, 10]; choose a positive order")
     grid("alpha", low, high, step)
     return Lattice(step, (float(low), float(high)), dict(orders))
 

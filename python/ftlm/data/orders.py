@@ -11,7 +11,11 @@ from typing import TypeAlias
 from ftlm.base.checks import real_number
 from ftlm.base.errors import ModelError
 
-MAX_ORDER = 3.0
+#: Highest order of an equation, and the lowest of an input: a threefold integration.
+MAX_ORDER = 10.0
+MIN_INPUT_ORDER = -3.0
+#: Highest order that a search tries of itself, where the structure holds none above it.
+SEARCHED_ORDER = 3.0
 #: What a person writes for the values of an order, see :func:`parse_values`.
 Values: TypeAlias = float | str | Iterable[float]
 
@@ -157,8 +161,8 @@ def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
 
 
 def _checked(name: str, value: float) -> float:
-    if not (math.isfinite(value) and abs(value) <= MAX_ORDER):
-        raise ModelError(f"order {name} = {value:g} is outside [-3, 3]; choose another value")
+    if not MIN_INPUT_ORDER <= value <= MAX_ORDER:
+        raise ModelError(f"order {name} = {value:g} is outside [-3, 10]; choose another value")
     return value
 
 

@@ -80,7 +80,8 @@ class Run(Measured):
         name : str, default "run"
             What reports call this run.
         resample : float, optional
-            Interpolate onto this step [s]: held inputs by hold, everything else linearly. Recorded in `warnings`.
+            Interpolate onto this step [s]: held inputs by the mean of the hold over each new interval, everything
+            else linearly. Recorded in `warnings`.
         slice : pair of float or None, optional
             Use the rows with a ≤ t < b only, [s] since the first row; applied before any other check of the rows.
         time_unit : {"s", "ms", "us", "min", "h"}, default "s"
@@ -213,8 +214,9 @@ class Run(Measured):
     def resample(self, step: float) -> Run:
         """Return this run interpolated onto another step.
 
-        Held inputs ("zoh") keep the value of the last row at or before each new row; inputs that are "foh" and all
-        outputs are interpolated linearly. There is no anti-alias filter. The result says so in `warnings`.
+        Held inputs ("zoh") take their mean over each new interval, the exact integral of the hold; inputs that are
+        "foh" and all outputs are interpolated linearly. There is no anti-alias filter. The result says so in
+        `warnings`.
 
         Parameters
         ----------

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, cast
 
 import numpy as np
@@ -270,7 +271,7 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
 def interpolated(
     since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
 ) -> dict[str, Floats]:
-    """Return signals on another step: held inputs by hold, all else linearly."""
+    """Return signals on another step: of held inputs the mean of the hold over each new interval, all else linearly."""
     spans = float(since[-1]) / step
     if spans + 1 > _MOST_ROWS:
         raise DataError(f"resample={step!r} gives more than {_MOST_ROWS} rows; use a larger step")
@@ -278,14 +279,43 @@ def interpolated(
     if rows < FEWEST_ROWS:
         raise DataError(f"resample={step!r} leaves {rows} rows, {FEWEST_ROWS} are needed; use a smaller step")
     grid = grid_of(rows, step)
-    held = np.searchsorted(since, grid + _EDGE * step, side="right") - 1
+    pieces = _Pieces.of(since, rows, step)
     return {
-        signal: values[held] if behaviour.get(signal) == "zoh" else np.interp(grid, since, values)
+        signal: pieces.means(values) if behaviour.get(signal) == "zoh" else np.interp(grid, since, values)
         for signal, values in data.items()
     }
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """New intervals cut at the old rows: the row each piece holds, its share of a step, where each interval begins."""
+
+    row: npt.NDArray[np.intp]
+    share: Floats
+    first: npt.NDArray[np.intp]
+
+    @classmethod
+    def of(cls, since: Floats, rows: int, step: float) -> _Pieces:
+        """Cut; an old row within rounding of a new one counts as there. The last row holds on."""
+        edges = grid_of(rows + 1, step)
+        place = np.searchsorted(edges, since, side="left")
+        near = np.minimum(place, rows)
+        near = np.where((near > 0) & (np.abs(edges[near - 1] - since) <= _EDGE * step), near - 1, near)
+        snapped = np.where(np.abs(edges[near] - since) <= _EDGE * step, edges[near], since)
+        cuts = np.unique(np.concatenate([edges, snapped[snapped < edges[-1]]]))
+        row = np.searchsorted(snapped, cuts[:-1], side="right") - 1
+        return cls(row, np.diff(cuts) / step, np.searchsorted(cuts, edges[:-1]))
+
+    def means(self, values: Floats) -> Floats:
+        """Exact means of a hold; what does not change within an interval keeps its bits."""
+        begin = values[self.row[self.first]]
+        counts = np.diff(np.append(self.first, self.row.size))
+        risen = (values[self.row] - np.repeat(begin, counts)) * self.share
+        return np.asarray(begin + np.add.reduceat(risen, self.first))
 
 
 def how_interpolated(behaviour: Mapping[str, Intersample]) -> str:
     """Say what :func:`interpolated` does to each signal."""
     held = [signal for signal, kind in behaviour.items() if kind == "zoh"]
-    return f"{'held: ' + ', '.join(held) + '; ' if held else ''}others linear; no anti-alias filter"
+    means = f"held: {', '.join(held)}, by means over the new intervals; " if held else ""
+    return f"{means}others linear; no anti-alias filter"

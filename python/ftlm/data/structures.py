@@ -41,7 +41,7 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 if not (math.isfinite(coefficient) and 0 <= order <= MAX_ORDER):
                     raise ModelError(
                         f"sensor filter: {coefficient:g} D^{order:g} in its {part} is no term; give a finite "
-                        "coefficient and an order in [0, 3]"
+                        "coefficient and an order in [0, 10]"
                     )
         highest = max((order for coefficient, order in self.denominator if coefficient), default=None)
         if highest is None:

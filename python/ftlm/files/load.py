@@ -74,7 +74,8 @@ def load(
     slice : pair of float or None, optional
         Use the rows with a ≤ t < b only, [s] since the first row.
     resample : float, optional
-        Interpolate onto this step [s]; recorded in the run's warnings.
+        Interpolate onto this step [s]: held inputs by the mean of the hold over each new interval, everything else
+        linearly. Recorded in the run's warnings.
     name : str, optional
         What reports call the run; the first file's name where not given.
     time_unit : {"s", "ms", "us", "min", "h"}, default "s"

@@ -18,10 +18,11 @@ from ftlm.base.errors import ConvergenceError, DataError, FtlmError
 from ftlm.base.statistics import NORMAL_95, noise_of
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure, delay_name
+from ftlm.fit.extrapolation import feasible
 from ftlm.fit.grid import FINEST, Attempt, Grid
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.race import SAME_COST, finalists, race
-from ftlm.fit.uncertainty import covariance
+from ftlm.fit.uncertainty import covariance, deviation
 
 #: Residual that costs 1 in a coarse fit, as a share of an output's size.
 COARSE_SHARE = 0.01
@@ -43,7 +44,8 @@ class JointFit:
     orders, coefficients
         Free orders and free coefficients by name; under a coefficient law the free ones of the law.
     covariance
-        Of orders, coefficients, then delays, robust to coloured residuals.
+        Of orders, coefficients, then delays, robust to coloured residuals. Variances of what takes part in a direction
+        that the runs do not see are infinite, their covariances not numbers.
     noise
         Standard deviation of the residuals by output.
     cost
@@ -99,7 +101,7 @@ class JointFit:
         for name, (sign, factors) in self.products.items():
             value = sign * math.prod(self.coefficients[f] for f in factors)
             slope = np.array([factors.count(n) * value / v if v else 0.0 for n, v in self.coefficients.items()])
-            out[name] = float(np.sqrt(slope @ spread @ slope))
+            out[name] = float(deviation(slope[None], spread)[0])
         return out
 
     @property
@@ -233,7 +235,9 @@ def refined(best: Attempt, grid: Grid) -> Optimum:
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
         # Of a flat valley in which neither stood still they tell nothing.
         still = finer.converged and best.converged
-        limit = finer.values + (finer.values - best.values) / 3.0 if still else finer.values
+        limit = finer.values
+        if still:
+            limit = feasible(grid.problem, limit, limit + (limit - best.values) / 3.0)
         settled = bool(np.all(np.abs(limit - estimate) <= REFINED * errors))
         best, estimate = finer, limit
     return Optimum(best, grid, estimate, settled)

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.data.orders import MAX_ORDER, Order
+from ftlm.data.orders import MAX_ORDER, SEARCHED_ORDER, Order
 from ftlm.data.structures import Structure, delay_name
 from ftlm.solve.records import affine
 
 #: Own bounds of orders where the structure gives none.
-ALPHA_BOUNDS = (0.05, MAX_ORDER)
+ALPHA_BOUNDS = (0.05, SEARCHED_ORDER)
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,8 @@ class FreeProblem:
                 values = structure.order_values[name]
                 bounds.append((values[0], values[-1]))
             else:
-                bounds.append(ALPHA_BOUNDS if name in highest else (0.0, MAX_ORDER))
+                least = ALPHA_BOUNDS[0] if name in highest else 0.0
+                bounds.append((least, _reach(structure, name, above=name in highest)))
         coefficients = tuple(dict.fromkeys(free))
         return cls(
             structure, structure.order_names, coefficients, tuple(bounds), products, tuple(structure.free_delays)
@@ -148,3 +149,10 @@ class FreeProblem:
             usable = [s for s in said if math.isfinite(s) and 1.05 < s < 20]
             out.append(float(np.median(usable)) if usable else 1.5)
         return out
+
+
+def _reach(structure: Structure, name: str, *, above: bool) -> float:
+    """How high a free order is sought: 3, or past the highest number in its equations where that is more."""
+    beside = [e for e in structure.equations if name in e.order_names]
+    numbers = [o.constant for e in beside for o in (e.order, *(t.order for t in e.terms)) if not o.names]
+    return min(max([SEARCHED_ORDER, *(n + above for n in numbers)]), MAX_ORDER)

@@ -12,7 +12,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.equations import Equation
-from ftlm.data.orders import MAX_ORDER
+from ftlm.data.orders import SEARCHED_ORDER
 from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Hints, Structure
@@ -74,7 +74,7 @@ def start_axes(problem: FreeProblem) -> dict[str, list[float]]:
     """A coarse lattice of the free orders within their bounds."""
     equations = problem.structure.equations
     highest = {n for e in equations if e.order.is_single for n in e.order.names}
-    usual = (problem.structure.hints or Hints()).highest or (0.2, MAX_ORDER)
+    usual = (problem.structure.hints or Hints()).highest or (0.2, SEARCHED_ORDER)
     axes = {}
     for name, bounds in zip(problem.orders, problem.bounds, strict=True):
         low, high = usual if name in highest and bounds == ALPHA_BOUNDS else bounds

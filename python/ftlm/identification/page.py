@@ -31,7 +31,7 @@ from ftlm.paint.figure import Figure
 from ftlm.paint.heat import heat_map
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
-from ftlm.paint.text import Cell, number, symbol, symbol_html
+from ftlm.paint.text import Cell, number, symbol, symbol_html, unbounded
 from ftlm.search.orders import landscape
 from ftlm.search.result import SearchResult, search_summary, search_top
 
@@ -78,7 +78,7 @@ def identification_page(
     others = [] if validation is None else as_runs(validation)
     validated = [validate(result, run) for run in others]
     warnings = list(result.warnings)
-    undefined = [n for n, e in result.standard_errors.items() if not math.isfinite(e)]
+    undefined = [n for n, e in result.standard_errors.items() if math.isnan(e)]
     if undefined:
         warnings.append(
             f"the standard errors of {', '.join(undefined)} are not defined: the fit's covariance is not finite; "
@@ -155,7 +155,9 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
     omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
     words = "Exact, orders as they are; the equations together, from what is not modelled."
     if model.estimate is None or model.estimate.covariance is None:
-        words += " This estimator gives no covariance, so there are no bands."
+        told = model.estimate is None or None not in model.estimate.standard_errors.values()
+        lacking = "This estimator gives no covariance" if told else "The runs leave directions unseen"
+        words += f" {lacking}, so there are no bands."
     return Section("Frequency response", words, figures=bode_charts(model, omega)[:SMALL_CHARTS], small=True)
 
 
@@ -239,7 +241,8 @@ def estimates_table(result: Judged | None, truth: Mapping[str, float] | None = N
         for name, value in {**result.orders, **result.joint.coefficients}.items():
             low, high = result.intervals[name]
             known = [truth.get(name)] if truth else []
-            rows.append([symbol_html(name), value, result.standard_errors[name], low, high, *known])
+            spread = [v if math.isfinite(v) else unbounded(v) for v in (result.standard_errors[name], low, high)]
+            rows.append([symbol_html(name), value, *spread, *known])
     columns, groups = ["parameter", "value", "standard error", "from", "to"], [("", 3), ("95 % interval", 2)]
     if truth:
         columns, groups = [*columns, "true value"], [*groups, ("", 1)]

@@ -13,6 +13,8 @@ from ftlm.base.checks import real_number
 from ftlm.base.errors import ModelError
 from ftlm.base.statistics import NORMAL_95
 from ftlm.fit.joint import JointFit
+from ftlm.fit.uncertainty import deviation
+from ftlm.paint.text import unbounded
 
 #: Physical parameters of stage j by name, and their units (of whole orders).
 PHYSICAL_UNITS = {
@@ -45,7 +47,7 @@ class PhysicalParameter:
         return self.value - NORMAL_95 * self.standard_error, self.value + NORMAL_95 * self.standard_error
 
     def __str__(self) -> str:
-        return f"{self.value:.6g} ± {self.standard_error:.3g} {self.unit}"
+        return f"{self.value:.6g} ± {unbounded(self.standard_error)} {self.unit}"
 
 
 def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str, PhysicalParameter]:
@@ -105,7 +107,7 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
             above, below = (_physical(centre + side, name, amount, stage) for side in (shift, -shift))
             slopes.append((above - below) / (2 * step))
         gradient = np.array(slopes).T
-        errors = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gradient, spread, gradient), 0.0))
+        errors = deviation(gradient, spread)
         units = list(PHYSICAL_UNITS.items())
         for (pattern, unit), v, e in zip(units, values.tolist(), errors.tolist(), strict=True):
             out[pattern.format(j=stage)] = PhysicalParameter(v, e, unit)

@@ -19,7 +19,9 @@ from ftlm.identification.physical import PhysicalParameter, physical_parameters
 from ftlm.identification.settings import settings_in_words
 from ftlm.identification.warnings import validate
 from ftlm.judge.comparison import Comparison
+from ftlm.judge.metrics import finite
 from ftlm.judge.residuals import Residuals, resid
+from ftlm.paint.text import unbounded
 
 
 class Identification(Judged):
@@ -149,8 +151,8 @@ class Identification(Judged):
             "orders": self.orders,
             "coefficients": self.coefficients,
             "delays": self.delays,
-            "standard_errors": self.standard_errors,
-            "intervals": {n: list(i) for n, i in self.intervals.items()},
+            "standard_errors": {n: finite(e) for n, e in self.standard_errors.items()},
+            "intervals": {n: [finite(low), finite(high)] for n, (low, high) in self.intervals.items()},
             **self.comparison.to_dict(),
             "residuals": None if self.residuals is None else self.residuals.to_dict(),
             "information": None if self.information is None else self.information.to_dict(),
@@ -165,7 +167,7 @@ class Identification(Judged):
         reference = self.model.structure.reference
         errors = self.standard_errors
         for name, value in {**self.orders, **self.joint_values, **self.coefficients}.items():
-            spread = f" ± {errors[name]:<10.3g}" if name in errors else ""
+            spread = f" ± {unbounded(errors[name]):<10}" if name in errors else ""
             stated = f"   (stated {reference[name]:.6g})" if name in reference else ""
             lines.append(f"  {name:<12}{value:>14.6g}{spread}{stated}")
         if self.joint is not None:

@@ -34,14 +34,24 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             "errors: the model is stiffer than the sampling; sample faster or trust its fast poles less"
         )
     errors = joint.standard_errors
+    unseen = [n for n in joint.names if math.isinf(errors[n])]
+    if unseen:
+        warnings.append(
+            f"these runs do not tell {', '.join(unseen)} apart: moved together they change nothing that was measured, "
+            "so their intervals are infinite; leave a term out, fix one of them, or record a richer input"
+        )
     for (name, value), (low, high) in zip(joint.orders.items(), problem.bounds, strict=True):
         # Negated so that a standard error that is not a number counts as too large.
+        if name in unseen:
+            continue
         if not errors[name] <= high - low:
             warnings.append(f"order {name} cannot be told from these runs: its standard error exceeds its bounds")
         elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
             warnings.append(f"order {name} = {value:g} is on its bound; widen it")
     for signal, value in joint.delays.items():
         low, high = problem.structure.free_delays[signal]
+        if delay_name(signal) in unseen:
+            continue
         if not errors[delay_name(signal)] <= high - low:
             warnings.append(
                 f"the delay of {signal} cannot be told from these runs: its standard error exceeds its bounds"
@@ -49,7 +59,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
         elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
             warnings.append(f"the delay of {signal} = {value:g} s is on its bound; widen it")
     for name, value in joint.coefficients.items():
-        if not errors[name] <= abs(value):
+        if name not in unseen and not errors[name] <= abs(value):
             warnings.append(
                 f"coefficient {name} = {value:.4g} is not different from 0 in these runs "
                 f"(standard error {errors[name]:.3g})"

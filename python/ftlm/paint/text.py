@@ -60,6 +60,11 @@ def number(value: float, digits: int = DIGITS) -> str:
     return f"{mantissa}×10{str(int(exponent)).translate(SUPERSCRIPTS)}" if exponent else mantissa
 
 
+def unbounded(value: float, spec: str = ".3g") -> str:
+    """Return a standard error or an end of an interval in short, infinity as ∞: the runs do not see the number."""
+    return f"{'−' if value < 0 else ''}∞" if math.isinf(value) else f"{value:{spec}}"
+
+
 def shortened(text: str, most: int) -> str:
     """A text of at most so many letters, with an ellipsis for the rest."""
     return text if len(text) <= most else text[: most - 1] + "…"

@@ -264,7 +264,8 @@ def response_deviation(model: Solved, w: ArrayLike, *, coupling: str = "simulate
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None:
         raise ModelError(
-            "this model has no covariance, so its response has no uncertainty; identify it with method='output-error'"
+            "this model has no covariance, so its response has no uncertainty; identify it with method='output-error', "
+            "and without a term whose interval is infinite"
         )
     centre = frequency_response(model, w, coupling=coupling)
     values = model_numbers(model)

@@ -29,7 +29,7 @@ def fractional_integral(
     x
         Signals along ``axis``: means over pulses for ``"block-pulse"``, point samples otherwise.
     order
-        Order of the integral, in [0, 3].
+        Order of the integral, in [0, 10].
     step
         Sampling step or pulse width [s], positive.
     rule
@@ -49,7 +49,7 @@ def fractional_integral(
     DataError
         Values that are not finite real numbers (with the first index and the count).
     ModelError
-        An order outside [0, 3], a step that is not positive, a rule that is not known.
+        An order outside [0, 10], a step that is not positive, a rule that is not known.
 
     Notes
     -----
@@ -201,7 +201,7 @@ def block_pulse_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
     Parameters
     ----------
     order
-        Order of the integral, in [0, 3].
+        Order of the integral, in [0, 10].
     m
         Number of pulses, at most 16 384.
     duration
@@ -227,7 +227,7 @@ def operational_matrix(order: float, m: int, duration: float) -> NDArray[np.floa
     Parameters
     ----------
     order
-        Order of the integral, in [0, 3].
+        Order of the integral, in [0, 10].
     m
         Number of wavelets, a power of two, at most 16 384.
     duration

@@ -2,7 +2,7 @@
 
 use crate::equation::{tidy, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
-use crate::kernels::MAX_ORDER;
+use crate::kernels::{MAX_ORDER, MIN_INPUT_ORDER};
 use crate::search::lattice::tuples::{Group, Slice};
 
 /// Most candidates that one search takes: an hour or so where bounds and early stopping do their work.
@@ -50,7 +50,7 @@ impl Lattice {
     ///
     /// # Errors
     /// [`Error::EmptyLattice`], [`Error::LatticeTooLarge`] before anything of that size is gone through, an α outside
-    /// (0, 3], [`Error::NotFinite`] for an order that is no number, [`Error::Structure`] for more than 34 terms of one
+    /// (0, 10], [`Error::NotFinite`] for an order that is no number, [`Error::Structure`] for more than 34 terms of one
     /// signal.
     ///
     /// ```
@@ -90,7 +90,7 @@ impl Lattice {
         let axes: Vec<Vec<Vec<f64>>> = signals
             .iter()
             .map(|&signal| {
-                let lowest = if is_input(signal) { -MAX_ORDER } else { 0.0 };
+                let lowest = if is_input(signal) { MIN_INPUT_ORDER } else { 0.0 };
                 members(signal).iter().map(|&k| values(&terms[k], lowest)).collect()
             })
             .collect();

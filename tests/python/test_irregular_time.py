@@ -1,0 +1,75 @@
+"""Runs with jittered times put on a regular step: held commands by the exact mean of the hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm.data.samples import interpolated
+
+PLANT = "D^0.8 y = -1.5 y + 1.5 u"
+STEP, ROWS, FINE = 0.05, 600, 20
+
+
+def naive_means(since: np.ndarray, values: np.ndarray, step: float, rows: int) -> np.ndarray:
+    """The mean of a hold over each new interval, one interval and one row at a time."""
+    out = []
+    for k in range(rows):
+        low, high, total = k * step, (k + 1) * step, 0.0
+        for j, value in enumerate(values):
+            begin, end = since[j], since[j + 1] if j + 1 < len(since) else np.inf
+            total += value * max(0.0, min(high, end) - max(low, begin))
+        out.append(total / step)
+    return np.array(out)
+
+
+def jittered(seed: int) -> ftlm.Run:
+    """A first-order fractional plant, a command given at times that jitter by ±30 %, 1 % noise."""
+    rng = np.random.default_rng(seed)
+    # Times on a fine grid, so that the simulated hold is exact.
+    ticks = np.arange(ROWS) * FINE + np.round(rng.uniform(-0.3, 0.3, ROWS) * FINE).astype(int)
+    ticks[0] = 0
+    # Some 30 switches: at every one the linear interpolation of the output cuts a corner of its own.
+    command = np.where(np.cumsum(rng.random(ROWS) < 0.05) % 2, -1.0, 1.0)
+    fine = np.arange(ticks[-1] + 1)
+    held = command[np.searchsorted(ticks, fine, side="right") - 1]
+    there = ftlm.Run.from_arrays(inputs={"u": held}, outputs={"y": np.zeros(fine.size)}, step=STEP / FINE)
+    y = ftlm.Model(ftlm.equation(PLANT)).simulate(there)["y"][ticks]
+    return ftlm.Run.from_arrays(
+        time=ticks * STEP / FINE, inputs={"u": command},
+        outputs={"y": y + 0.01 * np.std(y) * rng.standard_normal(ROWS)}, resample=STEP,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("step", [0.37, 0.05, 1.3])
+def test_a_held_command_becomes_its_means(step: float) -> None:
+    rng = np.random.default_rng(7)
+    since = np.concatenate([[0.0], np.cumsum(rng.uniform(0.05, 1.0, 80))])
+    data = {"u": rng.standard_normal(81), "y": rng.standard_normal(81)}
+    found = interpolated(since, data, {"u": "zoh"}, step)
+    expected = naive_means(since, data["u"], step, found["u"].size)
+    np.testing.assert_allclose(found["u"], expected, rtol=0, atol=1e-11)
+    np.testing.assert_array_equal(found["y"], np.interp(np.arange(found["y"].size) * step, since, data["y"]))
+
+
+def test_what_falls_on_the_grid_keeps_its_bits() -> None:
+    values = np.random.default_rng(8).standard_normal(500) * 1e3
+    since = np.arange(500) * 0.01
+    same = interpolated(since + 1e-10 * np.sin(np.arange(500)) * (since > 0), {"u": values}, {"u": "zoh"}, 0.01)
+    np.testing.assert_array_equal(same["u"], values)
+    np.testing.assert_array_equal(
+        interpolated(since, {"u": values}, {"u": "zoh"}, 0.0025)["u"], np.repeat(values, 4)[:-3]
+    )
+
+
+def test_jitter_of_thirty_percent_leaves_intervals_that_cover() -> None:
+    covered = {"alpha": 0, "a": 0}
+    for seed in range(30):
+        run = jittered(seed)
+        assert "by means over the new intervals" in run.warnings[0]
+        found = ftlm.identify(run, ftlm.equation("D^alpha y = a y + b u"))
+        for name, true in (("alpha", 0.8), ("a", -1.5)):
+            low, high = found.intervals[name]
+            covered[name] += low <= true <= high
+    assert min(covered.values()) >= 27, covered

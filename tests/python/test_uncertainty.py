@@ -1,0 +1,128 @@
+"""Intervals of what the runs do not see: no direction is dropped, none is invented."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+from pathlib import Path
+
+import mpmath
+import numpy as np
+import pytest
+from scipy.signal import lsim
+
+import ftlm
+from ftlm.fit.joint import JointFit, fit_output_error
+from ftlm.fit.uncertainty import covariance_of, deviation
+from ftlm.identification import estimate
+from ftlm.report.model_page import model_page
+
+
+def digits_of(jacobian: np.ndarray, squares: float) -> np.ndarray:
+    """Classical covariance from the normal equations, in 60 digits."""
+    with mpmath.workdps(60):
+        matrix = mpmath.matrix(jacobian.tolist())
+        inverse = (matrix * matrix.T) ** -1
+        count = jacobian.shape[1] - jacobian.shape[0]
+        return np.array((inverse * squares / count).tolist(), dtype=float)
+
+
+@pytest.mark.parametrize("apart", [1.0, 1e-4, 1e-7, 1e-10])
+def test_a_flat_direction_has_the_interval_that_sixty_digits_give(apart: float) -> None:
+    rng = np.random.default_rng(1)
+    jacobian = rng.standard_normal((4, 300)) * np.array([[1e6], [1.0], [1.0], [1e-5]])
+    jacobian[2] = jacobian[1] + apart * jacobian[2]
+    noise = rng.standard_normal(300)
+    found, exact = covariance_of(jacobian, [noise], float(noise @ noise)), digits_of(jacobian, float(noise @ noise))
+    spread = np.sqrt(np.diag(exact))
+    np.testing.assert_allclose(np.sqrt(np.diag(found)), spread, rtol=1e-5)
+    # Dropped directions left 0.04 where 60 digits give 0.04 / apart.
+    assert np.sqrt(found[1, 1]) * apart > 0.01
+    np.testing.assert_allclose(found / np.outer(spread, spread), exact / np.outer(spread, spread), atol=1e-5)
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_parameters_of_an_unseen_direction_have_infinite_variance_and_the_others_keep_theirs(coloured: bool) -> None:
+    rng = np.random.default_rng(2)
+    jacobian = rng.standard_normal((5, 400))
+    jacobian[3] = jacobian[1]
+    jacobian[4] = 0.0
+    noise = rng.standard_normal(400)
+    residuals = np.convolve(noise, np.ones(20))[:400] if coloured else noise
+    found = covariance_of(jacobian, [residuals], float(residuals @ residuals))
+    assert np.isinf(np.diag(found)).tolist() == [False, True, False, True, True]
+    # What the two others know is what they know where the pair counts once.
+    once = covariance_of(jacobian[:3], [residuals], float(residuals @ residuals))
+    if not coloured:
+        np.testing.assert_allclose(once[:3, :3], digits_of(jacobian[:3], float(residuals @ residuals)), rtol=1e-9)
+        once *= (400 - 3) / (400 - 5)
+    np.testing.assert_allclose(found[np.ix_([0, 2], [0, 2])], once[np.ix_([0, 2], [0, 2])], rtol=1e-9)
+    derived = deviation(np.array([[1.0, 0, 2.0, 0, 0], [1.0, 1.0, 0, 0, 0]]), found)
+    np.testing.assert_allclose(derived[0] ** 2, found[0, 0] + 4 * found[2, 2] + 4 * found[0, 2])
+    assert math.isinf(derived[1])
+
+
+def driven_twice(seed: int, apart: float) -> ftlm.Run:
+    """A resonance at 40 dB whose command stands in two columns, the second this much of its noise apart."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(np.where(rng.random(40) < 0.5, -1.0, 1.0), 20)
+    y = lsim(([[0, 1], [-4, -0.4]], [[0], [4.0]], [[1, 0]], 0), u, np.arange(u.size) * 0.05, interp=False)[1]
+    return ftlm.Run.from_arrays(
+        inputs={"u": u, "v": u + apart * rng.standard_normal(u.size)},
+        outputs={"y": y + 0.01 * np.std(y) * rng.standard_normal(y.size)}, step=0.05,
+    )  # fmt: skip
+
+
+START = {"c": -0.4, "a": -4.0, "b": 2.0, "e": 2.0}
+WORDS = "D^2 y = c D y + a y + b u + e v"
+
+
+@pytest.fixture
+def twice(monkeypatch: pytest.MonkeyPatch) -> ftlm.Identification:
+    """Two terms that are the same to the runs, from a given start: an automatic one finds nothing to invert."""
+    monkeypatch.setattr(estimate, "fit_output_error", partial(fit_output_error, start=START))
+    return ftlm.identify(driven_twice(1, 0.0), ftlm.equation(WORDS))
+
+
+def test_two_terms_that_are_one_are_told_apart_by_nothing(twice: ftlm.Identification, tmp_path: Path) -> None:
+    errors = twice.standard_errors
+    assert [n for n, e in errors.items() if math.isinf(e)] == ["b", "e"]
+    assert twice.intervals["b"] == (-math.inf, math.inf)
+    for name, true in (("a", -4.0), ("c", -0.4)):
+        assert abs(twice.coefficients[name] - true) < 3 * errors[name] < 0.1 * abs(true)
+    said = [w for w in twice.warnings if "do not tell b, e apart" in w]
+    assert len(said) == 1
+    assert "infinite" in said[0]
+    assert not [w for w in twice.warnings if "b = " in w or "not defined" in w]
+    assert "± ∞" in str(twice)
+    document = json.loads(json.dumps(twice.to_dict(), allow_nan=False))
+    assert document["standard_errors"]["b"] is None
+    assert document["intervals"]["e"] == [None, None]
+    twice.model.save(tmp_path / "model.json")
+    read = ftlm.load_model(tmp_path / "model.json")
+    assert read.estimate is not None
+    assert read.estimate.standard_errors["b"] is None
+    assert read.estimate.standard_errors["a"] == errors["a"]
+    page = twice.report(tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "−∞" in page
+    assert "The runs leave directions unseen, so there are no bands" in page
+    model_page(read, tmp_path / "model.html")
+
+
+def test_two_terms_that_are_nearly_one_have_the_wide_intervals_of_their_difference() -> None:
+    found = fit_output_error([driven_twice(1, 1e-9)], ftlm.equation(WORDS, initial="rest"), start=START)
+    for name in ("b", "e"):
+        assert 1e6 < found.standard_errors[name] < 1e9
+    assert found.standard_errors["a"] < 0.1
+
+
+def test_derived_errors_of_what_is_not_seen_are_infinite() -> None:
+    covariance = np.array([[np.inf, np.nan], [np.nan, 0.04]])
+    fit = JointFit(
+        {}, {"a": 2.0, "r": 3.0}, covariance, {}, 0.0, 9, 1, True, True, [], [],
+        products={"both": (1.0, ("a", "r")), "square": (-1.0, ("r", "r"))},
+    )  # fmt: skip
+    assert fit.derived_errors == {"both": math.inf, "square": pytest.approx(2 * 3.0 * 0.2)}
+    assert np.isnan(fit.correlation[0, 1])
+    assert fit.intervals["a"] == (-math.inf, math.inf)
