@@ -32,8 +32,10 @@ def sine():
 
 
 def identified(runs, method, **orders):
-    options = {} if method == "output-error" else {"lattice": ftlm.lattice(step=0.2)}
-    return ftlm.identify(runs, ftlm.equation(WORDS, orders=orders), method=method, threads=1, **options)
+    structure = ftlm.equation(WORDS, orders=orders)
+    searched = method != "output-error" and structure.order_names
+    options = {"lattice": ftlm.lattice(step=0.2)} if searched else {}
+    return ftlm.identify(runs, structure, method=method, threads=1, **options)
 
 
 def truth_is_inside(found, width=4.0):
