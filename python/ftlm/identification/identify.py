@@ -122,9 +122,9 @@ def identify(
     words = {n: value for n, value in words.items() if value is not None}
     others = {"lattice": lattice, "genetic": genetic, "store": store, "executor": executor}
     given = [*(n for n, value in others.items() if value is not None), *words]
-    check_used(method, given, free=bool(structure.order_names))
     estimator = "least-squares" if method in ("output-error", "genetic") else method
     settings = Settings.check(coefficients=estimator, threads=threads, **words)
+    check_used(method, given, free=bool(structure.order_names))
     task = Task(tuple(several), structure, lattice)
     if method == "output-error":
         return judged(by_output_error(task, m, settings.threads, progress))

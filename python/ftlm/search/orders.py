@@ -123,10 +123,10 @@ def search_orders(
     checked = as_runs(runs)
     weighted = {"innovation_length": innovation_length, "prior_covariance": prior_covariance, "rows": rows}
     words: dict[str, Any] = {n: value for n, value in weighted.items() if value is not None}
-    check_used(coefficients, words, argument="coefficients")
     settings = Settings.check(
         criterion, norm, coefficients, keep=keep, threads=threads, early_stopping=early_stopping, **words
     )
+    check_used(coefficients, words, argument="coefficients")
     job = make_job(checked, equation, lattice, settings, m=m, progress=progress)
     if store is None:
         return run_job(job, executor=executor)
