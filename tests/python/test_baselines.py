@@ -147,7 +147,7 @@ def test_what_cannot_be_done_is_said(small_run, monkeypatch):
     structure = ftlm.equation(EQUATION)
     with pytest.raises(ftlm.ModelError, match="bounds of 'q': there is no such number; free are alpha, nu, a, c, b"):
         ftlm.identify(small_run, structure, method="genetic", genetic=Genetic(bounds={"q": (0, 1)}))
-    with pytest.raises(ftlm.ModelError, match="genetic settings are given, but method = 'least-squares'"):
+    with pytest.raises(ftlm.ModelError, match="genetic= is not used by method='least-squares'; leave it out, or use "):
         ftlm.identify(small_run, structure, method="least-squares", genetic=Genetic())
     with pytest.raises(ftlm.ModelError, match="genetic is dict, not Genetic"):
         ftlm.identify(small_run, structure, method="genetic", genetic={"seeds": 1})

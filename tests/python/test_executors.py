@@ -226,7 +226,10 @@ def test_an_identification_by_the_lattice_shares_its_searches_out(stage_run, law
     with ThreadPoolExecutor(2) as pool:
         found = ftlm.identify(stage_run, structure, executor=pool, **options)
     assert json.dumps(found.to_dict()) == json.dumps(ftlm.identify(stage_run, structure, **options).to_dict())
-    with ThreadPoolExecutor(1) as pool, pytest.raises(ModelError, match="method 'output-error' makes none"):
+    with (
+        ThreadPoolExecutor(1) as pool,
+        pytest.raises(ModelError, match="executor= is not used by method='output-error'"),
+    ):
         ftlm.identify(stage_run, structure, executor=pool)
 
 

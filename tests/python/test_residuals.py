@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,10 @@ import pytest
 
 import ftlm
 from ftlm import _core
-from ftlm.base.statistics import chi_squared_99
+from ftlm.base.statistics import chi_squared_99, is_white
+from ftlm.judge.charts import residual_charts
 from ftlm.judge.residuals import residual_warnings
+from ftlm.judge.whitening import autoregression, whitened
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
 
@@ -255,3 +258,112 @@ def test_validation_far_below_estimation_is_said(noisy, small_model):
     fresh = small_model.simulate(blank(np.sin(0.02 * np.arange(800) ** 1.1)), tolerance=1e-5)
     assert found.validate(fresh).warnings == ()
     assert found.validate(fresh).fit_percent == found.model.compare(fresh).fit_percent
+
+
+# ------------------------------------------------------------------------------------------------ tests that can fail
+
+
+def motor_record(seed, *, coloured=False):
+    """SciPy's record of a motor of gain 8 and time constant 0.12 s behind a dead time of 35 ms, 5 % noise."""
+    signal = pytest.importorskip("scipy.signal")
+    rng, step, fine, n = np.random.default_rng([35, seed]), 0.005, 5, 1600
+    u = np.where(np.arange(n) % 400 < 200, 1.0, -1.0)
+    late = np.concatenate([np.zeros(35), np.repeat(u, fine)])[: n * fine]
+    motor = tuple(np.array(part) for part in ([[-1 / 0.12]], [[8 / 0.12]], [[1.0]], [[0.0]]))
+    a, b, c, d, _ = signal.cont2discrete(motor, step / fine, "zoh")
+    y = signal.dlsim((a, b, c, d, step / fine), late)[1][::fine, 0]
+    noise = rng.standard_normal(n + 60)
+    noise = np.convolve(noise, 0.9 ** np.arange(61), "valid")[:n] if coloured else noise[:n]
+    return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y + 0.4 * noise}, name=f"motor {seed}")
+
+
+MOTOR = "D y = a y + b u"
+
+
+def test_a_missing_dead_time_is_found():
+    found = [ftlm.identify(motor_record(seed), ftlm.equation(MOTOR)).residuals for seed in range(20)]
+    assert sum(t.outputs["y"].inputs["u"].failed for t in found) >= 19
+    assert sum(not t.white["y"] for t in found) >= 19
+
+
+@pytest.mark.parametrize("coloured", [False, True])
+def test_the_true_dead_time_raises_no_alarm(coloured):
+    true = ftlm.Model(ftlm.equation("D y = -8.333333333333334 y + 66.66666666666667 u").with_delays({"u": 0.035}))
+    alarms = sum(
+        true.resid(motor_record(seed, coloured=coloured)).outputs["y"].inputs["u"].failed for seed in range(100)
+    )
+    assert alarms <= 3
+
+
+def levinson_oracle(x, order):
+    """Yule-Walker's equations solved as they stand."""
+    c = [float(np.mean((x - x.mean())[k:] @ (x - x.mean())[: x.size - k])) for k in range(order + 1)]
+    matrix = np.array([[c[abs(i - j)] for j in range(order)] for i in range(order)])
+    return np.concatenate([[1.0], -np.linalg.solve(matrix, c[1:])])
+
+
+def test_the_whitening_filter_is_that_of_yule_and_walker():
+    rng = np.random.default_rng(4)
+    white = rng.standard_normal(4000)
+    x = np.zeros(4000)
+    for k in range(2, 4000):
+        x[k] = 1.4 * x[k - 1] - 0.7 * x[k - 2] + white[k]
+    found = autoregression([x], 25)
+    assert 3 <= found.size <= 5
+    np.testing.assert_allclose(found, levinson_oracle(x, found.size - 1), rtol=1e-9)
+    np.testing.assert_allclose(found[:3], [1.0, -1.4, 0.7], atol=0.05)
+    assert is_white(whitened([x], found)[0])
+    assert not is_white(x)
+    assert autoregression([white], 25).size == 1
+    assert autoregression([np.zeros(100)], 25).tolist() == [1.0]
+
+
+def test_a_limit_that_cannot_be_exceeded_decides_nothing(small_model, monkeypatch):
+    # A slow sine of a few samples: were its correlations judged as they are, the limit would be above 1.
+    monkeypatch.setattr("ftlm.judge.residuals.autoregression", lambda series, most: np.ones(1))
+    n = 60
+    t = np.arange(n)
+    u = np.sin(2 * np.pi * t / 120)
+    clean = small_model.simulate(blank(u), tolerance=1e-5)
+    run = ftlm.Run.from_arrays(
+        step=0.02, inputs={"u": u}, outputs={"y": clean["y"] + 0.1 * np.cos(2 * np.pi * t / 120)}
+    )
+    found = small_model.resid(run)
+    test = found.outputs["y"].inputs["u"]
+    assert test.limit > 1
+    assert (test.decided, test.passed, test.failed, test.verdict) == (False, False, False, "undecided")
+    assert found.to_dict()["outputs"]["y"]["inputs"]["u"]["decided"] is False
+    assert "undecided" in str(found)
+    assert any("whether residuals follow u is undecided: its limit is" in w for w in residual_warnings(found))
+    assert "undecided" in found._repr_html_()
+    assert "undecided: its limit is" in residual_charts(found)[1].caption
+
+
+def test_an_input_that_does_not_move_decides_nothing(small_model, noisy):
+    run = ftlm.Run.from_arrays(
+        step=noisy.step, inputs={"u": noisy["u"], "v": np.full(noisy.length, 0.1)}, outputs={"y": noisy["y"]}
+    )
+    found = small_model.resid(run)
+    assert found.outputs["y"].inputs["v"].verdict == "undecided"
+    assert found.outputs["y"].inputs["u"].verdict == "passed"
+    # The input that moves decides; the other one can do nothing, and is shown as what it is.
+    assert (found.passed, found.decided, found.verdict) == (True, True, "passed")
+    assert re.search(r"^y and v .* undecided$", str(found), re.MULTILINE)
+    json.dumps(found.to_dict(), allow_nan=False)
+    still = ftlm.Run.from_arrays(step=0.02, inputs={"u": np.full(noisy.length, 0.1)}, outputs={"y": noisy["y"]})
+    found = small_model.resid(still)
+    assert found.outputs["y"].inputs["u"].verdict == "undecided"
+    assert found.independence == {"y": "undecided"}
+    assert not found.passed
+    assert "whether residuals follow u is undecided: u does not move" in str(found)
+
+
+def test_the_caption_of_a_chart_says_what_its_bars_do(long_run, small_model):
+    for model in (small_model, ftlm.Model(ftlm.equation("D^1.6 y = -2 D^0.6 y - 8 y + 5 u"))):
+        tests = model.resid(long_run)
+        for chart, (_, signal, test) in zip(residual_charts(tests), tests.tests, strict=True):
+            bars = test.values[test.lags != 0] if not signal else test.values
+            outside = int(np.sum(np.abs(bars) > test.band))
+            assert f"; {outside} of {bars.size} bars leave" in chart.caption
+            assert ("could be" in chart.caption) is test.passed
+            assert ("is not" in chart.caption) is not test.passed

@@ -582,11 +582,11 @@ def test_a_store_where_nothing_is_searched_is_refused(stage_run, tmp_path):
     path = tmp_path / "s.ftlm"
     known = ftlm.equation("D^1.6 theta11 = a D^0.6 theta11 + b I1")
     for structure, method, why in (
-        (ftlm.flexible_link(), "output-error", "method 'output-error' makes none"),
-        (ftlm.flexible_link(), "genetic", "method 'genetic' makes none"),
-        (known, "least-squares", "every order here is a number"),
+        (ftlm.flexible_link(), "output-error", "store= is not used by method='output-error'; leave it out"),
+        (ftlm.flexible_link(), "genetic", "store= is not used by method='genetic'; leave it out"),
+        (known, "least-squares", "store= is not used: it is for order searches, and every order here is a number"),
     ):
-        with pytest.raises(ModelError, match=f"store= and executor= are for order searches, and {why}; leave them out"):
+        with pytest.raises(ModelError, match=why):
             ftlm.identify(stage_run, structure, method=method, store=path)
     with pytest.raises(ModelError, match="a store keeps one identification"):
         ftlm.identify_many([stage_run], ftlm.flexible_link(), method="least-squares", store=path)

@@ -74,6 +74,38 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
         assert "order alpha cannot be told from these runs: its standard error exceeds its bounds" in words, value
 
 
+def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):
+    from dataclasses import replace
+
+    from ftlm.identification.warnings import inseparable
+
+    joint = ftlm.identify(noisy, ftlm.equation(WORDS)).joint
+    n = len(joint.names)
+    # All of them correlated by 0.999; only the size of their errors differs.
+    alike = np.full((n, n), 0.999) + 0.001 * np.eye(n)
+    sizes = np.array(
+        [1.0 if name in joint.orders else abs(v) for name, v in zip(joint.names, joint.values, strict=True)]
+    )
+
+    def said_of(shares):
+        spread = np.asarray(shares) * sizes
+        return inseparable(replace(joint, covariance=alike * np.outer(spread, spread)))
+
+    assert said_of(np.full(n, 0.01)) == []
+    assert said_of([0.2, *np.full(n - 1, 0.01)]) == []
+    listed = f"{', '.join(joint.names[:-1])} and {joint.names[-1]}"
+    assert said_of(np.full(n, 0.2)) == [f"{listed} cannot be told apart in these runs (correlations up to 0.9990)"]
+    assert said_of([0.2, 0.2, *np.full(n - 2, 0.01)]) == [
+        f"{joint.names[0]} and {joint.names[1]} cannot be told apart in these runs (correlation 0.9990)"
+    ]
+    lost = [np.inf, np.inf, *np.full(n - 2, 0.01)]
+    with np.errstate(invalid="ignore"):
+        assert said_of(lost) == [
+            f"{joint.names[0]} and {joint.names[1]} cannot be told apart in these runs "
+            "(their standard errors are not finite)"
+        ]
+
+
 def test_one_sine_for_many_numbers_says_so(small_model):
     n = 900
     blank = ftlm.Run.from_arrays(step=0.02, inputs={"u": np.sin(0.1 * np.arange(n))}, outputs={"y": np.zeros(n)})

@@ -18,6 +18,8 @@ app = typer.Typer(
     help="Fractional-order models of flexible machines from measured data.",
     no_args_is_help=True,
     add_completion=False,
+    # Marks of rich would take the brackets of units, [s] and [A], out of every help text.
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )

@@ -14,6 +14,7 @@ from typing import Any, get_type_hints
 import typer
 
 from ftlm.base.errors import FtlmError, InternalError, ModelError, RigFault
+from ftlm.cli.words import in_options
 
 EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
 
@@ -48,7 +49,7 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             raise typer.Exit(0) from None
         except FtlmError as error:
-            print(f"ftlm: {error}", file=sys.stderr)
+            print(f"ftlm: {in_options(str(error))}", file=sys.stderr)
             raise typer.Exit(exit_code(error)) from None
 
     # What typer reads.
@@ -80,7 +81,7 @@ def show(result: Any, *, as_json: bool) -> None:
     if as_json:
         show_json(result.to_dict())
     else:
-        print(result)
+        print(in_options(str(result)))
 
 
 def show_json(document: Any) -> None:

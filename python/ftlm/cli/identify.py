@@ -29,7 +29,9 @@ from ftlm.cli.options import (
     Text,
     Threads,
 )  # fmt: skip
+from ftlm.cli.words import in_options
 from ftlm.data.lattice import Lattice
+from ftlm.data.settings import check_used
 from ftlm.data.structures import Structure
 from ftlm.identification import identify as estimation
 from ftlm.search.job import run_job
@@ -78,7 +80,7 @@ def identify(
         return
     show(result, as_json=False)
     if checked is not None:
-        print(f"\nvalidation on {', '.join(r.name for r in others)}\n{checked}")
+        print(f"\nvalidation on {', '.join(r.name for r in others)}\n{in_options(str(checked))}")
 
 
 @command
@@ -93,8 +95,9 @@ def search(
     wanted = shape.structure(structure)
     runs = reading.runs(files)
     parts = wanted.parts() or {e.output: wanted.equation(e.output) for e in wanted.equations}
-    lattice = options.lattice()
+    lattice = options.lattice() or Lattice()
     check_named(lattice, wanted)
+    check_used(coefficients, options.settings(), argument="coefficients")
     results = {}
     with resumable(store), contextlib.ExitStack() as stack:
         jobs = {
@@ -131,7 +134,7 @@ def show_searches(results: Mapping[str, SearchResult], *, as_json: bool) -> None
     if as_json:
         show_json({name: result.to_dict() for name, result in results.items()})
     else:
-        print("\n\n".join(f"{name}\n{result}" for name, result in results.items()))
+        print(in_options("\n\n".join(f"{name}\n{result}" for name, result in results.items())))
 
 
 @contextlib.contextmanager

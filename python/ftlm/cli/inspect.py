@@ -11,6 +11,7 @@ from ftlm import _core
 from ftlm.base.checks import available_threads
 from ftlm.cli.command import command
 from ftlm.cli.options import Files, Json, ReadingOptions
+from ftlm.cli.words import in_options
 from ftlm.data.inspection import inspect_run
 from ftlm.rig.quanser import driver_state
 
@@ -23,7 +24,7 @@ def inspect(*, files: Files, reading: ReadingOptions, as_json: Json = False) -> 
         data = [{**figures.to_dict(), "advice": advice.to_dict()} for figures, advice in inspected]
         print(json.dumps(data, indent=1, ensure_ascii=False))
     else:
-        print("\n\n".join(f"{figures}\n{advice}" for figures, advice in inspected))
+        print(in_options("\n\n".join(f"{figures}\n{advice}" for figures, advice in inspected)))
 
 
 @command

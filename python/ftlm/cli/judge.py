@@ -57,7 +57,7 @@ def resid(
     lags: Annotated[int, Option(min=1, help="Largest lag in samples.")] = 25,
     reading: ReadingOptions, as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Test a saved model's residuals: are they white, and independent of the inputs? Exit with 4 where not."""
+    """Test a saved model's residuals: are they white, and independent of the inputs? Exit with 4 unless they are."""
     tests = load_model(model).resid(reading.runs(files), lags=lags)
     show(tests, as_json=as_json)
     if not tests.passed:

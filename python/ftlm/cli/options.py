@@ -44,6 +44,10 @@ class ReadingOptions:
     """How files are read."""
 
     time: Annotated[Text, Option(help="Column of time.")] = None
+    time_unit: Annotated[
+        Literal["s", "ms", "us", "min", "h"] | None,
+        Option("--time-unit", help="Unit of that column; default what its header says, as in time [ms], or s."),
+    ] = None
     sampling: Annotated[Number, Option(help="Sampling step [s] of files without a time column.")] = None
     inputs: Annotated[Texts, Option("-u", "--input", metavar="NAME=COLUMN", help="An input.")] = None
     outputs: Annotated[Texts, Option("-y", "--output", metavar="NAME=COLUMN", help="An output.")] = None
@@ -62,11 +66,11 @@ class ReadingOptions:
         given: dict[str, Any] = {
             "time": self.time, "step": self.sampling, "inputs": pairs("-u", self.inputs),
             "outputs": pairs("-y", self.outputs), "units": pairs("--unit", self.units), "columns": self.columns,
-            "intersample": pairs("--intersample", self.between), "resample": self.resample,
+            "time_unit": self.time_unit, "intersample": pairs("--intersample", self.between), "resample": self.resample,
         }  # fmt: skip
         if not files:
             return []
-        options = {name: value for name, value in given.items() if value}
+        options = {name: value for name, value in given.items() if value not in (None, {}, "")}
         if self.sliced is not None:
             options["slice"] = interval(self.sliced, "--slice", "1.1:19.5")
         if not apart and len(files) > 1 and all(f.lower().endswith(".mat") for f in files):
@@ -82,20 +86,23 @@ class ReadingOptions:
 
 @dataclass(frozen=True)
 class StructureOptions:
-    """What is made of a structure in words."""
+    """What is made of a structure in words; None is an option that is not given."""
 
     only: Annotated[Text, Option(metavar="OUTPUT", help="Only the equation of this output.")] = None
-    coupling: Annotated[Literal["measured", "simulated"], Option(help="What drives free runs of a flexible link.")] = (
-        "simulated"
-    )
+    coupling: Annotated[
+        Literal["measured", "simulated"] | None,
+        Option(help="What drives free runs of a flexible link or of several equations; default simulated."),
+    ] = None
     cross_stage: Annotated[bool, Option("--cross-stage", help="Add the other stage's angles and current.")] = False
     friction: Annotated[bool, Option("--friction", help="Add a Coulomb term.")] = False
-    laws: Annotated[Literal["none", "orders"], Option(help="orders: search all equations under the order law.")] = (
-        "none"
-    )
-    input_order: Annotated[Literal["published", "derived"], Option(help="Order of the current, see the manual.")] = (
-        "published"
-    )
+    laws: Annotated[
+        Literal["none", "orders"] | None,
+        Option(help="orders: search all equations under the order law; default none."),
+    ] = None
+    input_order: Annotated[
+        Literal["published", "derived"] | None,
+        Option(help="Order of the current, see the manual; default published."),
+    ] = None
     stock_filter: Annotated[bool, Option("--stock-filter", help="Deflections passed the stock 2 Hz low-pass.")] = False
     orders: Annotated[Texts, Option("--order", metavar="NAME=VALUE", help="Fix an order.")] = None
     fixed: Annotated[Texts, Option(metavar="NAME=VALUE", help="Fix a coefficient.")] = None
@@ -110,12 +117,29 @@ class StructureOptions:
             built = self._flexible_link(text)
         else:
             built = equation(text)
+            self._check_equation(len(built.equations))
             if len(built.equations) > 1:
-                built = replace(built, coupling=self.coupling)
+                built = replace(built, coupling=self.coupling or "simulated")
         if self.only is not None:
             built = built.equation(self.only)
         built = replace(built, initial=check_initial(self._initial())).with_delays(delays(self.delay))
         return built.with_orders(numbers("--order", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
+
+    def _check_equation(self, count: int) -> None:
+        """Refuse what only the flexible link has, for that many equations in words."""
+        given = {
+            "--coupling": self.coupling is not None and count == 1, "--cross-stage": self.cross_stage,
+            "--friction": self.friction, "--laws": self.laws is not None,
+            "--input-order": self.input_order is not None, "--stock-filter": self.stock_filter,
+        }  # fmt: skip
+        wrong = [option for option, is_given in given.items() if is_given]
+        if wrong:
+            owner = "the flexible link or of several equations" if wrong == ["--coupling"] else "the flexible link"
+            kind = "one equation in words" if count == 1 else "equations in words"
+            raise ModelError(
+                f"{', '.join(wrong)}: of {owner}, not used with {kind}; leave {'it' if len(wrong) == 1 else 'them'} "
+                "out, or use --structure flexible-link:1, :2 or :both"
+            )
 
     def _flexible_link(self, text: str) -> Structure:
         stages: dict[str, Literal[1, 2, "both"]] = {"1": 1, "2": 2, "both": "both"}
@@ -123,7 +147,8 @@ class StructureOptions:
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use flexible-link:1, :2 or :both, or an equation")
         return flexible_link(
-            stage=stage, input_order=self.input_order, coupling=self.coupling, cross_stage=self.cross_stage,
+            stage=stage, input_order=self.input_order or "published", coupling=self.coupling or "simulated",
+            cross_stage=self.cross_stage,
             friction=self.friction, laws=("orders", "coefficients") if self.laws == "orders" else (),
             sensor_filter="stock" if self.stock_filter else None,
         )  # fmt: skip
@@ -139,33 +164,39 @@ class StructureOptions:
 
 @dataclass(frozen=True)
 class SearchOptions:
-    """How candidates are made, computed and ranked."""
+    """How candidates are made, computed and ranked; None is an option that is not given."""
 
-    criterion: Annotated[Criterion, Option(help="Error that ranks the candidates.")] = "output-error"
-    norm: Annotated[Literal["l1", "l2"], Option(help="l1 is (45), l2 is (46).")] = "l1"
+    criterion: Annotated[Criterion | None, Option(help="Error that ranks the candidates; default output-error.")] = None
+    norm: Annotated[Literal["l1", "l2"] | None, Option(help="l1 is (45), l2 is (46); default l1.")] = None
     values: Annotated[
         Texts, Option("--lattice", metavar="NAME=LOW:HIGH:STEP", help="Values of an order; alpha means every alpha.")
     ] = None
-    step: LatticeStep = 0.05
-    p: Annotated[int, Option(help="Innovation length.")] = 7
-    k0: Annotated[float, Option(help="Prior covariance of the coefficients.")] = 1.0
-    rows: Annotated[Literal["haar", "time"], Option(help="Coordinates of the rows of (44).")] = "haar"
+    step: Annotated[Number, Option("--step", help="Step of the order lattice; default 0.05.")] = None
+    p: Annotated[int | None, Option(help="Innovation length, of multi-innovation; default 7.")] = None
+    k0: Annotated[Number, Option(help="Prior covariance of the coefficients, of multi-innovation; default 1.")] = None
+    rows: Annotated[
+        Literal["haar", "time"] | None,
+        Option(help="Coordinates of the rows of (44), of multi-innovation; default haar."),
+    ] = None
     m: BlockPulses = None
-    keep: Annotated[int, Option(help="Rows of the ranked table.")] = 20
+    keep: Annotated[int | None, Option(help="Rows of the ranked table; default 20.")] = None
 
-    def lattice(self) -> Lattice:
-        """Where the orders are searched."""
+    def lattice(self) -> Lattice | None:
+        """Where the orders are searched; None where nothing is said of it."""
+        if self.step is None and not self.values:
+            return None
         named: dict[str, Any] = dict(pairs("--lattice", self.values))
         alpha = named.pop("alpha", None)
-        made = lattice(step=self.step, **named)
+        made = lattice(**named) if self.step is None else lattice(step=self.step, **named)
         return made if alpha is None else replace(made, orders={**made.orders, "alpha": alpha})
 
     def settings(self) -> dict[str, Any]:
-        """Everything but the lattice, as a search takes it."""
-        return {
+        """Everything that is given but the lattice, as a search takes it."""
+        given = {
             "criterion": self.criterion, "norm": self.norm, "innovation_length": self.p, "prior_covariance": self.k0,
             "rows": self.rows, "m": self.m, "keep": self.keep,
         }  # fmt: skip
+        return {name: value for name, value in given.items() if value is not None}
 
 
 @dataclass(frozen=True)

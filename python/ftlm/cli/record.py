@@ -34,12 +34,16 @@ class LiveOptions:
     orders: Annotated[
         Texts, Option("--order", metavar="NAME=VALUE", help="Orders of --live; default the arm's own.")
     ] = None
-    p: Annotated[int, Option(help="Innovation length of --live.")] = 7
-    k0: Annotated[float, Option(help="Prior covariance of --live.")] = 1.0
+    p: Annotated[int | None, Option(help="Innovation length of --live; default 7.")] = None
+    k0: Annotated[Number, Option(help="Prior covariance of --live; default 1.")] = None
 
     def stream(self, rig: str, parameters: str, rate: float, limit: float) -> Streaming | None:
         """The identification, for a rig's samples a second and longest run [s]; None where none is asked for."""
         if self.live is None:
+            given = {"--order": bool(self.orders), "--p": self.p is not None, "--k0": self.k0 is not None}
+            useless = [option for option, is_given in given.items() if is_given]
+            if useless:
+                raise ModelError(f"{', '.join(useless)}: of --live, which is not given; leave out, or give --live")
             return None
         free = numbers("--order", self.orders)
         if self.live.startswith("flexible-link:"):
@@ -56,8 +60,8 @@ class LiveOptions:
         else:
             structure = equation(self.live)
         return Streaming(
-            structure.with_orders(free), step=1.0 / rate, longest=limit + 1.0, innovation_length=self.p,
-            prior_covariance=self.k0,
+            structure.with_orders(free), step=1.0 / rate, longest=limit + 1.0,
+            innovation_length=7 if self.p is None else self.p, prior_covariance=1.0 if self.k0 is None else self.k0,
         )  # fmt: skip
 
 

@@ -6,6 +6,40 @@ import re
 
 from ftlm.base.errors import ModelError
 
+#: What the command line calls an argument of Python.
+OPTIONS = {
+    "method": "--method", "coefficients": "--coefficients", "criterion": "--criterion", "norm": "--norm",
+    "lattice": "--lattice or --step", "innovation_length": "--p", "prior_covariance": "--k0", "rows": "--rows",
+    "m": "--m", "keep": "--keep", "threads": "--threads", "store": "--store", "genetic": "--seed or --evaluations",
+    "slice": "--slice", "resample": "--resample", "step": "--sampling", "time": "--time", "time_unit": "--time-unit",
+    "units": "--unit", "columns": "--columns", "intersample": "--intersample", "inputs": "-u", "outputs": "-y",
+    "coupling": "--coupling", "initial": "--initial", "laws": "--laws", "input_order": "--input-order",
+    "friction": "--friction", "cross_stage": "--cross-stage", "tolerance": "--tolerance", "lags": "--lags",
+    "delay": "--delay", "force": "--force",
+}  # fmt: skip
+#: ``force=True (--force)``, where the option stands beside the argument already.
+_BESIDE = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")
+_COMMANDS = re.compile(r" \(commands: [^)]*\)")
+#: ``-u m=3`` is a name that a user gave, not an argument.
+_ARGUMENT = re.compile(r"(--?[\w-]+ )?(?<![^\s(])(" + "|".join(OPTIONS) + r")=(?:'([^']*)'|([\w.+-]+))?(?![\w{])")
+_BARE = re.compile(r"\b(innovation_length|prior_covariance|time_unit)\b(?!=)")
+
+
+def in_options(text: str) -> str:
+    """Return a message in which the options of the command line stand for the arguments of Python."""
+    text = text.replace("inputs={name: column}", "-u NAME=COLUMN").replace("outputs={name: column}", "-y NAME=COLUMN")
+    text = text.replace("in a columns file", "in a file for --columns")
+    text = _BESIDE.sub(r"\1", _COMMANDS.sub("", text))
+    return _BARE.sub(lambda found: OPTIONS[found[1]], _ARGUMENT.sub(_as_option, text))
+
+
+def _as_option(found: re.Match[str]) -> str:
+    before, name, quoted, bare = found.groups()
+    if before:
+        return found[0]
+    value = quoted or bare or ""
+    return OPTIONS[name] if value in ("", "True") else f"{OPTIONS[name]} {value}"
+
 
 def pairs(option: str, given: list[str] | None) -> dict[str, str]:
     """NAME=VALUE options as a dictionary; a bare NAME stands for NAME=NAME."""

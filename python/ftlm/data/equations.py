@@ -169,8 +169,9 @@ class Equation:
         return f"{derivative(self.order, self.output)} = {right}"
 
 
-def numeric(item: Equation) -> str:
-    """Write an identified equation with six significant digits."""
-    parts = [f"{t.fixed or 0.0:+.6g} {derivative(t.order, t.signal)}" for t in item.terms]
-    right = " ".join(parts).removeprefix("+").replace(" +", " + ").replace(" -", " - ")
+def numeric(item: Equation, delay: Mapping[str, float] | None = None) -> str:
+    """Write an identified equation with six significant digits, inputs with their delays [s]: ``u(t - 0.035 s)``."""
+    late = {n: f"{n}(t - {d:.6g} s)" for n, d in (delay or {}).items() if d > 0}
+    parts = [f"{t.fixed or 0.0:+.6g} {derivative(t.order, late.get(t.signal, t.signal))}" for t in item.terms]
+    right = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])
     return f"{derivative(item.order, item.output)} = {right}"

@@ -25,6 +25,7 @@ from ftlm.data.samples import (
     window_rows,
 )
 from ftlm.data.structures import Structure
+from ftlm.data.units import time_unit_of
 from ftlm.data.written import write_csv, write_parquet
 
 
@@ -111,7 +112,7 @@ class Run(Measured):
         inputs: Mapping[str, Hashable] | Sequence[str] | str | None,
         outputs: Mapping[str, Hashable] | Sequence[str] | str, units: Mapping[str, str] | None = None,
         intersample: Mapping[str, str] | None = None, name: str = "run", resample: float | None = None,
-        slice: Sequence[float | None] | None = None, time_unit: str = "s",
+        slice: Sequence[float | None] | None = None, time_unit: str | None = None,
     ) -> Run:  # fmt: skip
         """Make a run from a pandas or polars frame, a dict of arrays or a structured NumPy array.
 
@@ -125,8 +126,11 @@ class Run(Measured):
             Time between rows [s], > 0.
         inputs, outputs : mapping of str to column, or list of str
             Columns by signal name; a list names columns that keep their names.
-        units, intersample, name, resample, slice, time_unit
+        units, intersample, name, resample, slice
             As in `Run.from_arrays`.
+        time_unit : {"s", "ms", "us", "min", "h"}, optional
+            Unit of the time column; where not given, the one that its name states, as in ``time [ms]`` (said in the
+            run's `warnings`), or else s. A name that states another one is refused.
 
         Returns
         -------
@@ -154,10 +158,14 @@ class Run(Measured):
         wanted = [names_to_columns(argument, given) for argument, given in (("inputs", inputs), ("outputs", outputs))]
         labels = {s: f"signal {s!r} (column {column!r})" for part in wanted for s, column in part.items()}
         given_inputs, given_outputs = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in wanted)
+        label = "time" if time is None else f"time (column {time!r})"
+        if isinstance(time, str):
+            unit, said = time_unit_of(time, label, time_unit)
+        else:
+            unit, said = time_unit or "s", ()
         asked = Asked(
             given_inputs, given_outputs, step=step, time=clock, units=units, intersample=intersample, name=name,
-            resample=resample, window=slice, time_unit=time_unit, labels=labels,
-            time_label="time" if time is None else f"time (column {time!r})",
+            resample=resample, window=slice, time_unit=unit, labels=labels, facts=said, time_label=label,
         )  # fmt: skip
         return built(asked)
 

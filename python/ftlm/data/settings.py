@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -11,8 +12,46 @@ from ftlm.base.errors import ModelError
 
 Criterion = Literal["output-error", "equation-error"]
 Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
+METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
+_LATTICE = METHODS[1:4]
+#: The methods of `identify` that use an option; one that is not here (runs, structure, m, threads, progress) is of all.
+USED_BY: dict[str, tuple[str, ...]] = {
+    "lattice": METHODS[1:], "criterion": _LATTICE, "norm": METHODS[1:], "keep": _LATTICE,
+    "innovation_length": ("multi-innovation",), "prior_covariance": ("multi-innovation",),
+    "rows": ("multi-innovation",), "genetic": ("genetic",), "store": _LATTICE, "executor": _LATTICE,
+}  # fmt: skip
+#: What belongs to the search of orders: lattice methods use it only where an order is free.
+OF_SEARCHES = ("lattice", "criterion", "norm", "keep", "store", "executor")
 #: Steps of refined instrumental variables a candidate; most stand still before.
 REFINEMENTS = 5
+
+
+def check_used(method: str, given: Iterable[str], *, free: bool = True, argument: str = "method") -> None:
+    """Refuse options that a method does not use with a `ModelError` that names the first and how many they are.
+
+    Parameters
+    ----------
+    method
+        One of :data:`METHODS`.
+    given
+        Names of the options that somebody gave, whatever their values.
+    free
+        Whether an order is free.
+    argument
+        What the caller calls the method.
+    """
+    useless = [n for n in given if method not in USED_BY.get(n, METHODS)]
+    fixed = [n for n in given if not free and method in _LATTICE and n in OF_SEARCHES and n not in useless]
+    count = len(useless) + len(fixed)
+    others = f", nor {count - 1} other{'s' if count > 2 else ''} given here" if count > 1 else ""
+    if useless:
+        users = " or ".join(f"{argument}={m!r}" for m in USED_BY[useless[0]])
+        raise ModelError(f"{useless[0]}= is not used by {argument}={method!r}{others}; leave it out, or use {users}")
+    if fixed:
+        raise ModelError(
+            f"{fixed[0]}= is not used{others}: it is for order searches, and every order here is a number; leave it "
+            "out, or free an order"
+        )
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping
 
 from ftlm.base.checks import as_mapping, listed, nearest
@@ -21,6 +22,72 @@ UNITS: dict[str, tuple[str, float]] = {
     "Pa": ("Pa", 1.0), "kPa": ("Pa", 1e3), "W": ("W", 1.0), "Hz": ("Hz", 1.0),
 }  # fmt: skip
 TIME_UNITS: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "min": 60.0, "h": 3600.0}
+
+#: Other ways to write them in the header of a column, without capitals.
+_WRITTEN = {
+    **{unit: unit for unit in TIME_UNITS}, "μs": "us",  # the letter mu, into which casefold turns the micro sign
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"), "hr": "h", "hour": "h", "hours": "h",
+    **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"), "minute": "min", "minutes": "min",
+    **dict.fromkeys(("usec", "microsecond", "microseconds"), "us"),
+}  # fmt: skip
+_BRACKETED = re.compile(r"(.*?)\s*\[\s*([^\[\]]*?)\s*\]")
+_OTHERWISE = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*/\s*(\S+)|_(\S+))")
+_TIME_NAMES = frozenset(("t", "time", "seconds"))
+
+
+def header_time(name: str) -> tuple[str, str | None]:
+    """Split the name of a column of times into what it is called, without capitals, and the unit that it states.
+
+    The unit is one of :data:`TIME_UNITS`, None where none is stated, and as it stands where square brackets hold
+    something else. Written as in ``time [ms]``, ``time (ms)``, ``time/ms`` or ``time_ms``.
+    """
+    folded = name.strip().casefold()
+    bracketed = _BRACKETED.fullmatch(folded)
+    if bracketed and bracketed[2]:
+        return bracketed[1], _WRITTEN.get(bracketed[2], bracketed[2])
+    otherwise = _OTHERWISE.fullmatch(folded)
+    unit = None if otherwise is None else _WRITTEN.get(otherwise[2] or otherwise[3] or otherwise[4] or "")
+    return (folded, None) if otherwise is None or unit is None else (otherwise[1], unit)
+
+
+def is_time_name(name: str) -> bool:
+    """Whether a column is called the time: t, time or seconds, with or without a unit."""
+    return header_time(name)[0] in _TIME_NAMES
+
+
+def time_unit_of(name: str, label: str, given: str | None) -> tuple[str, tuple[str, ...]]:
+    """Return the unit of a column of times, and what a run is to say of it.
+
+    Parameters
+    ----------
+    name, label
+        The column's own name, and what errors call it.
+    given
+        The unit that a person states, or None.
+
+    Raises
+    ------
+    DataError
+        Two units that contradict each other, or a unit in the header that is not known where none is given.
+    """
+    if given is not None and (not isinstance(given, str) or given not in TIME_UNITS):
+        raise DataError(f"time_unit={given!r} is unknown; the known ones are {listed(TIME_UNITS)}")
+    stated = header_time(name)[1]
+    if stated is None:
+        return given or "s", ()
+    if stated not in TIME_UNITS:
+        if given is None:
+            raise DataError(
+                f"{label}: its header states the unit {stated!r}, which is unknown; the known ones are "
+                f"{listed(TIME_UNITS)}; say with time_unit= in which the numbers are"
+            )
+        return given, ()
+    if given is not None and TIME_UNITS[given] != TIME_UNITS[stated]:
+        raise DataError(
+            f"{label}: its header states {stated!r}, and time_unit={given!r} is asked for; leave time_unit= out, or "
+            "rename the column"
+        )
+    return stated, () if stated == "s" else (f"time read in {stated}, as the header {name!r} says",)
 
 
 def checked_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> dict[str, tuple[str, float]]:

@@ -13,8 +13,8 @@ import numpy.typing as npt
 from ftlm.base.checks import bad_rows, listed, nearest
 from ftlm.base.errors import DataError
 from ftlm.data.header import Header
+from ftlm.data.units import is_time_name
 
-_TIME_NAMES = frozenset(("t", "time", "t_s", "time_s", "seconds", "time [s]"))
 _AGREE = 1e-9
 _MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
 
@@ -118,7 +118,7 @@ class Pool:
             named = [
                 column
                 for column in self._columns.values()
-                if column.source == table.path and column.matrix is None and column.variable.casefold() in _TIME_NAMES
+                if column.source == table.path and column.matrix is None and is_time_name(column.variable)
             ]
             if len(named) > 1:
                 raise DataError(
@@ -131,7 +131,7 @@ class Pool:
             clocks = [self._columns[f"{matrix}.1"] for matrix in matrices]
         if not clocks:
             raise DataError(
-                "time: no column is called t, time, t_s, time_s, seconds or time [s]; "
+                "time: no column is called t, time or seconds, alone or with a unit as in time [ms], time_ms or t (s); "
                 f"name it with time=, or give the time between rows with step=; {self.described()}"
             )
         for other in clocks[1:]:

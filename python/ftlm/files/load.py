@@ -16,6 +16,7 @@ from ftlm.data.asked import Asked
 from ftlm.data.header import Header
 from ftlm.data.names import CSV_TIME, is_run_name
 from ftlm.data.run import Run, built
+from ftlm.data.units import time_unit_of
 from ftlm.files.apart import MATLAB, PARQUET, read_apart
 from ftlm.files.columns import Column, FileTable, Pool
 from ftlm.files.text import LONGEST_HEADER, read_text
@@ -43,7 +44,7 @@ def load(
     outputs: Mapping[str, str | int] | Sequence[str] | str | None = None, units: Mapping[str, str] | None = None,
     columns: Mapping[str, object] | PathLike | None = None, intersample: Mapping[str, str] | None = None,
     step: float | None = None, slice: Sequence[float | None] | None = None, resample: float | None = None,
-    name: str | None = None, time_unit: str = "s",
+    name: str | None = None, time_unit: str | None = None,
 ) -> Run:  # fmt: skip
     """Load one run from a text, version-5 .mat or parquet file, or from several files that hold its columns.
 
@@ -57,8 +58,9 @@ def load(
         Columns of several files are pooled; a name that is in two of them is prefixed by its file, ``STEM/V.3``.
     time : str or int, optional
         Column of the time, by name or, in a single text file, by position from 0. Without `time` and `step`, a text
-        file's column called t, time, t_s, time_s, seconds or time [s] (any case) is taken, a .mat file's vector of
-        such a name, or else the first column of every matrix in use, which must all agree.
+        file's column called t, time or seconds (any case), alone or with a unit as in ``time [ms]``, ``time (ms)``,
+        ``time/ms`` or ``t_ms``, is taken, a .mat file's vector of such a name, or else the first column of every
+        matrix in use, which must all agree.
     inputs, outputs : mapping of str to column, or list of str, optional
         Columns by signal name; a list names columns that keep their names. Needed unless `columns` or the file's
         own ftlm header gives them; at least one output.
@@ -78,8 +80,9 @@ def load(
         linearly. Recorded in the run's warnings.
     name : str, optional
         What reports call the run; the first file's name where not given.
-    time_unit : {"s", "ms", "us", "min", "h"}, default "s"
-        Unit of the time column.
+    time_unit : {"s", "ms", "us", "min", "h"}, optional
+        Unit of the time column; where not given, the one that the column's header states (said in the run's
+        warnings), or else s. A header that states another one is refused; the spacing of the rows is no guess.
 
     Returns
     -------
@@ -125,19 +128,27 @@ def load(
 
     given_inputs, given_outputs = gather(wanted.inputs), gather(wanted.outputs)
     clock = pool.time(wanted.time, used) if wanted.step is None else None
+    label = "time" if clock is None else f"{clock.source.name}: column {clock.name!r} (time)"
+    if clock is None and time_unit is not None:
+        raise DataError(f"time_unit={time_unit!r} is the unit of time=, which is not used; step= is in s")
+    unit, said = ("s", ()) if clock is None else time_unit_of(_header_of(clock), label, time_unit)
     if name is None:
         stem = paths[0].stem
         name = header.name if header is not None else stem if is_run_name(stem) else "run"
     asked = Asked(
         given_inputs, given_outputs, step=wanted.step, time=None if clock is None else clock.numbers(),
         units=wanted.units, intersample=wanted.intersample, name=name, resample=resample, window=slice,
-        time_unit=time_unit, labels=labels,
-        time_label="time" if clock is None else f"{clock.source.name}: column {clock.name!r} (time)",
+        time_unit=unit, labels=labels, facts=said, time_label=label,
     )  # fmt: skip
     if header is not None:
         stated = header.step if clock is not None and clock.name == CSV_TIME else None
-        asked = replace(asked, known_step=stated, facts=header.warnings, about=header.about)
+        asked = replace(asked, known_step=stated, facts=(*header.warnings, *said), about=header.about)
     return built(asked)
+
+
+def _header_of(clock: Column) -> str:
+    """Return what stands above a column of times; the first column of a matrix has no words of its own."""
+    return clock.variable if clock.matrix is None else "time"
 
 
 def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:

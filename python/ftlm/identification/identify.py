@@ -6,12 +6,12 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.lattice import Lattice, check_lattice, check_lattice_names
 from ftlm.data.run import Run
-from ftlm.data.settings import Settings
+from ftlm.data.settings import METHODS, Settings, check_used
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Estimate
 from ftlm.data.structures import Structure
@@ -26,7 +26,6 @@ from ftlm.judge.metrics import finite
 from ftlm.judge.residuals import LAGS, Residuals, residual_warnings, tested_residuals
 from ftlm.solve.records import default_m
 
-METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
 #: Residuals of an output-error fit below this share of the output are rounding and discretisation.
 ROUNDING = 3e-5
 
@@ -38,14 +37,14 @@ def identify(
     method: Literal[
         "output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"
     ] = "output-error",
-    criterion: Literal["output-error", "equation-error"] = "output-error",
+    criterion: Literal["output-error", "equation-error"] | None = None,
     lattice: Lattice | None = None,
-    norm: Literal["l1", "l2"] = "l1",
-    innovation_length: int = 7,
-    prior_covariance: float = 1.0,
-    rows: Literal["haar", "time"] = "haar",
+    norm: Literal["l1", "l2"] | None = None,
+    innovation_length: int | None = None,
+    prior_covariance: float | None = None,
+    rows: Literal["haar", "time"] | None = None,
     m: int | None = None,
-    keep: int = 20,
+    keep: int | None = None,
     genetic: Genetic | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -56,7 +55,8 @@ def identify(
 
     By output error, orders and coefficients are continuous and found together, with intervals, from an automatic start.
     By the equation-error methods, free orders are searched on the lattice: each equation on its own, or all under their
-    order law; at the orders found, or given, the coefficients are those of the estimator.
+    order law; at the orders found, or given, the coefficients are those of the estimator. An option that the
+    method does not use is refused; None is an option that is not given.
 
     Parameters
     ----------
@@ -70,11 +70,15 @@ def identify(
         bias of noise. ``"multi-innovation"``: the paper's (44) in closed form. ``"least-squares"``: its limit for a
         weak prior. ``"genetic"``: orders and coefficients by a genetic algorithm on the free run, the paper's
         baseline, for comparison only (``pip install 'ftlm[genetic]'``).
-    criterion, lattice, norm, keep, threads, progress
-        Of the order search; see :func:`ftlm.search_orders`. Not used by ``"output-error"``, whose bounds are the
-        structure's own.
+    criterion, lattice, norm, keep
+        Of the order search, by default ``"output-error"``, every lattice of :func:`ftlm.lattice`'s own, ``"l1"`` and
+        20; see :func:`ftlm.search_orders`. Refused by ``"output-error"``, whose bounds are the structure's own, and
+        where every order is a number. ``"genetic"`` uses lattice (its bounds) and norm.
+    threads, progress
+        Threads, by default all cores, and what is called with (work done, work in all).
     innovation_length, prior_covariance, rows
-        p, K0 and the coordinates of paper (42)-(44). p is a weight of the data against the prior, nothing else.
+        p, K0 and the coordinates of paper (42)-(44), by default 7, 1 and ``"haar"``; of ``"multi-innovation"`` alone. p
+        is a weight of the data against the prior, nothing else.
     m
         Block pulses a run; default 2 048, or what the runs carry (a power of two for Haar rows). Instrumental variables
         search on these and, without m, end on all samples (at most 16 384 pulses).
@@ -98,8 +102,8 @@ def identify(
         Runs that do not fit the structure, or a constant output; a store of other searches, in use, damaged, or that
         cannot be written.
     ModelError
-        A method that is not known, a lattice without or with too many candidates, settings out of range, a store or an
-        executor without an order search.
+        A method that is not known, an option that it does not use, a lattice without or with too many candidates,
+        settings out of range, a store or an executor without an order search.
     ConvergenceError
         Regressors that cannot be told apart at the given orders, or an executor that has lost its workers.
     """
@@ -112,19 +116,21 @@ def identify(
     check_lattice_names(lattice, structure)
     if not (genetic is None or isinstance(genetic, Genetic)):
         raise ModelError(f"genetic is {type(genetic).__name__}, not Genetic; use ftlm.Genetic(seeds=…)")
-    if genetic is not None and method != "genetic":
-        raise ModelError(f"genetic settings are given, but method = {method!r}; use method='genetic'")
+    words: dict[str, Any] = {
+        "criterion": criterion, "norm": norm, "innovation_length": innovation_length,
+        "prior_covariance": prior_covariance, "rows": rows, "keep": keep,
+    }  # fmt: skip
+    words = {n: value for n, value in words.items() if value is not None}
+    others = {"lattice": lattice, "genetic": genetic, "store": store, "executor": executor}
+    given = [*(n for n, value in others.items() if value is not None), *words]
     estimator = "least-squares" if method in ("output-error", "genetic") else method
-    settings = Settings.check(criterion, norm, estimator, innovation_length, prior_covariance, rows, keep, threads)
-    searched = bool(structure.order_names) and method not in ("output-error", "genetic")
-    if not searched and not (store is None and executor is None):
-        why = f"method {method!r} makes none" if structure.order_names else "every order here is a number"
-        raise ModelError(f"store= and executor= are for order searches, and {why}; leave them out")
+    settings = Settings.check(coefficients=estimator, threads=threads, **words)
+    check_used(method, given, free=bool(structure.order_names))
     task = Task(tuple(several), structure, lattice)
     if method == "output-error":
         return judged(by_output_error(task, m, settings.threads, progress))
     if method == "genetic":
-        return judged(by_genetic_algorithm(task, genetic or Genetic(), norm, m, settings.threads, progress))
+        return judged(by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress))
     if executor is not None and threads is None:
         settings = replace(settings, threads=1)
     return judged(by_lattice(task, settings, m, progress, store, executor))

@@ -121,7 +121,10 @@ def first_sections(
     # Two lines a chart, drawn once wide and once narrow with half the points.
     points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
     drawn = [f for label, c in compared for f in comparison_charts(c, units=units, label=label, points=points)]
-    equations = [*(equation_html(e) for e in model.equations), f"As a whole, the model is {model.stability()}."]
+    equations = [
+        *(equation_html(e, model.structure.delay) for e in model.equations),
+        f"As a whole, the model is {model.stability()}.",
+    ]
     sections = [
         Section("Warnings", words[1:] if warned else words, warned),
         Section("Equations", equations, tables=[parameter_table(model, joint)]),
@@ -291,18 +294,22 @@ def settings_table(result: Judged, *, title: str = "What the result depends on")
     return Table(title, ("setting", "used"), rows)
 
 
+#: A verdict in a sentence.
+_INDEPENDENCE = {"yes": "independent of", "no": "not independent of", "undecided": "perhaps independent of"}
+
+
 def identification_html(result: Judged) -> str:
     """Return warnings, equations, parameters with intervals, both errors and the residual verdicts."""
     model = result.model
     parts = [warned(result.warnings)]
-    parts += [Markup("<p>{}</p>").format(equation_html(e)) for e in model.equations]
+    parts += [Markup("<p>{}</p>").format(equation_html(e, model.structure.delay)) for e in model.equations]
     parts.append(parameter_table(model, result.joint).to_html())
     parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
     if result.residuals is not None:
         verdicts = [
-            Markup("{}: residuals {}, {} of the inputs").format(
+            Markup("{}: residuals {}, {} the inputs").format(
                 symbol_html(o), "white" if white else "not white",
-                "independent" if result.residuals.independent[o] else "not independent",
+                _INDEPENDENCE[result.residuals.independence[o]],
             )
             for o, white in result.residuals.white.items()
         ]  # fmt: skip

@@ -147,7 +147,7 @@ class Identification(Judged):
         return {
             "method": self.method,
             "settings": self.settings,
-            "equations": {e.output: numeric(e) for e in self.model.equations},
+            "equations": {e.output: numeric(e, self.model.structure.delay) for e in self.model.equations},
             "orders": self.orders,
             "coefficients": self.coefficients,
             "delays": self.delays,
@@ -163,7 +163,7 @@ class Identification(Judged):
 
     def __str__(self) -> str:
         lines = [f"{self.model.structure.name}: {self.method}, {settings_in_words(self.settings)}"]
-        lines += [f"  {numeric(e)}" for e in self.model.equations]
+        lines += [f"  {numeric(e, self.model.structure.delay)}" for e in self.model.equations]
         reference = self.model.structure.reference
         errors = self.standard_errors
         for name, value in {**self.orders, **self.joint_values, **self.coefficients}.items():
@@ -177,7 +177,7 @@ class Identification(Judged):
         lines.append(str(replace(self.comparison, warnings=())))
         if self.residuals is not None:
             white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.white.items())
-            free = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.independent.items())
+            free = ", ".join(f"{o} {w}" for o, w in self.residuals.independence.items())
             lines.append(f"residuals white: {white}; independent of the inputs: {free} (99 %)")
         if self.information is not None:
             lines.append(str(self.information))

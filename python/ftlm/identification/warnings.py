@@ -6,7 +6,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ftlm import _core
+from ftlm.base.arrays import Floats
 from ftlm.base.statistics import is_white
 from ftlm.data.advice import excitation_for
 from ftlm.data.run import Run
@@ -17,8 +20,12 @@ from ftlm.identification.judged import Judged
 from ftlm.judge.comparison import Comparison, compare, validation_warnings
 from ftlm.model.model import Model
 
-#: Two parameters more correlated than this cannot be told apart.
+#: Two parameters more correlated than this cannot be told apart where neither is known by itself.
 INSEPARABLE = 0.995
+#: A coefficient or delay is not known by itself where its standard error exceeds this share of its value, an order
+#: where it exceeds this much. However correlated two numbers are, both are usable if each is within a tenth: then its
+#: 95 % interval spans less than half its value, and an order's less than the steps of 0.5 in which mechanisms differ.
+VAGUE = 0.1
 #: Two coefficients further apart than this share do not obey the coefficient law.
 LAW_BROKEN = 0.05
 
@@ -64,13 +71,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
                 f"coefficient {name} = {value:.4g} is not different from 0 in these runs "
                 f"(standard error {errors[name]:.3g})"
             )
-    correlation = joint.correlation
-    for i, first in enumerate(joint.names):
-        for j, second in enumerate(joint.names[:i]):
-            if abs(correlation[i, j]) > INSEPARABLE:
-                warnings.append(
-                    f"{second} and {first} cannot be told apart in these runs (correlation {correlation[i, j]:.4f})"
-                )
+    warnings += inseparable(joint)
     coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
     if coloured:
         warnings.append(
@@ -78,6 +79,34 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             "standard errors allow for it"
         )
     return warnings
+
+
+def inseparable(joint: JointFit) -> list[str]:
+    """Say which numbers trade for each other, a line a group: correlated, and none of them known by itself."""
+    errors, correlation = joint.standard_errors, np.abs(joint.correlation)
+    sizes = {n: abs(v) for n, v in zip(joint.names, joint.values.tolist(), strict=True)}
+    # Negated so that a standard error that is not a number counts as too large.
+    vague = [i for i, n in enumerate(joint.names) if not errors[n] <= VAGUE * (1.0 if n in joint.orders else sizes[n])]
+    groups: list[list[int]] = []
+    for i in vague:
+        tied = [g for g in groups if any(_trade(joint, correlation, i, j) for j in g)]
+        groups = [g for g in groups if g not in tied] + [sorted([*(j for g in tied for j in g), i])]
+    said = []
+    for group in (g for g in groups if len(g) > 1):
+        *most, last = (joint.names[i] for i in group)
+        known = [c for i in group for j in group if i < j and math.isfinite(c := float(correlation[i, j]))]
+        of = "correlation" if len(group) == 2 else "correlations up to"
+        why = f"{of} {max(known):.4f}" if known else "their standard errors are not finite"
+        said.append(f"{', '.join(most)} and {last} cannot be told apart in these runs ({why})")
+    return said
+
+
+def _trade(joint: JointFit, correlation: Floats, i: int, j: int) -> bool:
+    """Whether two vague numbers move together; those without a finite error do, whatever their correlation."""
+    errors = joint.standard_errors
+    if not any(math.isfinite(errors[joint.names[k]]) for k in (i, j)):
+        return True
+    return bool(correlation[i, j] > INSEPARABLE)
 
 
 def unexcited(runs: Sequence[Run], structure: Structure) -> list[str]:

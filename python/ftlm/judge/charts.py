@@ -9,7 +9,7 @@ import numpy as np
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError
 from ftlm.judge.comparison import Comparison
-from ftlm.judge.residuals import Residuals
+from ftlm.judge.residuals import CorrelationTest, Residuals
 from ftlm.paint.axes import POINTS
 from ftlm.paint.figure import SMALL, Figure
 from ftlm.paint.lines import line_chart
@@ -108,15 +108,31 @@ def residual_charts(tests: Residuals, *, label: str = "") -> list[Figure]:
             keep = test.lags != 0 if own else np.ones(test.lags.size, dtype=bool)
             lags, values = test.lags[keep].astype(np.float64), test.values[keep]
             band = np.full(lags.size, test.band)
-            words = "could be white noise" if own else f"could be independent of earlier {symbol(name)}"
-            words = words if test.passed else words.replace("could", "cannot")
             other = "itself" if own else symbol(name)
             figures.append(
                 line_chart(
                     lags, [("", values)], stems=True, width=SMALL, height=190, bands=[(-band, band)],
                     title=f"Residual of {symbol(output)} with {other}{suffix}",
                     x_label="lag [samples]", y_label="correlation",
-                    caption=f"Shade: 99 % band. The residual {words} (99 %).",
+                    caption=_residual_caption(test, values, "" if own else symbol(name)),
                 )
             )  # fmt: skip
     return figures
+
+
+def _residual_caption(test: CorrelationTest, drawn: Floats, signal: str) -> str:
+    """What the bars of one test show, and what they were judged by; no signal stands for the residual itself."""
+    if not test.decided:
+        why = f"{signal} does not move" if np.isnan(test.limit) else f"its limit is {number(test.limit)}, above 1"
+        return f"Whether the residual follows {signal} is undecided: {why}."
+    if not np.isfinite(test.statistic):
+        return "The residual is not finite, so there are no correlations."
+    outside = int(np.sum(np.abs(drawn) > test.band))
+    bars = f"Shade: 99 % band of one bar; {outside} of {drawn.size} bars leave{'s' if outside == 1 else ''} it."
+    if signal:
+        word = "could be independent of" if test.passed else "is not independent of"
+        judged = f"largest bar at lags from 0 on {number(test.statistic)}, limit {number(test.limit)}"
+        return f"{bars} The residual {word} earlier {signal}: {judged} (99 %, both through the whitening filter)."
+    word = "could be" if test.passed else "is not"
+    judged = f"Ljung-Box sum {number(test.statistic)}, limit {number(test.limit)}"
+    return f"{bars} The residual {word} white noise: {judged} (99 %)."

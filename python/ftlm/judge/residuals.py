@@ -22,6 +22,7 @@ from ftlm.data.several import Runs, as_runs
 from ftlm.data.solved import Solved, check_solved
 from ftlm.judge.comparison import free_runs
 from ftlm.judge.metrics import finite
+from ftlm.judge.whitening import autoregression, is_constant, whitened
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, symbol_html
 from ftlm.solve.sampled import Sampled, measured_samples
@@ -46,7 +47,10 @@ class CorrelationTest:
         What is judged, and the value that one true model in a hundred exceeds: for whiteness the Ljung-Box sum over
         all positive lags, for independence the largest correlation at lags >= 0 against a band for all of them.
     passed
-        Whether the statistic is within its limit; False where the residuals are not finite.
+        Whether the statistic is within a limit that it could have exceeded; False where the residuals are not finite.
+    decided
+        Whether the test could fail at all. A correlation never exceeds 1: where its limit does, or where the input does
+        not move, nothing is shown, and the test has neither passed nor failed.
     """
 
     lags: NDArray[np.int64]
@@ -55,6 +59,17 @@ class CorrelationTest:
     statistic: float
     limit: float
     passed: bool
+    decided: bool = True
+
+    @property
+    def failed(self) -> bool:
+        """Whether the test was decided, and not passed."""
+        return self.decided and not self.passed
+
+    @property
+    def verdict(self) -> str:
+        """``"passed"``, ``"failed"`` or ``"undecided"``."""
+        return "undecided" if not self.decided else "passed" if self.passed else "failed"
 
     @property
     def outside(self) -> int:
@@ -75,6 +90,7 @@ class CorrelationTest:
             "values": list(map(finite, self.values.tolist())),
             **{n: finite(getattr(self, n)) for n in ("band", "statistic", "limit")},
             "passed": self.passed,
+            "decided": self.decided,
         }
 
 
@@ -93,7 +109,7 @@ class OutputResiduals:
     whiteness
         Autocorrelations.
     inputs
-        Cross-correlations with each input.
+        Cross-correlations with each input, both through the filter that makes the residuals white.
     feedback
         Inputs whose LATER values the residuals correlate with while they do not follow earlier ones: a sign of a closed
         loop, not of a missing term.
@@ -105,6 +121,11 @@ class OutputResiduals:
     whiteness: CorrelationTest
     inputs: dict[str, CorrelationTest]
     feedback: tuple[str, ...]
+
+    @property
+    def judged(self) -> dict[str, CorrelationTest]:
+        """Tests of the inputs that move, since one that does not can do nothing; of all where none does."""
+        return {n: t for n, t in self.inputs.items() if t.decided or not math.isnan(t.limit)} or self.inputs
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -148,39 +169,67 @@ class Residuals:
 
     @property
     def independent(self) -> dict[str, bool]:
-        """Whether the residuals of each output could be independent of all earlier inputs."""
-        return {name: all(t.passed for t in output.inputs.values()) for name, output in self.outputs.items()}
+        """Whether the residuals of each output were found independent of all earlier inputs; not if it is undecided."""
+        return {name: all(t.passed for t in output.judged.values()) for name, output in self.outputs.items()}
+
+    @property
+    def tests(self) -> list[tuple[str, str, CorrelationTest]]:
+        """Every test with its output and its input, which is empty for whiteness."""
+        return [
+            (name, signal, test)
+            for name, output in self.outputs.items()
+            for signal, test in [("", output.whiteness), *output.inputs.items()]
+        ]
+
+    @property
+    def independence(self) -> dict[str, str]:
+        """``"yes"``, ``"no"`` or ``"undecided"`` for each output: whether its residuals are independent."""
+        return {
+            name: "no" if any(t.failed for t in output.inputs.values()) else "yes" if free else "undecided"
+            for (name, output), free in zip(self.outputs.items(), self.independent.values(), strict=True)
+        }
+
+    @property
+    def _judged(self) -> list[CorrelationTest]:
+        return [t for output in self.outputs.values() for t in (output.whiteness, *output.judged.values())]
 
     @property
     def passed(self) -> bool:
-        """Whether all residuals pass both tests."""
-        return all(self.white.values()) and all(self.independent.values())
+        """Whether all residuals pass both tests; False where one is undecided, inputs that do not move apart."""
+        return all(test.passed for test in self._judged)
+
+    @property
+    def decided(self) -> bool:
+        """Whether every test could fail, inputs that do not move apart, or one has failed."""
+        return any(test.failed for test in self._judged) or all(test.decided for test in self._judged)
+
+    @property
+    def verdict(self) -> str:
+        """``"passed"``, ``"FAILED"`` where one test has, or ``"undecided"``."""
+        return "passed" if self.passed else "FAILED" if self.decided else "undecided"
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "passed": self.passed,
+            "decided": self.decided,
             "runs": list(self.runs),
             "refinement": self.refinement,
             "outputs": {name: output.to_dict() for name, output in self.outputs.items()},
         }
 
     def __str__(self) -> str:
-        tests = [
-            (f"{output} {words}", test)
-            for output, judged in self.outputs.items()
-            for words, test in [("alone", judged.whiteness), *((f"and {n}", t) for n, t in judged.inputs.items())]
-        ]
+        tests = [(f"{output} and {signal}" if signal else f"{output} alone", t) for output, signal, t in self.tests]
         width = max(len(label) for label, _ in tests) + 2
         lines = [
-            f"residual tests at 99 % on {', '.join(self.runs)}: {'passed' if self.passed else 'FAILED'}",
+            f"residual tests at 99 % on {', '.join(self.runs)}: {self.verdict}",
             f"{'correlation of':<{width}}{'largest':>10}{'at lag':>8}{'band':>10}{'statistic':>12}{'limit':>10}",
         ]
         for label, test in tests:
             lag, value = test.largest
             lines.append(
                 f"{label:<{width}}{value:>10.3g}{lag:>8}{test.band:>10.3g}{test.statistic:>12.4g}{test.limit:>10.4g}"
-                f"   {_verdict(test.passed)}"
+                f"   {test.verdict}"
             )
         lines += residual_sentences(self)
         return "\n".join(lines)
@@ -223,11 +272,14 @@ def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Resi
     Notes
     -----
     Whiteness: the 99 % band of one autocorrelation of white noise is 2.576/√N; the verdict is the sum of Ljung and Box
-    (doi:10.1093/biomet/65.2.297) over all lags against the 99 % quantile of χ². Independence: the variance of one
-    cross-correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), which allows for
-    coloured residuals and is taken no smaller than for white ones; the verdict is the largest correlation at lags >= 0
-    against the band that holds for all of them together with 99 % (Šidák). Both tests are of the free run: an equation
-    error that passes proves nothing.
+    (doi:10.1093/biomet/65.2.297) over all lags against the 99 % quantile of χ². Independence: residuals and input pass
+    the filter that makes the residuals white, an autoregression of least Bayesian information criterion; raw
+    correlations of two slow signals are so wide by chance that a missing dead time hides in them (Box and Jenkins,
+    chapter 11). The filter is causal, so an input that follows the residuals stays later than they are. The variance of
+    one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), taken no smaller than for
+    white residuals; the verdict is the largest correlation at lags >= 0 against the band that holds for all of them
+    together with 99 % (Šidák). A limit above 1 decides nothing, nor does an input that does not move. Both tests are of
+    the free run: an equation error that passes proves nothing.
     """
     check_solved(model)
     several = as_runs(runs)
@@ -280,7 +332,10 @@ def _tested(series: list[Floats], signals: Mapping[str, list[Floats]], lags: int
         lost, across = _lost(np.arange(lags + 1)), _lost(np.arange(-lags, lags + 1))
         return OutputResiduals(series, math.inf, math.inf, lost, dict.fromkeys(signals, across), ())
     whiteness = _whiteness(series, everything.size, lags)
-    inputs = {name: _independence(series, values, lags) for name, values in signals.items()}
+    # Through this filter the residuals are white, and the inputs lose what they share with them by chance alone.
+    colour = autoregression(series, lags)
+    white = whitened(series, colour)
+    inputs = {name: _independence(white, values, colour, lags) for name, values in signals.items()}
     before = {name: float(np.max(np.abs(test.values[:lags]))) for name, test in inputs.items()}
     feedback = tuple(name for name, test in inputs.items() if test.passed and before[name] > test.limit)
     return OutputResiduals(series, rms, nr, whiteness, inputs, feedback)
@@ -299,13 +354,16 @@ def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
     return CorrelationTest(np.arange(lags + 1), own, band, statistic, limit, passed=statistic <= limit)
 
 
-def _independence(series: list[Floats], signal: list[Floats], lags: int) -> CorrelationTest:
+def _independence(white: list[Floats], signal: list[Floats], colour: Floats, lags: int) -> CorrelationTest:
     """Largest correlation at lags from 0 on against the band that holds for all of them together."""
-    cross, variance, _ = _core.correlation(series, signal, lags)
+    around = np.arange(-lags, lags + 1)
+    if is_constant(signal):
+        return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, decided=False)
+    cross, variance, _ = _core.correlation(white, whitened(signal, colour), lags)
     spread, largest = math.sqrt(variance), float(np.max(np.abs(cross[lags:])))
     limit = NormalDist().inv_cdf(1 - (1 - (1 - LEVEL) ** (1 / (lags + 1))) / 2) * spread
-    around = np.arange(-lags, lags + 1)
-    return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed=largest <= limit)
+    decided = limit < 1.0
+    return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, decided and largest <= limit, decided)
 
 
 def residual_sentences(tests: Residuals) -> list[str]:
@@ -321,9 +379,14 @@ def residual_sentences(tests: Residuals) -> list[str]:
                 f"{name}: residuals are not white (Ljung-Box {white.statistic:.3g} over {white.lags[-1]} lags, 99 % "
                 f"limit {white.limit:.3g}): the model leaves something out"
             )
-        for signal, test in output.inputs.items():
+        for signal, test in output.judged.items():
             lag, value = test.largest
-            if not test.passed:
+            if not test.decided:
+                why = f"its limit is {test.limit:.3g}: too few samples for residuals of this colour; give a longer run"
+                if math.isnan(test.limit):
+                    why = f"{signal} does not move; give a run in which it does"
+                words.append(f"{name}: whether residuals follow {signal} is undecided: {why}")
+            elif not test.passed:
                 words.append(
                     f"{name}: residuals still follow {signal} (correlation {value:.2g} at lag {lag}, 99 % limit "
                     f"{test.limit:.2g}): not all of what {signal} does is in the model"
@@ -348,16 +411,13 @@ def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:
     for name, output in tests.outputs.items():
         judged = [(Markup("whiteness"), output.whiteness)]
         judged += [(Markup("independence of {}").format(symbol_html(n)), t) for n, t in output.inputs.items()]
-        rows += [[symbol_html(name), what, t.statistic, t.limit, _verdict(t.passed)] for what, t in judged]
+        rows += [[symbol_html(name), what, t.statistic, t.limit, t.verdict] for what, t in judged]
     note = (
-        "Whiteness: Ljung-Box sum over 25 lags. Independence: largest correlation at lags from 0 on. One true model in "
-        "a hundred fails each."
+        "Whiteness: Ljung-Box sum over all lags. Independence: largest correlation at lags from 0 on, residual and "
+        "input through the filter that whitens the residual. One true model in a hundred fails each. Undecided: the "
+        "test could not have failed."
     )
     return Table(title, ("output", "test", "statistic", "limit (99 %)", "verdict"), rows, note=note)
-
-
-def _verdict(passed: bool) -> str:
-    return "passed" if passed else "failed"
 
 
 def residuals_html(tests: Residuals) -> str:

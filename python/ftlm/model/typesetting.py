@@ -18,11 +18,20 @@ from ftlm.paint.text import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_h
 #: Decimals of an order in an equation; the model's file has them all.
 ORDER_DECIMALS = 4
 THIN = Markup('<mspace width="0.17em"></mspace>')  # our constant
+_LATE = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
 _PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
-def equation_html(item: Equation) -> Markup:
-    """Return an identified equation typeset as MathML, a piece for each term so that it breaks between terms."""
+def equation_html(item: Equation, delay: Mapping[str, float] | None = None) -> Markup:
+    """Return an identified equation typeset as MathML, a piece for each term so that it breaks between terms.
+
+    Parameters
+    ----------
+    item
+        The equation.
+    delay
+        Delays of inputs [s]; a delayed input is written u(t − 0.035 s).
+    """
     parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
     for k, term in enumerate(item.terms):
         value = term.fixed or 0.0
@@ -30,7 +39,8 @@ def equation_html(item: Equation) -> Markup:
         # The first sign belongs to its number; the others stand between two terms.
         lead = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
         parts.append(_math(lead + _number_math(abs(value)) + THIN +
-                           _derivative_math(term.order, term.signal), "term"))  # fmt: skip
+                           _derivative_math(term.order, term.signal, (delay or {}).get(term.signal, 0.0)),
+                           "term"))  # fmt: skip
     return Markup('<span class="equation">{}</span>').format(Markup(" ").join(parts))
 
 
@@ -39,7 +49,7 @@ def _math(content: Markup, name: str = "") -> Markup:
     return Markup("<math{}><mrow>{}</mrow></math>").format(kind, content)
 
 
-def _number_math(value: float) -> Markup:
+def _number_math(value: float | Exact) -> Markup:
     mantissa, times, power = number(value).partition("×10")
     base = Markup("<mn>{}</mn>").format(mantissa)
     if not times:
@@ -58,11 +68,14 @@ def _symbol_math(name: str) -> Markup:
     return Markup("<msub>{}<mn>{}</mn></msub>").format(stem, parts[2]) if parts[2] else stem
 
 
-def _derivative_math(order: Order, signal: str) -> Markup:
+def _derivative_math(order: Order, signal: str, delay: float = 0.0) -> Markup:
+    written = _symbol_math(signal)
+    if delay > 0:
+        written += _LATE.format(_number_math(Exact(delay)), THIN)
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
-        return _symbol_math(signal)
+        return written
     value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed(order.constant)
-    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN, _symbol_math(signal))
+    return Markup("<msup><mi>D</mi>{}</msup>{}{}").format(value, THIN, written)
 
 
 def _signed(value: float) -> Markup:
@@ -139,6 +152,8 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
 
 def model_html(model: Solved) -> str:
     """Return the equations of a model and its parameters."""
-    lines = Markup("").join(Markup("<p>{}</p>").format(equation_html(e)) for e in model.equations)
+    lines = Markup("").join(
+        Markup("<p>{}</p>").format(equation_html(e, model.structure.delay)) for e in model.equations
+    )
     known = model.orders or any(t.name for e in model.equations for t in e.terms)
     return str(lines + parameter_table(model).to_html() if known else lines)

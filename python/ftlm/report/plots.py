@@ -153,8 +153,7 @@ def residuals(tests: Residuals | Identification) -> Any:
             axis.vlines(test.lags[keep], 0, test.values[keep], color=LINES[1][0], linewidth=1.2)
             axis.axhline(0, color=LINES[0][0], linewidth=0.6)
             other = name if name == "itself" else symbol(name)
-            verdict = "passed" if test.passed else "failed"
-            axis.set_title(_plain(f"{symbol(output)} with {other}: {verdict}"), fontsize="small")
+            axis.set_title(_plain(f"{symbol(output)} with {other}: {test.verdict}"), fontsize="small")
             axis.set_xlabel("lag [samples]")
         row[0].set_ylabel("correlation")
         for axis in row[len(correlations) :]:

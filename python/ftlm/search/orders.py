@@ -15,7 +15,7 @@ from ftlm.base.errors import DataError, ModelError
 from ftlm.base.progress import Progress
 from ftlm.data.lattice import Lattice, check_lattice
 from ftlm.data.run import Run
-from ftlm.data.settings import Coefficients, Criterion, Settings
+from ftlm.data.settings import Coefficients, Criterion, Settings, check_used
 from ftlm.data.several import as_runs
 from ftlm.data.structures import Structure
 from ftlm.paint.heat import Landscape
@@ -37,9 +37,9 @@ def search_orders(
     criterion: Criterion = "output-error",
     coefficients: Coefficients = "multi-innovation",
     norm: Literal["l1", "l2"] = "l1",
-    innovation_length: int = 7,
-    prior_covariance: float = 1.0,
-    rows: Literal["haar", "time"] = "haar",
+    innovation_length: int | None = None,
+    prior_covariance: float | None = None,
+    rows: Literal["haar", "time"] | None = None,
     m: int | None = None,
     keep: int = 20,
     threads: int | None = None,
@@ -51,7 +51,7 @@ def search_orders(
     """Exhaustive search over the orders of an equation, or of a stage under its order law.
 
     Each candidate gets its coefficients on the equation error, then its score; the table is that of evaluating every
-    candidate to the end, the same bits for any number of threads (paper Table 2, steps 5-7).
+    candidate to the end, the same bits for any number of threads on one kind of processor (paper Table 2, steps 5-7).
 
     Parameters
     ----------
@@ -72,7 +72,9 @@ def search_orders(
     norm
         ``"l1"`` (paper (45)) or ``"l2"`` (paper (46)).
     innovation_length, prior_covariance, rows
-        p and K0 of paper (43)-(44), and whether rows come in Haar coordinates or in the order of time.
+        p and K0 of paper (43)-(44), and whether rows come in Haar coordinates (``"haar"``) or in the order of time
+        (``"time"``); by default 7, 1 and ``"haar"``. Of ``"multi-innovation"`` alone; with other coefficients they are
+        refused.
     m
         Block pulses a run; default 2 048, or what the runs carry.
     keep
@@ -103,7 +105,8 @@ def search_orders(
         Runs that do not fit, or a constant output; a store of another search, in use, damaged, or that cannot be
         written.
     ModelError
-        Nothing to search, a lattice without or with too many candidates, settings out of range.
+        Nothing to search, a lattice without or with too many candidates, settings out of range, an option that these
+        coefficients do not use.
     ConvergenceError
         An executor that has lost its workers.
     KeyboardInterrupt
@@ -118,9 +121,12 @@ def search_orders(
     if executor is not None and threads is None:
         threads = 1
     checked = as_runs(runs)
+    weighted = {"innovation_length": innovation_length, "prior_covariance": prior_covariance, "rows": rows}
+    words: dict[str, Any] = {n: value for n, value in weighted.items() if value is not None}
     settings = Settings.check(
-        criterion, norm, coefficients, innovation_length, prior_covariance, rows, keep, threads, early_stopping
+        criterion, norm, coefficients, keep=keep, threads=threads, early_stopping=early_stopping, **words
     )
+    check_used(coefficients, words, argument="coefficients")
     job = make_job(checked, equation, lattice, settings, m=m, progress=progress)
     if store is None:
         return run_job(job, executor=executor)

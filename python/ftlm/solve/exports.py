@@ -53,7 +53,7 @@ def matlab_text(model: Solved) -> str:
 
     lines = [
         _comment(f"{model.structure.name}, written by ftlm {__version__}", "%"),
-        *(_comment(numeric(e), "%") for e in model.equations),
+        *(_comment(numeric(e, model.structure.delay), "%") for e in model.equations),
         "% G_y_u = (b(1)*s^nb(1) + ...)/(a(1)*s^na(1) + ...)*exp(-s*delay); SI units.",
         "% FOMCON (https://fomcon.net) makes fotf objects of them; without it the vectors remain.",
     ]
@@ -93,7 +93,7 @@ def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) ->
 
     lines = [
         _comment(f"{model.structure.name}, written by ftlm {__version__}", "#"),
-        *(_comment(numeric(e), "#") for e in model.equations),
+        *(_comment(numeric(e, model.structure.delay), "#") for e in model.equations),
         *(_comment(line, "#") for line in str(near).splitlines()),
         "import control",
         "import numpy as np",

@@ -1,8 +1,9 @@
 //! How a search is cut into rounds, and its rounds into waves.
 //!
 //! Rounds form waves of 1, 2, 4, … A round knows the rows kept before its wave and what it finds itself, nothing else,
-//! so it comes to the same bits, counts too, wherever and whenever it is done: on any number of threads, on another
-//! machine, or continued from a checkpoint.
+//! so it comes to the same bits, counts too, whenever it is done on processors of one kind: on any number of threads, on
+//! another machine with the same vector instructions, or continued from a checkpoint. On another kind of processor the
+//! last digits may differ: the dense products and the transforms choose their kernels by the instructions they find.
 
 use crate::search::options::Options;
 
