@@ -80,7 +80,14 @@ _Monomial: TypeAlias = tuple[float, Sequence[tuple[int, int]]]
 #: (output, alpha, [(signal, order, coefficient), ...])
 _FreeEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine, _Monomial]]]
 #: (record, pulses a sample interval, samples of each output as rows, filter of simulated outputs, weights of outputs)
-_Experiment: TypeAlias = tuple[_Record, int, _Floats, tuple[_Floats, Sequence[bool]] | None, Sequence[float]]
+_Experiment: TypeAlias = tuple[
+    _Record,
+    int,
+    _Floats,
+    tuple[_Floats, Sequence[bool]] | None,
+    Sequence[float],
+    Sequence[tuple[_Floats | None, bool]],
+]
 _Progress: TypeAlias = Callable[[int, int, int], object]
 
 #: (coefficients, initial terms per record, their exponents, dropped (record, position) pairs)
@@ -131,7 +138,7 @@ class _Fit(TypedDict):
     initial: list[list[list[float]]]
     exponents: list[list[float]]
     evaluations: int
-    status: Literal["converged", "exhausted", "stalled"]
+    status: Literal["converged", "exhausted", "stalled", "wall"]
 
 __version__: Final[str]
 SIMD: Final[str]

@@ -105,9 +105,16 @@ type AffineArg = (f64, Vec<f64>);
 type MonomialArg = (f64, Vec<(usize, i32)>);
 /// (output, alpha, [(signal, order, coefficient), …]).
 type FreeEquationArg = (usize, AffineArg, Vec<(usize, AffineArg, MonomialArg)>);
-/// (record, pulses a sample interval, samples of each output, filter of simulated outputs, weight of each output).
-type ExperimentArg<'py> =
-    (RecordArg<'py>, usize, PyReadonlyArray2<'py, f64>, Option<(PyReadonlyArray1<'py, f64>, Vec<bool>)>, Vec<f64>);
+/// (record, pulses a sample interval, samples of each output, filter of simulated outputs, weight of each output,
+/// (values at the samples, whether it holds) of each signal).
+type ExperimentArg<'py> = (
+    RecordArg<'py>,
+    usize,
+    PyReadonlyArray2<'py, f64>,
+    Option<(PyReadonlyArray1<'py, f64>, Vec<bool>)>,
+    Vec<f64>,
+    Vec<(Option<PyReadonlyArray1<'py, f64>>, bool)>,
+);
 
 fn affine((constant, weights): AffineArg) -> AffineOrder {
     AffineOrder { constant, weights }
@@ -115,6 +122,13 @@ fn affine((constant, weights): AffineArg) -> AffineOrder {
 
 fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     let experiment = joint::Experiment::new(record(&argument.0)?, argument.1, rows(&argument.2), argument.4.clone())?;
+    let instants = (argument.5.iter())
+        .map(|(values, held)| {
+            let values = values.as_ref().map(|v| vector("signal at the samples", v)).transpose()?;
+            Ok(joint::Instant { values: values.map(Into::into), held: *held })
+        })
+        .collect::<PyResult<Vec<_>>>()?;
+    let experiment = experiment.with_instants(instants)?;
     Ok(match &argument.3 {
         None => experiment,
         Some((series, applies)) => experiment.with_filter(vector("filter", series)?, applies.clone())?,
@@ -187,6 +201,7 @@ pub fn output_error<'py>(
             joint::Status::Converged => "converged",
             joint::Status::Exhausted => "exhausted",
             joint::Status::Stalled => "stalled",
+            joint::Status::Wall => "wall",
         },
     )?;
     Ok(dict)

@@ -115,3 +115,95 @@ fn few_evaluations_and_bad_columns_are_said() {
     };
     assert!(matches!(minimise(&nowhere, vec![0.0], settings(3)), Err(Error::Diverged { .. })));
 }
+
+/// Half of (x − 3)² + (x + 2y − 4)² with x within bounds, a value only up to a wall, and a size for its rounding.
+struct Boxed {
+    bounds: (f64, f64),
+    wall: f64,
+    corner: bool,
+}
+
+impl Problem for Boxed {
+    type Point = [f64; 2];
+    type Evaluation = Vec<f64>;
+
+    fn evaluate(&self, x: &[f64; 2]) -> Result<Vec<f64>> {
+        if x[0] > self.wall {
+            return Err(Error::Diverged { what: "free run".into(), index: 0 });
+        }
+        // With a corner at 2 the way back is as steep as the way on.
+        let turned = if self.corner && x[0] > 2.0 { 4.0 - x[0] } else { x[0] };
+        Ok(vec![turned - 3.0, x[0] + 2.0 * x[1] - 4.0, 1.0])
+    }
+
+    fn residuals<'a>(&self, evaluation: &'a Vec<f64>) -> &'a [f64] {
+        evaluation
+    }
+
+    fn jacobian(&self, x: &[f64; 2], _: &Vec<f64>) -> Result<Vec<Vec<f64>>> {
+        let turned = if self.corner && x[0] > 2.0 { -1.0 } else { 1.0 };
+        Ok(vec![vec![turned, 1.0, 0.0], vec![0.0, 2.0, 0.0]])
+    }
+
+    fn moved(&self, x: &[f64; 2], steps: &[f64]) -> ([f64; 2], f64) {
+        let next = [(x[0] + steps[0]).clamp(self.bounds.0, self.bounds.1), x[1] + steps[1]];
+        (next, (next[0] - x[0]).abs().max(steps[1].abs()))
+    }
+
+    fn room(&self, x: &[f64; 2], parameter: usize) -> (f64, f64) {
+        if parameter == 0 {
+            (x[0] - self.bounds.0, self.bounds.1 - x[0])
+        } else {
+            (f64::INFINITY, f64::INFINITY)
+        }
+    }
+
+    fn kinked(&self, _: &[f64; 2], parameter: usize) -> bool {
+        self.corner && parameter == 0
+    }
+}
+
+const OPEN: Boxed = Boxed { bounds: (-10.0, 10.0), wall: 20.0, corner: false };
+
+#[test]
+fn what_pushes_out_of_a_bound_does_not_keep_the_rest_from_its_minimum() {
+    for (bounds, x) in [((-10.0, 10.0), 3.0), ((-10.0, 1.0), 1.0), ((4.0, 10.0), 4.0), ((0.5, 0.5), 0.5)] {
+        let start = [0.0_f64.clamp(bounds.0, bounds.1), -7.0];
+        let found = minimise(&Boxed { bounds, ..OPEN }, start, Settings { evaluations: 60, tolerance: 1e-12 }).unwrap();
+        assert_eq!((found.status, found.point[0]), (Status::Converged, if x == 3.0 { found.point[0] } else { x }));
+        check("minimum within bounds", (found.point[0] - x).abs().max((found.point[1] - 0.5 * (4.0 - x)).abs()), 1e-5);
+        assert!(found.evaluations < 20, "{}", found.evaluations);
+    }
+}
+
+#[test]
+fn a_start_on_a_bound_leaves_it_where_the_slope_leads_inside() {
+    let found = minimise(&Boxed { bounds: (-10.0, 5.0), ..OPEN }, [5.0, 0.0], Settings::default()).unwrap();
+    assert_eq!(found.status, Status::Converged);
+    check("minimum inside", (found.point[0] - 3.0).abs(), 1e-4);
+}
+
+#[test]
+fn a_minimum_behind_a_wall_is_no_minimum() {
+    let found = minimise(&Boxed { wall: 1.0, ..OPEN }, [0.0, 0.0], Settings { evaluations: 500, tolerance: 1e-9 });
+    let found = found.unwrap();
+    assert_eq!(found.status, Status::Wall);
+    assert!(found.point[0] <= 1.0 && found.point[0] > 0.99, "{:?}", found.point);
+}
+
+#[test]
+fn a_corner_of_the_cost_is_a_minimum_where_the_rest_lies_flat() {
+    let corner = Boxed { corner: true, ..OPEN };
+    let found = minimise(&corner, [0.0, 0.0], Settings { evaluations: 500, tolerance: 1e-9 }).unwrap();
+    assert_eq!(found.status, Status::Converged);
+    check("corner", (found.point[0] - 2.0).abs().max((found.point[1] - 1.0).abs()), 1e-4);
+}
+
+#[test]
+fn a_short_step_is_no_minimum() {
+    // Slopes that lie, and a tolerance that every damped step falls below before the damping ends.
+    let problem =
+        Closed { residuals: |x: &[f64]| Ok(vec![1.0 + x[0] * x[0] + x[0]]), jacobian: |_: &[f64]| vec![vec![-1.0]] };
+    let found = minimise(&problem, vec![0.0], Settings { evaluations: 1000, tolerance: 1e-6 }).unwrap();
+    assert_eq!(found.status, Status::Stalled);
+}

@@ -3,7 +3,7 @@
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimate::output_error::{
-    fit, Coordinate, Experiment, Fit, FreeDelay, FreeEquation, FreeModel, Monomial, Point, Settings, Status,
+    fit, Coordinate, Experiment, Fit, FreeDelay, FreeEquation, FreeModel, Instant, Monomial, Point, Settings, Status,
 };
 use ftlm::means::{delayed, point_samples};
 use ftlm::regressors::Record;
@@ -84,7 +84,7 @@ fn run(intervals: usize, every: usize, initial: &[Vec<(f64, f64)>], noise: f64, 
         samples.push(clean.iter().map(|y| y + sigma * random.normal()).collect());
         record = with_signal(&record, i, means);
     }
-    Experiment { record, every, samples, filter: None, weights }
+    Experiment { record, every, samples, filter: None, weights, instants: Vec::new() }
 }
 
 fn point(orders: &[f64], coefficients: &[f64]) -> Point {
@@ -390,4 +390,110 @@ fn a_delay_is_estimated_as_well_as_its_slope_says() {
     // Of forty standard normal numbers: the mean scatters by 0.16, the deviation by 0.11.
     assert!(mean.abs() < 0.6, "mean {mean}");
     check_between("deviation of the scores", deviation(&scores), 0.6, 1.4);
+}
+
+/// Two equations that feed through: each output drives the other at once, and the input both.
+fn at_once(coupled: bool, initial: Initial, delays: Vec<FreeDelay>) -> FreeModel {
+    let fixed = |order: f64| AffineOrder { constant: order, weights: Vec::new() };
+    let equation = |output: usize, other: usize, order: f64, first: usize| FreeEquation {
+        output,
+        order: fixed(order),
+        terms: vec![
+            (output, fixed(0.0), monomial(-1.0, &[first])),
+            (other, fixed(order), monomial(1.0, &[first + 1])),
+            (2, fixed(order), monomial(1.0, &[first + 2])),
+            (2, fixed(0.0), monomial(2.0, &[first, first + 2])),
+        ],
+    };
+    FreeModel {
+        equations: vec![equation(0, 1, 1.2, 0), equation(1, 0, 0.7, 3)],
+        order_bounds: Vec::new(),
+        coordinates: vec![Coordinate::Plain; 6],
+        delays,
+        coupled,
+        initial,
+    }
+}
+
+#[test]
+fn what_feeds_through_has_the_slope_of_its_residuals() {
+    let coefficients = [1.5, 0.4, 0.7, 0.9, -0.3, 0.5];
+    let delayed = || vec![FreeDelay { signal: 2, bounds: (0.0, 0.2) }];
+    for (name, model) in [
+        ("coupled", at_once(true, Initial::Rest, Vec::new())),
+        ("measured coupling", at_once(false, Initial::Rest, Vec::new())),
+        ("delayed", at_once(true, Initial::Rest, delayed())),
+    ] {
+        let mut experiment = run(80, 2, &[], 0.02, 700);
+        let held = Random::new(701).signal(81);
+        let instants = experiment.samples.iter().cloned().map(|values| Instant { values: Some(values), held: false });
+        experiment.instants = instants.chain([Instant { values: Some(held), held: true }]).collect();
+        let at = |c: &[f64], delay: f64| {
+            let delays = model.delays.iter().map(|_| delay).collect();
+            let start = Point { orders: Vec::new(), coefficients: c.to_vec(), delays };
+            let settings = Settings { evaluations: 1, ..Settings::default() };
+            fit(&model, std::slice::from_ref(&experiment), &start, settings).unwrap()
+        };
+        let here = at(&coefficients, 0.057);
+        for (i, column) in here.jacobian.iter().enumerate() {
+            let shifted = |by: f64| {
+                let mut c = coefficients;
+                if let Some(c) = c.get_mut(i) {
+                    *c += by;
+                }
+                at(&c, if i == 6 { 0.057 + by } else { 0.057 })
+            };
+            let d = 1e-4;
+            let (up, down) = (shifted(d), shifted(-d));
+            let slope: Vec<f64> = up.residuals.iter().zip(&down.residuals).map(|(u, l)| (u - l) / (2.0 * d)).collect();
+            assert!(norm(column) > 0.0);
+            check(&format!("slope of what feeds through, {name}, {i}"), relative_distance(column, &slope), 1e-6);
+        }
+    }
+}
+
+#[test]
+fn a_gain_is_the_gain_at_the_instant_of_the_sample() {
+    // y = 0.4 x + 0.7 u and x = -0.3 y + 0.5 u at once: with no other term the samples are those of the two by two.
+    let mut model = at_once(true, Initial::Rest, Vec::new());
+    model.equations.iter_mut().for_each(|e| {
+        e.terms.remove(3);
+        e.terms[0].2 = Monomial { factor: 0.0, powers: vec![(0, 1)] };
+    });
+    let input = Random::new(702).signal(41);
+    let determinant = 1.0 + 0.4 * 0.3;
+    let rows = [(0.7 + 0.4 * 0.5) / determinant, (0.5 - 0.3 * 0.7) / determinant];
+    let samples: Vec<Vec<f64>> = rows.iter().map(|g| input.iter().map(|u| g * u).collect()).collect();
+    let record = record(0.1, vec![vec![0.0; 40], vec![0.0; 40], input[..40].to_vec()]);
+    let instants = vec![Instant::default(), Instant::default(), Instant { values: Some(input), held: true }];
+    let experiment = Experiment::new(record, 1, samples, vec![1.0, 1.0]).unwrap().with_instants(instants).unwrap();
+    let found = at(&model, &[experiment.clone()], &[], &[1.0, 0.4, 0.7, 1.0, -0.3, 0.5]);
+    check("samples that feed through", norm(&found.residuals), 1e-12);
+    let short = vec![Instant::default(), Instant::default(), Instant { values: Some(vec![0.0]), held: true }];
+    assert!(matches!(experiment.clone().with_instants(short), Err(Error::Length { .. })));
+    assert!(matches!(experiment.with_instants(vec![Instant::default()]), Err(Error::Length { .. })));
+}
+
+#[test]
+fn a_fit_that_its_grid_stops_says_so() {
+    // Sampled at a tenth of its time constant, y' = -20 y + 20 u; the data ask for a pole far beyond the grid: y = u.
+    let input = Random::new(703).steps(200, 5);
+    let record = record(0.1, vec![vec![0.0; 200], input.clone()]);
+    let response = point_samples(&input);
+    let experiment = Experiment::new(record, 1, vec![response], vec![1.0]).unwrap();
+    let fixed = |order: f64| AffineOrder { constant: order, weights: Vec::new() };
+    let model = FreeModel {
+        equations: vec![FreeEquation {
+            output: 0,
+            order: fixed(1.0),
+            terms: vec![(0, fixed(0.0), monomial(-1.0, &[0])), (1, fixed(0.0), monomial(1.0, &[0]))],
+        }],
+        order_bounds: Vec::new(),
+        coordinates: vec![Coordinate::Logarithm],
+        delays: Vec::new(),
+        coupled: false,
+        initial: Initial::Rest,
+    };
+    let found = fit(&model, &[experiment], &point(&[], &[2.0]), Settings::default()).unwrap();
+    assert_eq!(found.status, Status::Wall, "{:?}", found.point);
 }

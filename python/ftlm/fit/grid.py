@@ -14,10 +14,11 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
 from ftlm.data.run import Run
+from ftlm.data.structures import Structure
 from ftlm.fit.problem import FreeProblem
-from ftlm.solve.records import initial_tuple, record, sensor_series
+from ftlm.solve.records import Record, initial_tuple, record, sensor_series
 
-#: A step that lowers the cost, or moves all parameters, by a smaller share than this ends a descent.
+#: A descent ends where a whole step would lower the cost by a smaller share than this.
 TOLERANCE = 1e-9
 #: Discretisation that the first fit on all samples may leave, in standard deviations of the noise.
 NOTICED = 0.3
@@ -49,7 +50,29 @@ def experiment(
     if coupled and structure.sensor_filter is not None:
         applies = [o in structure.sensor_filter.outputs for o in structure.outputs]
         filtered = (sensor_series(structure, rec.m, rec.step), applies)
-    return rec.core(), every, np.ascontiguousarray(np.stack(samples)), filtered, list(weights)
+    instants = [_instant(run, structure, rec, name, every, decimation) for name in structure.signals]
+    return rec.core(), every, np.ascontiguousarray(np.stack(samples)), filtered, list(weights), instants
+
+
+def _instant(
+    run: Run, structure: Structure, rec: Record, name: str, every: int, decimation: int
+) -> tuple[Floats | None, bool]:
+    """What a signal is at the samples, after it changed there, and whether it holds in between.
+
+    None where it has no jump or corner of its own at the samples: behind a sensor filter, or made of other signals.
+    """
+    measured_through = structure.sensor_filter is not None and name in structure.sensor_filter.outputs
+    if name not in run or (rec.sensor is not None and not measured_through):
+        return None, False
+    held = name in run.inputs and run.intersample[name] == "zoh"
+    values, delay = run[name], structure.delay.get(name, 0.0)
+    if delay and held:
+        # A command switches between samples after a delay: what it is then is the pulse that follows.
+        means = rec.of(name)[::every]
+        return np.append(means, means[-1]), held
+    if delay:
+        values = _core.delayed(values, delay / run.step, 0.0 if rec.initial == "rest" else float(values[0]))
+    return np.ascontiguousarray(values[::decimation]), held
 
 
 @dataclass
@@ -74,7 +97,7 @@ class Attempt:
 
     @property
     def converged(self) -> bool:
-        """Whether neither cost nor parameters moved any more."""
+        """Whether the gradient vanished, but for what pushes out of a bound; a fit stopped at a wall has not."""
         return bool(self.outcome["status"] == "converged")
 
 
@@ -132,7 +155,7 @@ class Grid:
         """Weighted residuals of an attempt by run and output."""
         residuals = np.asarray(attempt.outcome["residuals"])
         parts, at = [], 0
-        for _, _, samples, _, _ in self.experiments:
+        for _, _, samples, *_ in self.experiments:
             compared = samples.shape[1] - 2
             part = {}
             for output in self.problem.structure.outputs:

@@ -57,7 +57,8 @@ class JointFit:
     settled
         Whether halving the step moved no estimate by a tenth of its standard error.
     converged
-        Whether neither cost nor parameters moved any more.
+        Whether the gradient of the cost vanished, but for what pushes out of a bound. False where the evaluations ran
+        out, where no step lowered the cost, and where the way down led to what the grid does not carry.
     starts
         Coarse cost (per residual) and origin of every start, best first.
     residuals
@@ -233,7 +234,7 @@ def refined(best: Attempt, grid: Grid) -> Optimum:
         finer, grid = with_settled_weights(best, grid.finer)
         errors = np.sqrt(np.diag(covariance(finer, grid)))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
-        # Of a flat valley in which neither stood still they tell nothing.
+        # Of a flat valley in which neither stood still, or of two fits that a wall stopped, they tell nothing.
         still = finer.converged and best.converged
         limit = finer.values
         if still:

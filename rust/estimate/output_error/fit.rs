@@ -61,6 +61,26 @@ impl Problem for OutputError<'_> {
             .map_or(1.0, |j| self.model.coordinates[j].stretch(point.coefficients[j]))
     }
 
+    /// Distance of orders and delays from their bounds; coefficients have none.
+    fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
+        let behind = point.orders.len() + point.coefficients.len();
+        let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
+            (Some(order), _) => (*order, self.model.order_bounds[parameter]),
+            (None, Some(delay)) => (point.delays[delay], self.model.delays[delay].bounds),
+            (None, None) => return (f64::INFINITY, f64::INFINITY),
+        };
+        (value - low, high - value)
+    }
+
+    /// The response is linear in a delay between whole numbers of steps, where its slope jumps.
+    fn kinked(&self, point: &Point, parameter: usize) -> bool {
+        parameter >= point.orders.len() + point.coefficients.len()
+    }
+
+    fn size(&self, evaluation: &Evaluation) -> f64 {
+        evaluation.size
+    }
+
     /// Where the grids see all of each equation: a fit would follow noise with what they do not see.
     fn trusted(&self, point: &Point) -> bool {
         self.model.resolved(self.experiments, point)

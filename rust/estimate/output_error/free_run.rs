@@ -1,6 +1,7 @@
 //! The free run of a model at a point, its residuals on every experiment, and the initial terms that are projected out.
 
 use super::experiment::Experiment;
+use super::feedthrough::Direct;
 use super::model::{FreeModel, Point};
 use crate::dense;
 use crate::equation::Structure;
@@ -18,6 +19,8 @@ const SPANNED: f64 = 1e-12;
 /// Residuals at a point, and what their derivatives there are made of.
 pub(super) struct Evaluation {
     pub(super) residuals: Vec<f64>,
+    /// Norm of the weighted samples, of which the residuals are differences.
+    pub(super) size: f64,
     pub(super) initial: Vec<Vec<Vec<f64>>>,
     pub(super) exponents: Vec<Vec<f64>>,
     pub(super) parts: Vec<Part>,
@@ -40,6 +43,8 @@ pub(super) struct Part {
     pub(super) basis: Vec<Vec<f64>>,
     /// Pulse means of each freely delayed input after its delay, and their derivative with respect to it \[1/s\].
     pub(super) shifted: Vec<(Vec<f64>, Vec<f64>)>,
+    /// What feeds through at once.
+    pub(super) direct: Option<Direct>,
 }
 
 /// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
@@ -51,6 +56,7 @@ impl FreeModel {
         let structures = self.structures(&point.orders);
         let mut out = Evaluation {
             residuals: Vec::new(),
+            size: 0.0,
             initial: Vec::new(),
             exponents: structures.iter().map(|s| s.initial_exponents(&self.initial)).collect(),
             parts: Vec::with_capacity(experiments.len()),
@@ -112,7 +118,12 @@ impl FreeModel {
             .zip(&experiment.weights)
             .flat_map(|(y, w)| y[1..=experiment.compared()].iter().map(move |v| v * w))
             .collect();
+        out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
         residuals.iter_mut().zip(experiment.sampled(&response)).for_each(|(e, v)| *e -= v);
+        let direct = Direct::of(self, experiment, structures, point, &shifted)?;
+        if let Some(direct) = &direct {
+            residuals.iter_mut().zip(direct.samples(experiment)).for_each(|(e, v)| *e -= v);
+        }
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
@@ -156,7 +167,7 @@ impl FreeModel {
         }
         out.residuals.extend(residuals);
         out.initial.push(initial);
-        out.parts.push(Part { matrix, inverse, operators, response, basis, shifted });
+        out.parts.push(Part { matrix, inverse, operators, response, basis, shifted, direct });
         Ok(())
     }
 }

@@ -2,6 +2,10 @@
 //!
 //! Columns are scaled by the Jacobian's norms, steps follow from a QR factor of [J | e] with the damping below it, and a
 //! rejected step costs no Jacobian. A problem says itself how a point moves: in which coordinates, and within which bounds.
+//! What stands on a bound and is pushed out of it is left out of step and gradient, so that the rest moves on.
+//!
+//! A minimum is where the gradient vanishes, and nothing else is called one: the cosine between the residuals and every
+//! column that is free to move, the relative offset of Dennis & Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
 
 use crate::dense;
 use crate::error::{check_length, Error, Result};
@@ -13,8 +17,12 @@ const FIRST_DAMPING: f64 = 1e-3;
 const LEAST_DAMPING: f64 = 1e-12;
 /// Damping beyond which a step is shorter than rounding.
 const LARGEST_DAMPING: f64 = 1e12;
-/// An accepted step lowers the damping by this factor, a rejected one raises it by as much.
+/// A step as good as its prediction lowers the damping by this factor, a rejected one raises it by as much.
 const FACTOR: f64 = 10.0;
+/// Share of the predicted fall of the cost that a step reaches whose damping is right.
+const FAIR: f64 = 0.25;
+/// Residuals that are differences of signals carry rounding of this share of them at most, once no step lowers the cost.
+const ROUNDING: f64 = 1e-10;
 
 /// A sum of squares to minimise.
 pub trait Problem {
@@ -46,6 +54,21 @@ pub trait Problem {
         1.0
     }
 
+    /// How far a parameter may move down and up in its coordinate before it stands on a bound.
+    fn room(&self, _point: &Self::Point, _parameter: usize) -> (f64, f64) {
+        (f64::INFINITY, f64::INFINITY)
+    }
+
+    /// Whether the cost may have corners along a parameter: a minimum there has no slope.
+    fn kinked(&self, _point: &Self::Point, _parameter: usize) -> bool {
+        false
+    }
+
+    /// Norm of what the residuals are differences of, which bounds their rounding.
+    fn size(&self, _evaluation: &Self::Evaluation) -> f64 {
+        0.0
+    }
+
     /// Whether a point may be trusted: from one that may, no step leads to one that may not.
     fn trusted(&self, _point: &Self::Point) -> bool {
         true
@@ -55,12 +78,14 @@ pub trait Problem {
 /// Where the search for the optimum ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Status {
-    /// Neither the cost nor the parameters move any more.
+    /// The gradient is zero, but for what pushes out of a bound and for rounding.
     Converged,
-    /// The last allowed iteration still moved.
+    /// The last allowed evaluation still moved.
     Exhausted,
     /// No step lowers the cost although the gradient is not zero.
     Stalled,
+    /// The way down leads where the problem has no value, or none that may be trusted.
+    Wall,
 }
 
 /// How long to search.
@@ -68,7 +93,7 @@ pub enum Status {
 pub struct Settings {
     /// Most evaluations of the residuals.
     pub evaluations: usize,
-    /// Relative change of the cost, and of the parameters, at which the search ends.
+    /// Share of the cost by which a Gauss–Newton step lowers it at a minimum, and so the square of the gradient's cosine.
     pub tolerance: f64,
 }
 
@@ -100,46 +125,109 @@ fn cost(residuals: &[f64]) -> f64 {
     0.5 * residuals.iter().map(|e| e * e).sum::<f64>()
 }
 
-/// R of the QR factorisation of [J | e] with J in coordinates and unit columns, and the columns' norms.
-fn scaled_factor<P: Problem>(
-    problem: &P,
-    point: &P::Point,
-    jacobian: &[Vec<f64>],
-    residuals: &[f64],
-) -> (Vec<f64>, Vec<f64>) {
-    let mut columns = Vec::with_capacity(jacobian.len() + 1);
-    let mut scales = Vec::with_capacity(jacobian.len());
-    for (i, column) in jacobian.iter().enumerate() {
-        let factor = problem.stretch(point, i);
-        let norm = column.iter().map(|v| (v * factor) * (v * factor)).sum::<f64>().sqrt();
-        let scale = if norm > 0.0 { factor / norm } else { 0.0 };
-        columns.push(column.iter().map(|v| v * scale).collect());
-        scales.push(norm);
-    }
-    columns.push(residuals.to_vec());
-    (dense::triangular_factor(&columns), scales)
+/// The linear problem at a point: R of [J | e] with J in coordinates and unit columns, and what may move.
+struct Linear {
+    r: Vec<f64>,
+    /// Length of a coordinate's unit in scaled steps, 0 where nothing moves with it.
+    scales: Vec<f64>,
+    /// Products of the unit columns with the residuals.
+    gradient: Vec<f64>,
+    /// Distances from the bounds, in scaled steps.
+    room: Vec<(f64, f64)>,
+    /// What is left out of the steps.
+    held: Vec<bool>,
+    /// Norm of the residuals.
+    norm: f64,
 }
 
-/// Minimises ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e].
-fn damped_step(r: &[f64], k: usize, stride: usize, damping: f64) -> Vec<f64> {
-    let mut columns: Vec<Vec<f64>> = (0..k)
-        .map(|j| {
-            let mut column = vec![0.0; 2 * k];
-            for i in 0..=j {
-                column[i] = r[i * stride + j];
+impl Linear {
+    fn at<P: Problem>(problem: &P, point: &P::Point, jacobian: &[Vec<f64>], residuals: &[f64], corners: bool) -> Self {
+        let mut columns = Vec::with_capacity(jacobian.len() + 1);
+        let mut scales = Vec::with_capacity(jacobian.len());
+        for (i, column) in jacobian.iter().enumerate() {
+            let factor = problem.stretch(point, i);
+            let norm = column.iter().map(|v| (v * factor) * (v * factor)).sum::<f64>().sqrt();
+            let scale = if norm > 0.0 { factor / norm } else { 0.0 };
+            columns.push(column.iter().map(|v| v * scale).collect::<Vec<f64>>());
+            scales.push(norm);
+        }
+        let gradient: Vec<f64> = columns.iter().map(|c| c.iter().zip(residuals).map(|(j, e)| j * e).sum()).collect();
+        columns.push(residuals.to_vec());
+        let scaled = |i: usize, (down, up): (f64, f64)| (down * scales[i], up * scales[i]);
+        let room: Vec<(f64, f64)> = (0..scales.len()).map(|i| scaled(i, problem.room(point, i))).collect();
+        let held = (room.iter().zip(&gradient).enumerate())
+            .map(|(i, (&(down, up), &g))| {
+                let out = if g > 0.0 { down <= 0.0 } else { up <= 0.0 };
+                out || scales[i] <= 0.0 || (corners && problem.kinked(point, i))
+            })
+            .collect();
+        let norm = residuals.iter().map(|e| e * e).sum::<f64>().sqrt();
+        Self { r: dense::triangular_factor(&columns), scales, gradient, room, held, norm }
+    }
+
+    /// Largest component of the gradient along what is free to move.
+    fn slope(&self) -> f64 {
+        self.gradient.iter().zip(&self.held).filter(|(_, held)| !**held).fold(0.0, |a, (g, _)| a.max(g.abs()))
+    }
+
+    /// Minimises ‖J s + e‖² + λ‖s‖² over what is free and within its bounds, and the share of the cost that falls.
+    fn step(&self, damping: f64) -> (Vec<f64>, f64) {
+        let k = self.scales.len();
+        let mut held = self.held.clone();
+        let mut step = loop {
+            let step = damped_step(&self.r, &held, damping);
+            let out = (0..k).find(|&i| {
+                let (down, up) = self.room[i];
+                !held[i] && ((step[i] < 0.0 && down <= 0.0) || (step[i] > 0.0 && up <= 0.0))
+            });
+            match out {
+                Some(i) => held[i] = true,
+                None => break step,
             }
-            column[k + j] = damping.sqrt();
+        };
+        step.iter_mut().zip(&self.room).for_each(|(s, &(down, up))| *s = s.max(-down.max(0.0)).min(up.max(0.0)));
+        let moved: f64 =
+            (0..k).map(|i| (i..k).map(|j| self.r[i * (k + 1) + j] * step[j]).sum::<f64>()).map(|v| v * v).sum();
+        let along: f64 = self.gradient.iter().zip(&step).map(|(g, s)| g * s).sum();
+        let falls = (-2.0 * along - moved) / (self.norm * self.norm).max(f64::MIN_POSITIVE);
+        (step, falls)
+    }
+
+    /// A scaled step in the parameters' coordinates.
+    fn unscaled(&self, step: &[f64]) -> Vec<f64> {
+        step.iter().zip(&self.scales).map(|(s, scale)| if *scale > 0.0 { s / scale } else { 0.0 }).collect()
+    }
+}
+
+/// Minimises ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e], with 0 for what is held.
+fn damped_step(r: &[f64], held: &[bool], damping: f64) -> Vec<f64> {
+    let (k, free) = (held.len(), (0..held.len()).filter(|&j| !held[j]).collect::<Vec<_>>());
+    if free.is_empty() {
+        return vec![0.0; k];
+    }
+    let mut columns: Vec<Vec<f64>> = free
+        .iter()
+        .enumerate()
+        .map(|(at, &j)| {
+            let mut column = vec![0.0; k + free.len()];
+            for (i, value) in column.iter_mut().enumerate().take(j + 1) {
+                *value = r[i * (k + 1) + j];
+            }
+            column[k + at] = damping.sqrt();
             column
         })
         .collect();
-    let mut target = vec![0.0; 2 * k];
+    let mut target = vec![0.0; k + free.len()];
     for (i, value) in target.iter_mut().take(k).enumerate() {
-        *value = -r[i * stride + k];
+        *value = -r[i * (k + 1) + k];
     }
     columns.push(target);
     let q = dense::triangular_factor(&columns);
-    let rhs: Vec<f64> = (0..k).map(|i| q[i * (k + 1) + k]).collect();
-    back_substitute(&q, k + 1, &rhs)
+    let stride = free.len() + 1;
+    let rhs: Vec<f64> = (0..free.len()).map(|i| q[i * stride + free.len()]).collect();
+    let mut step = vec![0.0; k];
+    free.iter().zip(back_substitute(&q, stride, &rhs)).for_each(|(&j, s)| step[j] = s);
+    step
 }
 
 /// Minimises half the sum of squared residuals from a start. An evaluation costs what the problem says, a step O(k² N)
@@ -197,63 +285,72 @@ pub fn minimise<P: Problem>(
     let mut trusted = problem.trusted(&point);
     let mut damping = FIRST_DAMPING;
     let mut status = Status::Exhausted;
+    // The gradient's cosine at a minimum: its square is a share of the cost.
+    let flat = settings.tolerance.max(f64::EPSILON).sqrt();
+    let (mut gain, mut hit, mut corners) = (f64::INFINITY, false, false);
     'outer: while evaluations < settings.evaluations {
-        let (r, scales) = scaled_factor(problem, &point, &jacobian, problem.residuals(&current));
-        let k = scales.len();
+        let linear = Linear::at(problem, &point, &jacobian, problem.residuals(&current), corners);
+        let slope = linear.slope();
+        let level = slope <= flat * linear.norm;
+        let (newton, falls) = linear.step(LEAST_DAMPING);
+        let nowhere = problem.moved(&point, &linear.unscaled(&newton)).1 <= settings.tolerance;
+        // A flat gradient along a valley may still have far to go: a whole step says so, unless none has led anywhere.
+        if nowhere || (level && (falls <= settings.tolerance || gain <= settings.tolerance)) {
+            status = Status::Converged;
+            break;
+        }
+        if gain <= settings.tolerance && hit {
+            status = Status::Wall;
+            break;
+        }
+        hit = false;
         loop {
-            let step = damped_step(&r, k, k + 1, damping);
-            let steps: Vec<f64> =
-                step.iter().zip(&scales).map(|(s, scale)| if *scale > 0.0 { s / scale } else { 0.0 }).collect();
-            let (next, moved) = problem.moved(&point, &steps);
-            if moved <= settings.tolerance {
-                status = Status::Converged;
-                break 'outer;
-            }
-            evaluations += 1;
-            let trusts = problem.trusted(&next);
-            // A step that lowers nothing, or leaves the numbers, is shortened.
-            let accepted = match problem.evaluate(&next) {
-                Ok(found) => {
-                    let reached = cost(problem.residuals(&found));
-                    if reached.is_finite() && reached < least && (trusts || !trusted) {
-                        match slopes_at(&next, &found) {
-                            Ok(slopes) => Some((found, reached, slopes)),
-                            Err(Error::Diverged { .. }) => {
-                                damping *= FACTOR;
-                                if damping > LARGEST_DAMPING {
-                                    status = Status::Stalled;
-                                    break 'outer;
-                                }
-                                // The residuals were sound, so this try does not count towards the end.
-                                continue;
-                            }
-                            Err(error) => return Err(error),
-                        }
-                    } else {
-                        None
-                    }
-                }
-                Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => None,
-                Err(error) => return Err(error),
-            };
-            if let Some((found, reached, slopes)) = accepted {
-                let gain = (least - reached) / least.max(f64::MIN_POSITIVE);
-                (point, current, least, jacobian, trusted) = (next, found, reached, slopes, trusts);
-                damping = (damping * (1.0 / FACTOR)).max(LEAST_DAMPING);
-                if gain <= settings.tolerance {
+            let (step, falls) = linear.step(damping);
+            let (next, moved) = problem.moved(&point, &linear.unscaled(&step));
+            if moved <= settings.tolerance || damping > LARGEST_DAMPING {
+                // No step lowers the cost any more: at its bottom, for rounding, at a wall or at a corner.
+                if level || slope <= ROUNDING * problem.size(&current) {
                     status = Status::Converged;
-                    break 'outer;
+                } else if hit {
+                    status = Status::Wall;
+                } else if !corners && (0..linear.scales.len()).any(|i| problem.kinked(&point, i)) {
+                    (corners, damping, gain) = (true, FIRST_DAMPING, f64::INFINITY);
+                    continue 'outer;
+                } else {
+                    status = Status::Stalled;
                 }
-                break;
-            }
-            damping *= FACTOR;
-            if damping > LARGEST_DAMPING {
-                status = Status::Stalled;
                 break 'outer;
             }
             if evaluations >= settings.evaluations {
                 break 'outer;
             }
+            evaluations += 1;
+            let trusts = problem.trusted(&next);
+            // A step that lowers nothing, or leaves the numbers, is shortened.
+            let tried = problem.evaluate(&next).and_then(|found| {
+                let reached = cost(problem.residuals(&found));
+                if !reached.is_finite() || (trusted && !trusts) {
+                    return Err(Error::Diverged { what: "step".into(), index: 0 });
+                }
+                if reached >= least {
+                    return Ok(None);
+                }
+                Ok(Some((slopes_at(&next, &found)?, found, reached)))
+            });
+            match tried {
+                Ok(Some((slopes, found, reached))) => {
+                    gain = (least - reached) / least.max(f64::MIN_POSITIVE);
+                    (point, current, least, jacobian, trusted) = (next, found, reached, slopes, trusts);
+                    if gain >= FAIR * falls {
+                        damping = (damping / FACTOR).max(LEAST_DAMPING);
+                    }
+                    break;
+                }
+                Ok(None) => hit = false,
+                Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => hit = true,
+                Err(error) => return Err(error),
+            }
+            damping *= FACTOR;
         }
     }
     Ok(Minimum { point, evaluation: current, cost: least, jacobian, evaluations, status })

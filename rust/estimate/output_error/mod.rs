@@ -4,16 +4,18 @@
 //! Its sensitivity to a parameter is A⁻¹(∂b − ∂A y), a sum of products of three series: with the spectra of A⁻¹ at hand,
 //! one inverse transform a parameter and output. Rejected steps cost no Jacobian. Initial terms are linear and projected
 //! out (variable projection, Kaufman's form, doi:10.1007/BF01932995). Records are compared sample by sample: y_k with the
-//! mean of the pulses on either side of kh, on a grid that may be finer than the samples.
+//! mean of the pulses on either side of kh, on a grid that may be finer than the samples, plus what the inputs of that
+//! instant feed through.
 
 pub mod experiment;
+mod feedthrough;
 pub mod fit;
 mod free_run;
 pub mod levenberg_marquardt;
 pub mod model;
 mod sensitivities;
 
-pub use experiment::Experiment;
+pub use experiment::{Experiment, Instant};
 pub use fit::{fit, Fit};
 pub use levenberg_marquardt::{Settings, Status};
 pub use model::{Coordinate, FreeDelay, FreeEquation, FreeModel, Monomial, Point};

@@ -1,6 +1,7 @@
 //! Derivatives of the residuals: A⁻¹(∂b − ∂A y) as products of three spectra, one inverse transform a parameter and output.
 
 use super::experiment::Experiment;
+use super::feedthrough::add_slope;
 use super::free_run::{inverse_spectra, Evaluation, Part, FACTORS};
 use super::model::{FreeModel, Point};
 use crate::equation::Initial;
@@ -113,6 +114,7 @@ impl FreeModel {
                 })
                 .collect();
             let mut column = experiment.sampled(&means);
+            add_slope(self, experiment, part, point, parameter, &mut column);
             for direction in &part.basis {
                 let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
                 column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);

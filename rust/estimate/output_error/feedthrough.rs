@@ -1,0 +1,159 @@
+//! Direct feed-through: what a term of its equation's own order adds to an output at once.
+//!
+//! A sample is read after the inputs of its instant act: y(t⁺) = y'(t) + G s(t⁺), where y' is the output without what
+//! feeds through. The mean of the pulses on either side of t holds G times the mean of s on either side, so it lacks G δ
+//! with δ = s(t⁺) less that mean: half a jump of a held signal, a quarter of the second difference of a linear one.
+
+use super::experiment::Experiment;
+use super::free_run::Part;
+use super::model::{FreeModel, Point};
+use crate::equation::Structure;
+use crate::error::Result;
+use crate::small;
+
+/// Orders closer than this are the same: the term integrates nothing.
+const AT_ONCE: f64 = 1e-9;
+
+/// What feeds through in one experiment.
+pub(super) struct Direct {
+    /// (I − C)⁻¹ with C the gains between simulated outputs, row by row; none where outputs do not drive each other at once.
+    between: Option<Vec<f64>>,
+    /// δ of each signal that drives an output at once, and its derivative with respect to its free delay.
+    lacking: Vec<Option<(Vec<f64>, Vec<f64>)>>,
+    /// Whether each term of each equation feeds through.
+    terms: Vec<Vec<bool>>,
+    /// (I − C)⁻¹ B δ by output and sample, unweighted.
+    values: Vec<Vec<f64>>,
+}
+
+impl Direct {
+    /// What feeds through at a point; none where no term does.
+    ///
+    /// # Errors
+    /// [`crate::error::Error::LeadingZero`] where the equations contradict each other at once.
+    pub(super) fn of(
+        model: &FreeModel,
+        experiment: &Experiment,
+        structures: &[Structure],
+        point: &Point,
+        shifted: &[(Vec<f64>, Vec<f64>)],
+    ) -> Result<Option<Self>> {
+        let terms: Vec<Vec<bool>> = structures
+            .iter()
+            .map(|s| s.terms.iter().map(|term| (s.order - term.order).abs() < AT_ONCE).collect())
+            .collect();
+        if !terms.iter().flatten().any(|&at_once| at_once) {
+            return Ok(None);
+        }
+        let n = structures.len();
+        let mut lacking: Vec<Option<(Vec<f64>, Vec<f64>)>> = vec![None; experiment.record.len()];
+        let mut between = vec![0.0; n * n];
+        (0..n).for_each(|i| between[i * n + i] = 1.0);
+        for (i, (structure, row)) in structures.iter().zip(&terms).enumerate() {
+            for (k, term) in structure.terms.iter().enumerate().filter(|(k, _)| row[*k]) {
+                if let Some(j) = model.unknown(i, term.signal) {
+                    between[i * n + j] -= model.equations[i].terms[k].2.at(&point.coefficients);
+                } else if lacking[term.signal].is_none() {
+                    lacking[term.signal] = Some(match model.delay_of(term.signal) {
+                        Some(d) => experiment.lacking_behind(term.signal, &shifted[d]),
+                        None => (experiment.lacking(term.signal), Vec::new()),
+                    });
+                }
+            }
+        }
+        let coupled = (0..n * n).any(|at| at % (n + 1) != 0 && between[at] != 0.0);
+        let between = if coupled { Some(small::inverse(&between, n)?) } else { None };
+        let mut direct = Self { between, lacking, terms, values: Vec::new() };
+        let mut driven = vec![vec![0.0; experiment.compared()]; n];
+        direct.add_driven(model, &mut driven, |i, k| model.equations[i].terms[k].2.at(&point.coefficients), |l| &l.0);
+        direct.values = direct.through(driven);
+        Ok(Some(direct))
+    }
+
+    /// Adds weighted δ of what drives each equation at once.
+    fn add_driven<'a>(
+        &'a self,
+        model: &FreeModel,
+        driven: &mut [Vec<f64>],
+        weight: impl Fn(usize, usize) -> f64,
+        which: impl Fn(&'a (Vec<f64>, Vec<f64>)) -> &'a [f64],
+    ) {
+        for (i, row) in self.terms.iter().enumerate() {
+            for (k, _) in row.iter().enumerate().filter(|(_, &at_once)| at_once) {
+                let signal = model.equations[i].terms[k].0;
+                let (c, unknown) = (weight(i, k), model.unknown(i, signal));
+                let series = match (unknown, &self.lacking[signal]) {
+                    (Some(j), _) if !self.values.is_empty() => &self.values[j],
+                    (None, Some(lacking)) => which(lacking),
+                    _ => continue,
+                };
+                if c != 0.0 {
+                    driven[i].iter_mut().zip(series).for_each(|(v, s)| *v += c * s);
+                }
+            }
+        }
+    }
+
+    /// (I − C)⁻¹ times what drives each equation.
+    fn through(&self, driven: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
+        let Some(between) = &self.between else { return driven };
+        let gains = between.chunks_exact(driven.len());
+        let mixed = |gains: &[f64]| {
+            let mut out = vec![0.0; driven.first().map_or(0, Vec::len)];
+            for (gain, row) in gains.iter().zip(&driven) {
+                out.iter_mut().zip(row).for_each(|(v, d)| *v += gain * d);
+            }
+            out
+        };
+        gains.map(mixed).collect()
+    }
+
+    /// Weighted, as the samples are, all outputs after one another; none of what passes the filter.
+    fn sampled(experiment: &Experiment, values: &[Vec<f64>]) -> Vec<f64> {
+        let mut out = Vec::with_capacity(values.len() * experiment.compared());
+        for (i, row) in values.iter().enumerate() {
+            let behind = experiment.filter.as_ref().is_some_and(|(_, applies)| applies[i]);
+            let w = if behind { 0.0 } else { experiment.weights[i] };
+            out.extend(row.iter().map(|v| w * v));
+        }
+        out
+    }
+
+    /// What the sampled means lack.
+    pub(super) fn samples(&self, experiment: &Experiment) -> Vec<f64> {
+        Self::sampled(experiment, &self.values)
+    }
+}
+
+/// Adds to the derivative of the sampled means that of what feeds through.
+pub(super) fn add_slope(
+    model: &FreeModel,
+    experiment: &Experiment,
+    part: &Part,
+    point: &Point,
+    parameter: usize,
+    column: &mut [f64],
+) {
+    let Some(direct) = &part.direct else { return };
+    let (orders, numbers) = (point.orders.len(), point.orders.len() + point.coefficients.len());
+    if parameter < orders {
+        return;
+    }
+    let mut driven = vec![vec![0.0; experiment.compared()]; model.equations.len()];
+    if parameter < numbers {
+        let slope = |i: usize, k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, parameter - orders);
+        direct.add_driven(model, &mut driven, slope, |l| &l.0);
+    } else {
+        let delayed = model.delays[parameter - numbers].signal;
+        let weight = |i: usize, k: usize| {
+            let (signal, _, c) = &model.equations[i].terms[k];
+            if *signal == delayed {
+                c.at(&point.coefficients)
+            } else {
+                0.0
+            }
+        };
+        direct.add_driven(model, &mut driven, weight, |l| &l.1);
+    }
+    column.iter_mut().zip(Direct::sampled(experiment, &direct.through(driven))).for_each(|(v, s)| *v += s);
+}

@@ -1,0 +1,63 @@
+"""Direct feed-through: y[k] belongs to t_k after u[k] acts, as SciPy samples C x[k] + D u[k]."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import dlsim, lsim, lti
+
+import ftlm
+from ftlm.fit.joint import JointFit, fit_output_error
+
+STEP = 0.1
+#: (0.5 s + 1)/(s + 1): y' = 0.5 u' + u - y.
+LEAD = replace(ftlm.equation("D y = d D u + a y + b u"), initial="rest")
+LEAD_TRUTH = {"d": 0.5, "a": -1.0, "b": 1.0}
+LEAD_SYSTEM = ([0.5, 1.0], [1.0, 1.0])
+#: Torque to acceleration: (0.8 s^2 + 2)/(s^2 + 0.6 s + 4).
+SECOND = replace(ftlm.equation("D^2 y = c D^2 u + d D y + a y + b u"), initial="rest")
+SECOND_TRUTH = {"c": 0.8, "d": -0.6, "a": -4.0, "b": 2.0}
+SECOND_SYSTEM = ([0.8, 0.0, 2.0], [1.0, 0.6, 4.0])
+
+
+def sampled(system: tuple, rows: int, seed: int, intersample: str, noise: float) -> ftlm.Run:
+    """A run as SciPy samples it: a random command held, or random samples joined by lines, and white noise."""
+    rng = np.random.default_rng(seed)
+    t = STEP * np.arange(rows)
+    u = rng.standard_normal(rows)
+    u[0] = 0.0
+    if intersample == "zoh":
+        y = dlsim(lti(*system).to_discrete(STEP), u)[1][:, 0]
+    else:
+        y = lsim(lti(*system), u, t, interp=True)[1]
+    y = y + noise * np.std(y) * rng.standard_normal(rows)
+    return ftlm.Run.from_arrays(step=STEP, outputs={"y": y}, inputs={"u": u}, intersample={"u": intersample})
+
+
+def scores(found: JointFit, truth: dict[str, float]) -> np.ndarray:
+    return np.array([(found.coefficients[n] - v) / found.standard_errors[n] for n, v in truth.items()])
+
+
+@pytest.mark.parametrize("intersample", ["zoh", "foh"])
+@pytest.mark.parametrize(
+    ("words", "system", "truth"), [(LEAD, LEAD_SYSTEM, LEAD_TRUTH), (SECOND, SECOND_SYSTEM, SECOND_TRUTH)]
+)
+def test_without_noise_the_coefficients_are_those_of_the_system(words, system, truth, intersample: str) -> None:
+    found = fit_output_error([sampled(system, 60, 1, intersample, 0.0)], words)
+    for name, value in truth.items():
+        assert found.coefficients[name] == pytest.approx(value, abs=1e-3), name
+
+
+@pytest.mark.parametrize("intersample", ["zoh", "foh"])
+@pytest.mark.parametrize(
+    ("words", "system", "truth"), [(LEAD, LEAD_SYSTEM, LEAD_TRUTH), (SECOND, SECOND_SYSTEM, SECOND_TRUTH)]
+)
+def test_the_truth_lies_within_three_standard_errors(words, system, truth, intersample: str) -> None:
+    z = np.array([
+        scores(fit_output_error([sampled(system, 600, seed, intersample, 0.01)], words), truth) for seed in range(10)
+    ])
+    assert np.max(np.abs(z)) < 3.0
+    # A bias of half an error, or errors of half the size, would show.
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 1.6
