@@ -145,7 +145,7 @@ class Identification(Judged):
         return {
             "method": self.method,
             "settings": self.settings,
-            "equations": {e.output: numeric(e) for e in self.model.equations},
+            "equations": {e.output: numeric(e) + self.model.structure.offset_in_words for e in self.model.equations},
             "orders": self.orders,
             "coefficients": self.coefficients,
             "delays": self.delays,
@@ -161,7 +161,7 @@ class Identification(Judged):
 
     def __str__(self) -> str:
         lines = [f"{self.model.structure.name}: {self.method}, {settings_in_words(self.settings)}"]
-        lines += [f"  {numeric(e)}" for e in self.model.equations]
+        lines += [f"  {numeric(e)}{self.model.structure.offset_in_words}" for e in self.model.equations]
         reference = self.model.structure.reference
         errors = self.standard_errors
         for name, value in {**self.orders, **self.joint_values, **self.coefficients}.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field
 from typing import Any
@@ -15,7 +16,7 @@ from ftlm.base.frames import to_frame
 from ftlm.data.run import Run
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Solved, check_solved
-from ftlm.data.structures import Structure
+from ftlm.data.structures import Structure, offset_exponents
 from ftlm.judge.metrics import Metrics, pooled
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol_html
@@ -54,6 +55,9 @@ class Comparison:
         to that run alone.
     warnings
         What makes these figures doubtful, in words.
+    offsets
+        Unknown constants of the equations, one mapping a run: output -> ``"constant"`` [unit of D^alpha y] (and
+        ``"ramp"``, that a second) -> value. Estimated anew on each run; empty for a model without an offset.
     """
 
     output_error: dict[str, Metrics]
@@ -65,6 +69,7 @@ class Comparison:
     m: int
     initial: list[dict[str, dict[float, float]]]
     warnings: tuple[str, ...] = field(default=())
+    offsets: tuple[dict[str, dict[str, float]], ...] = field(default=())
 
     @property
     def fit_percent(self) -> dict[str, float]:
@@ -95,6 +100,7 @@ class Comparison:
                 }
                 for name, equation, output in self.per_run
             ],
+            **({"offsets": list(self.offsets)} if self.offsets else {}),
             "warnings": list(self.warnings),
         }
 
@@ -108,6 +114,7 @@ class Comparison:
                     f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>10.4g}"
                 )
         lines.append(f"over {self.m} block pulses a run")
+        lines += offsets_in_words(self)
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
 
@@ -130,7 +137,8 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
     Returns
     -------
     Comparison
-        On the data that a model was identified from, its figures are those printed with it.
+        On the data that a model was identified from, its figures are those printed with it. Initial terms, and offsets
+        where the structure has them, are estimated anew on each of these runs.
 
     Raises
     ------
@@ -154,7 +162,33 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
         {o: [p.simulated[o] for p in parts] for o in model.outputs},
         {o: [p.measured[o] for p in parts] for o in model.outputs}, [p.step for p in parts], m,
         [p.initial for p in parts], tuple(near_identity(model.structure, equation_error, output_error)),
+        tuple(offsets_of(model, p.initial) for p in parts) if model.structure.offset != "none" else (),
     )  # fmt: skip
+
+
+def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
+    """Constants of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1)."""
+    out: dict[str, dict[str, float]] = {}
+    for item in model.equations:
+        exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
+        out[item.output] = {
+            name: float(values[np.argmin(np.abs(exponents - power))]) * math.gamma(power + 1.0)
+            for name, power in offset_exponents(item.order.constant, model.structure.offset).items()
+        }
+    return out
+
+
+def offsets_in_words(comparison: Comparison) -> list[str]:
+    """Offsets of every run that has some, a line an output."""
+    lines = []
+    for (run, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False):
+        for output, values in offsets.items():
+            ramp = f" and {values['ramp']:.6g} t" if "ramp" in values else ""
+            lines.append(
+                f"offset in the equation of {output} in {run} (estimated on that run, for it alone): "
+                f"{values['constant']:.6g}{ramp}"
+            )
+    return lines
 
 
 @dataclass(frozen=True)
@@ -172,7 +206,7 @@ class _Beside:
 def _beside(model: Solved, free: Record, full: Record) -> _Beside:
     """Free run and equation error on one run: as it is compared, and with all signals behind the sensor filter."""
     responses, initial = respond(model, free)
-    core, inputs, powers = full.core(), list(full.inputs), initial_tuple(full.initial)
+    core, inputs, powers = full.core(), list(full.inputs), initial_tuple(full.initial, full.offset)
     missed = {
         e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers) for e in model.equations
     }
@@ -300,7 +334,18 @@ def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms o
     ]
     if not rows:
         return None
+    rows += [
+        [name, symbol_html(output), f"offset: {what}", value]
+        for (name, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False)
+        for output, values in offsets.items()
+        for what, value in values.items()
+    ]
     note = "They describe how that record starts and are never carried to another."
+    if comparison.offsets:
+        note += (
+            " An offset c on the right-hand side is the power alpha with the coefficient c/Gamma(alpha + 1); it is "
+            "estimated on each run for that run alone."
+        )
     return Table(title, ("run", "output", "exponent of t", "coefficient"), rows, note=note)
 
 

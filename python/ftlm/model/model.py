@@ -95,7 +95,7 @@ class Model(Solved):
         return write_model(self, path, force=force)
 
     def __str__(self) -> str:
-        return "\n".join(numeric(e) for e in self.equations)
+        return "\n".join(numeric(e) + self.structure.offset_in_words for e in self.equations)
 
     def _repr_html_(self) -> str:
         return model_html(self)
