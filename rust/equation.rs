@@ -48,6 +48,14 @@ pub enum Initial {
     Caputo,
     /// These exponents.
     Powers(Vec<f64>),
+    /// A constant on the right-hand side, unknown and one a record, beside what else the record starts with. Integrated
+    /// with the equation it is c t^α/Γ(α + 1), so it is one more power of t; a ramp r t is r t^{α+1}/Γ(α + 2).
+    Offset {
+        /// How the record starts; not again an offset.
+        under: Box<Initial>,
+        /// Whether the constant grows in proportion to time as well.
+        ramp: bool,
+    },
 }
 
 impl Equation {
@@ -84,12 +92,66 @@ impl Equation {
 }
 
 impl Initial {
+    /// The same with an unknown constant on the right-hand side (1), or a constant and a ramp (2); 0 for neither.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for another number.
+    ///
+    /// ```
+    /// use ftlm::equation::{Initial, Structure, Term};
+    /// let plant = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
+    /// assert_eq!(plant.initial_exponents(&Initial::Caputo.with_offset(2)?), [0.0, 0.8, 1.8]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn with_offset(self, offset: u8) -> Result<Self> {
+        match offset {
+            0 => Ok(self),
+            1 | 2 => Ok(Self::Offset { under: Box::new(self.under().clone()), ramp: offset == 2 }),
+            _ => Err(Error::OutOfRange {
+                name: "offset".into(),
+                value: f64::from(offset),
+                range: "{0, 1, 2}".into(),
+                remedy: "0 is none, 1 a constant, 2 a constant and a ramp".into(),
+            }),
+        }
+    }
+
+    /// How the record starts, an offset left aside.
+    #[must_use]
+    pub fn under(&self) -> &Self {
+        match self {
+            Self::Offset { under, .. } => under.under(),
+            other => other,
+        }
+    }
+
+    /// Whether the record starts at rest: before it all signals were zero.
+    #[must_use]
+    pub fn at_rest(&self) -> bool {
+        *self.under() == Self::Rest
+    }
+
+    /// Whether exponents depend on the orders of the equation.
+    #[must_use]
+    pub fn follows_orders(&self) -> bool {
+        matches!(self, Self::Caputo | Self::Offset { .. })
+    }
+
+    /// Powers of t that an offset is, integrated under this α.
+    pub(crate) fn offset_exponents(&self, alpha: f64) -> Vec<f64> {
+        match self {
+            Self::Offset { ramp: true, .. } => vec![tidy(alpha), tidy(alpha + 1.0)],
+            Self::Offset { ramp: false, .. } => vec![tidy(alpha)],
+            _ => Vec::new(),
+        }
+    }
+
     /// Refuses exponents whose power of t has no mean over the first pulse.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for an exponent of −1 or less, [`Error::NotFinite`].
     pub fn check(&self) -> Result<()> {
-        let Self::Powers(exponents) = self else { return Ok(()) };
+        let Self::Powers(exponents) = self.under() else { return Ok(()) };
         check_finite("exponents of the initial terms", exponents)?;
         match exponents.iter().find(|&&e| e <= -1.0) {
             None => Ok(()),
@@ -153,8 +215,8 @@ impl Structure {
     /// Exponents of the initial terms, distinct and ascending.
     #[must_use]
     pub fn initial_exponents(&self, initial: &Initial) -> Vec<f64> {
-        let mut exponents = match initial {
-            Initial::Rest => Vec::new(),
+        let mut exponents = match initial.under() {
+            Initial::Rest | Initial::Offset { .. } => Vec::new(),
             Initial::Powers(powers) => powers.clone(),
             Initial::Caputo => {
                 let mut all: Vec<f64> = whole_below(self.order).collect();
@@ -164,6 +226,7 @@ impl Structure {
                 all
             }
         };
+        exponents.extend(initial.offset_exponents(self.order));
         exponents.sort_by(f64::total_cmp);
         exponents.dedup_by(|a, b| (*a - *b).abs() < ORDER_GRAIN);
         exponents

@@ -14,7 +14,12 @@ pub type StructureArg = (usize, f64, Vec<(usize, f64)>);
 /// A structure and its coefficients.
 pub type EquationArg = (StructureArg, Vec<f64>);
 /// (whether Caputo's powers, else these exponents).
-pub type InitialArg = (bool, Vec<f64>);
+#[derive(FromPyObject)]
+pub enum InitialArg {
+    /// With offset: 0 none, 1 a constant, 2 a constant and a ramp.
+    Offset(bool, Vec<f64>, u8),
+    Plain(bool, Vec<f64>),
+}
 
 /// A one-dimensional array as a vector, refused if it holds a value that is not finite.
 pub fn vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
@@ -60,13 +65,18 @@ pub fn equations(arguments: Vec<EquationArg>, signals: usize, inputs: &[bool]) -
 }
 
 pub fn initial(argument: InitialArg) -> PyResult<Initial> {
-    let powers = Initial::Powers(argument.1);
+    let (caputo, powers, offset) = match argument {
+        InitialArg::Offset(caputo, powers, offset) => (caputo, powers, offset),
+        InitialArg::Plain(caputo, powers) => (caputo, powers, 0),
+    };
+    let powers = Initial::Powers(powers);
     powers.check()?;
-    Ok(match powers {
-        _ if argument.0 => Initial::Caputo,
+    let under = match powers {
+        _ if caputo => Initial::Caputo,
         Initial::Powers(powers) if powers.is_empty() => Initial::Rest,
         powers => powers,
-    })
+    };
+    Ok(under.with_offset(offset)?)
 }
 
 /// A row-major matrix as an array.

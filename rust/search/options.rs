@@ -128,7 +128,7 @@ impl Options {
                 }
             }
         }
-        if let Initial::Powers(powers) = &self.initial {
+        if let Initial::Powers(powers) = self.initial.under() {
             check_finite("exponents of the initial terms", powers)?;
             if let Some(&bad) = powers.iter().find(|&&e| e <= -1.0) {
                 let remedy = "t to this power has no mean over the first pulse";

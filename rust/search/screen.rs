@@ -1,6 +1,5 @@
 //! Screening: coefficients of candidates side by side, and those left open that no proved lower bound excludes.
 
-use crate::equation::Initial;
 use crate::lanes::{self, WIDTH};
 use crate::search::candidate::columns::{part_of, Columns};
 use crate::search::candidate::normal::Solve;
@@ -46,8 +45,8 @@ impl lanes::Kernel for Screening<'_> {
         let mut cursor = Cursor::at(&catalogue.lattice, lo);
         let mut index = lo;
         let width = catalogue.lattice.width();
-        // Candidates differ in their Caputo terms, so they cannot share a layout.
-        if catalogue.options.initial != Initial::Caputo {
+        // Candidates differ in their Caputo terms and in the power of an offset, so they cannot share a layout.
+        if !catalogue.options.initial.follows_orders() {
             let mut screen = Screen::<WIDTH>::new(width);
             catalogue.positions(&cursor, &mut screen.terms);
             while index + WIDTH as u64 <= hi {

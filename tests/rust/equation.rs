@@ -94,6 +94,26 @@ fn from_one(m: usize) -> (Equation, ftlm::regressors::Record) {
 }
 
 #[test]
+fn an_offset_is_one_more_power_of_time_under_every_kind_of_initial_terms() {
+    let plant = structure(0, 0.8, &[(0, 0.3), (2, 0.0)]);
+    for (under, before) in
+        [(Initial::Rest, vec![]), (Initial::Caputo, vec![0.0, 0.5]), (Initial::Powers(vec![0.0, 0.8]), vec![0.0, 0.8])]
+    {
+        assert_eq!(plant.initial_exponents(&under.clone().with_offset(0).unwrap()), before);
+        for (offset, more) in [(1, vec![0.8]), (2, vec![0.8, 1.8])] {
+            let mut expected = [before.clone(), more].concat();
+            expected.sort_by(f64::total_cmp);
+            expected.dedup();
+            let initial = under.clone().with_offset(offset).unwrap();
+            assert_eq!(plant.initial_exponents(&initial), expected);
+            assert_eq!((initial.under(), initial.at_rest()), (&under, under == Initial::Rest));
+        }
+    }
+    assert!(matches!(Initial::Rest.with_offset(3), Err(Error::OutOfRange { .. })));
+    assert!(Initial::Powers(vec![-1.0]).with_offset(1).unwrap().check().is_err());
+}
+
+#[test]
 fn a_record_not_from_rest_needs_the_fractional_initial_term() {
     for m in [500, 2048] {
         let (model, record) = from_one(m);

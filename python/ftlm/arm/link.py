@@ -14,7 +14,7 @@ from ftlm.arm.parameters import INTEGER_ORDERS, PARAMETERS, LinkParameters
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Term
 from ftlm.data.orders import Order
-from ftlm.data.structures import Hints, SensorFilter, Structure
+from ftlm.data.structures import Hints, SensorFilter, Structure, check_offset
 from ftlm.model.model import Model
 
 #: Orders of the cross-stage terms: torques of the other stage act through its angles and its current as they are.
@@ -81,6 +81,7 @@ def flexible_link(
     laws: Sequence[Literal["orders", "coefficients"]] = ("orders", "coefficients"),
     parameters: Literal["effective", "table-3"] = "effective",
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
+    offset: Literal["none", "constant", "ramp"] = "none",
 ) -> Structure:  # fmt: skip
     """Make the paper's structure (22)-(25): two equations a stage.
 
@@ -106,6 +107,9 @@ def flexible_link(
         Named set that results are set beside.
     sensor_filter
         ``"stock"`` for the 2 Hz low-pass that the arm's stock real-time model puts on both deflections, or a filter.
+    offset
+        ``"constant"`` or ``"ramp"``: an unknown constant (and a ramp) in each equation, one a run, such as the current
+        that it takes to hold the arm still; see :func:`ftlm.equation`.
 
     Returns
     -------
@@ -146,6 +150,7 @@ def flexible_link(
         equations=tuple(equations), coupling=coupling, sensor_filter=sensor_filter,
         coefficient_law=tuple(coefficient_law) if "coefficients" in laws else (), reference=reference,
         name=f"flexible link, stage {stage}" if stage != "both" else "flexible link, both stages", hints=HINTS,
+        offset=check_offset(offset),
     )  # fmt: skip
     if input_order == "derived":
         structure = structure.with_orders({f"alpha{2 * j}": 2.0 for j in stages})

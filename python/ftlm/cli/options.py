@@ -61,7 +61,17 @@ class ReadingOptions:
         Number, Option(metavar="STEP", help="Interpolate onto this step [s], held inputs by their means.")
     ] = None
 
+    detrend: Annotated[
+        Literal["constant", "linear"] | None,
+        Option(help="Subtract the mean or the straight line of every signal; --offset estimates it instead."),
+    ] = None
+
     def runs(self, files: Sequence[str] | None, *, apart: bool = False) -> list[Run]:
+        """Each file a run, detrended if that is asked for; see :meth:`_read`."""
+        runs = self._read(files, apart=apart)
+        return runs if self.detrend is None else [run.detrend(self.detrend) for run in runs]
+
+    def _read(self, files: Sequence[str] | None, *, apart: bool) -> list[Run]:
         """Each file a run; .mat files that hold one signal each are one run together, unless they stand apart."""
         given: dict[str, Any] = {
             "time": self.time, "step": self.sampling, "inputs": pairs("-u", self.inputs),
@@ -110,6 +120,10 @@ class StructureOptions:
         None
     )
     initial: Annotated[str, Option(help="auto, rest, caputo, or exponents of t: 0,1.")] = "auto"
+    offset: Annotated[
+        Literal["none", "constant", "ramp"] | None,
+        Option(help="Unknown constant (and ramp) in each equation, one a run; default what the equation says."),
+    ] = None
 
     def structure(self, text: str) -> Structure:
         """The structure that `text` names, with what the options say of it."""
@@ -122,6 +136,8 @@ class StructureOptions:
                 built = replace(built, coupling=self.coupling or "simulated")
         if self.only is not None:
             built = built.equation(self.only)
+        if self.offset is not None:
+            built = replace(built, offset=self.offset)
         built = replace(built, initial=check_initial(self._initial())).with_delays(delays(self.delay))
         return built.with_orders(numbers("--order", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
 

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Term
 from ftlm.data.orders import Order, Values
-from ftlm.data.structures import SensorFilter, Structure, check_initial
+from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial, check_offset
 
 NAME = r"[^\W\d]\w*"
+#: A term that is such a name alone is an offset.
+_OFFSET = re.compile(r"c\d*")
 
 
 def equation(
@@ -23,6 +25,7 @@ def equation(
     delay: Mapping[str, float | tuple[float, float]] | None = None,
     initial: str | Iterable[float] = "auto",
     sensor_filter: SensorFilter | None = None,
+    offset: str | None = None,
 ) -> Structure:
     """Any linear fractional equation, in words.
 
@@ -31,7 +34,8 @@ def equation(
     text
         Such as ``"D^2.2 y = a1 D^0.9 y + a0 y + b0 u"``. ``D^alpha`` names a free order, ``D^(alpha-mu)`` an order
         law, ``D`` and ``D y`` the first derivative; a coefficient is a name, a number (fixed) or a number times a
-        name. Several equations are separated by ``;`` or by lines.
+        name. Several equations are separated by ``;`` or by lines. A term that is ``c`` alone (or ``c0``, ``c1``, …)
+        is an offset, an unknown constant; a signal of that name is ``1 c``.
     orders
         Values of the free orders: a number fixes one, ``"0.5:1.5:0.05"`` or (low, high, step) gives its lattice.
     fixed
@@ -43,6 +47,10 @@ def equation(
         exponents of t to use.
     sensor_filter
         Known filter that some outputs went through.
+    offset
+        ``"constant"``: an unknown constant on the right-hand side of each equation, as ``+ c`` says in words;
+        ``"ramp"``: a constant and a constant times t; ``"none"``. One each run, estimated with the coefficients and
+        never carried to another run. Default what the text says.
 
     Returns
     -------
@@ -52,14 +60,16 @@ def equation(
     Raises
     ------
     ModelError
-        Text that is no such equation (with the place), a name that does not occur, orders out of range.
+        Text that is no such equation (with the place), a name that does not occur, orders out of range, an offset in
+        some of several equations only.
     """
     if not isinstance(text, str):
         raise ModelError(f"the equation is {type(text).__name__}, not text; write it as in 'D^1.5 y = a0 y + b0 u'")
     lines = [line for line in re.split(r"[;\n]", text) if line.strip()]
     if not lines:
         raise ModelError("the equation is empty; write it as in 'D^1.5 y = a0 y + b0 u'")
-    equations = [parse_equation(line) for line in lines]
+    parsed = [_parse(line) for line in lines]
+    equations = [item for item, _ in parsed]
     fixed = dict(fixed or {})
     check_known("fixed coefficient", fixed, [n for e in equations for n in e.coefficient_names])
     for name, value in fixed.items():
@@ -67,10 +77,31 @@ def equation(
             raise ModelError(f"fixed coefficient {name} = {value} is not finite; give a number")
     equations = [e.with_coefficients(fixed) for e in equations]
     return (
-        Structure(equations=tuple(equations), initial=check_initial(initial), sensor_filter=sensor_filter)
+        Structure(
+            equations=tuple(equations),
+            initial=check_initial(initial),
+            sensor_filter=sensor_filter,
+            offset=_offset_of(parsed, offset),
+        )
         .with_delays(delay or {})
         .with_orders(orders or {})
     )
+
+
+def _offset_of(parsed: Sequence[tuple[Equation, bool]], offset: str | None) -> Offset:
+    """Offset of equations in words: what the argument says, or all of the equations."""
+    said = [item.output for item, found in parsed if found]
+    if offset is not None:
+        if said and check_offset(offset) == "none":
+            raise ModelError(f"the equation of {said[0]} has an offset, but offset='none'; leave one of them out")
+        return check_offset(offset)
+    without = [item.output for item, found in parsed if not found]
+    if said and without:
+        raise ModelError(
+            f"the equation of {said[0]} has an offset, that of {without[0]} has none; each equation of a structure has "
+            "one or none has: write + c in each (its estimate says whether it is 0)"
+        )
+    return "constant" if said else "none"
 
 
 _TOKEN = re.compile(
@@ -119,7 +150,15 @@ class _Words:
 
 
 def parse_equation(text: str) -> Equation:
-    """Read one equation; see :func:`equation`."""
+    """Read one equation without an offset; see :func:`equation`."""
+    item, offset = _parse(text)
+    if offset:
+        raise ModelError(f"equation {text!r}: an offset belongs to a structure; use equation(…)")
+    return item
+
+
+def _parse(text: str) -> tuple[Equation, bool]:
+    """Read one equation, and whether it has an offset."""
     words = _Words(text)
     order, output = _parse_derivative(words)
     if words.take()[1] != "=":
@@ -130,17 +169,41 @@ def parse_equation(text: str) -> Equation:
             f"equation {text!r}: its left-hand side has no derivative; write it as in 'D^1.5 {output} = …'"
         )
     terms = []
+    offset = False
     while True:
         sign = 1.0
         while words.peek()[1] in "+-" and words.peek()[0] == "symbol":
             sign *= -1.0 if words.take()[1] == "-" else 1.0
-        terms.append(_parse_term(words, sign))
+        if _is_offset(words):
+            if offset or sign < 0:
+                raise ModelError(
+                    f"equation {text!r}: the offset {words.peek()[1]!r} at character {words.peek()[2] + 1} "
+                    + ("stands there twice" if offset else "has a sign, but an unknown constant has its own")
+                    + "; write '+ c' once"
+                )
+            offset = True
+            words.take()
+        else:
+            terms.append(_parse_term(words, sign))
         kind, value, _ = words.peek()
         if kind == "end":
             break
         if not (kind == "symbol" and value in "+-"):
             raise words.fail("'+', '-' or the end")
-    return Equation(output, order, tuple(terms))
+    return Equation(output, order, tuple(terms)), offset
+
+
+def _is_offset(words: _Words) -> bool:
+    """Whether the term that follows is an unknown constant alone; a known one is refused."""
+    (kind, value, at), (after, symbol, _) = words.peek(), words.peek(1)
+    if not (after == "end" or (after == "symbol" and symbol in "+-")):
+        return False
+    if kind == "number":
+        raise ModelError(
+            f"equation {words.text!r}: {value} at character {at + 1} is a constant without a signal; an offset is "
+            f"unknown: write '+ c' and it is estimated, or subtract a known one from the run"
+        )
+    return kind == "name" and _OFFSET.fullmatch(value) is not None
 
 
 def _parse_derivative(words: _Words) -> tuple[Order | None, str]:

@@ -18,6 +18,7 @@ from ftlm.data.samples import (
     FEWEST_ROWS,
     checked_intersample,
     checked_step,
+    detrended,
     grid_of,
     how_interpolated,
     interpolated,
@@ -244,6 +245,41 @@ class Run(Measured):
         data = interpolated(grid_of(self.length, self.step), self._data, self._intersample, new_step)
         fact = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how_interpolated(self._intersample)})"
         return self._with(_data=data, step=new_step, facts=(*self.facts, fact))
+
+    def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
+        """Return this run less the mean, or the straight line of least squares, of some signals.
+
+        A mean belongs to the record, not to the system: the mean of a record that does not end where it began holds
+        part of the response. An offset in the structure (``+ c``) estimates it instead. The result says in `warnings`
+        what was subtracted.
+
+        Parameters
+        ----------
+        kind : {"constant", "linear"}, default "constant"
+            What is subtracted.
+        signals : iterable of str, optional
+            Which signals; default all inputs and outputs.
+
+        Returns
+        -------
+        Run
+
+        Raises
+        ------
+        DataError
+            If the kind is neither, or a name is unknown or given twice.
+        """
+        if kind not in ("constant", "linear"):
+            raise DataError(f"detrend: kind = {kind!r} is not known; use 'constant' or 'linear'")
+        wanted = self.signals if signals is None else tuple(names_to_columns("signals", signals))
+        unknown = next((name for name in wanted if name not in self), None)
+        if unknown is not None:
+            raise self._unknown(unknown)
+        data, facts = dict(self._data), list(self.facts)
+        for name in wanted:
+            data[name], words = detrended(self._data[name], self.step, linear=kind == "linear")
+            facts.append(f"detrended: {words} subtracted from {name}")
+        return self._with(_data=data, facts=tuple(facts))
 
     def rename(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with other signal names.

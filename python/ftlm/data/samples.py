@@ -149,6 +149,17 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
         )
 
 
+def detrended(values: Floats, step: float, *, linear: bool) -> tuple[Floats, str]:
+    """Samples less their mean or their line of least squares, and what that is in words."""
+    mean = float(np.mean(values))
+    if not linear:
+        return values - mean, f"{mean:.6g}"
+    clock = (np.arange(values.size) - 0.5 * (values.size - 1)) * step
+    slope = float(clock @ (values - mean)) / float(clock @ clock)
+    sign = "-" if slope < 0 else "+"
+    return values - mean - slope * clock, f"{mean - slope * clock[-1]:.6g} {sign} {abs(slope):.6g} t"
+
+
 def check_values(values: Floats, thing: str, offset: int) -> None:
     """Refuse what is not finite, and numbers whose squares overflow; ``offset`` is the number of the first row."""
     with np.errstate(invalid="ignore"):

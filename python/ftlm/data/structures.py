@@ -13,10 +13,11 @@ from msgspec import UNSET, UnsetType
 
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
-from ftlm.data.equations import Equation, Term
+from ftlm.data.equations import Equation, Term, numeric
 from ftlm.data.orders import MAX_ORDER, Order, Values, parse_values
 
 Initial: TypeAlias = Literal["auto", "rest", "caputo"] | tuple[float, ...]
+Offset: TypeAlias = Literal["none", "constant", "ramp"]
 
 
 class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -77,6 +78,13 @@ def check_initial(initial: str | Iterable[float]) -> Initial:
     return exponents
 
 
+def check_offset(offset: str) -> Offset:
+    """Refuse an offset that is no known word."""
+    if offset in ("none", "constant", "ramp"):
+        return offset  # type: ignore[return-value]
+    raise ModelError(f"offset = {offset!r} is not known; use 'none', 'constant' or 'ramp'")
+
+
 @dataclass(frozen=True)
 class Hints:
     """What the maker of a structure knows of where its orders lie; it tells a fit where to start, and bounds nothing.
@@ -126,6 +134,9 @@ class Structure:
         What this is.
     hints
         Where its orders lie, if its maker knows; no part of what it says, so never compared nor written.
+    offset
+        ``"constant"``: each equation has an unknown constant on its right-hand side, ``"ramp"``: a constant and a
+        constant times t; one each run, estimated as initial terms are and never carried to another run.
     """
 
     equations: tuple[Equation, ...]
@@ -139,6 +150,7 @@ class Structure:
     reference: Mapping[str, float] = field(default_factory=dict)
     name: str = "equation"
     hints: Hints | UnsetType = field(default=UNSET, repr=False, compare=False)
+    offset: Offset = "none"
 
     def __post_init__(self) -> None:
         if not self.equations:
@@ -166,6 +178,21 @@ class Structure:
                 raise ModelError(f"{delay_name(name)} is the delay of {name}; call the coefficient otherwise")
         if self.sensor_filter is not None:
             check_known("filtered output", self.sensor_filter.outputs, self.signals)
+        self._check_offset()
+
+    def _check_offset(self) -> None:
+        """Refuse an offset that is no word, or that given initial terms hold already."""
+        check_offset(self.offset)
+        if isinstance(self.initial, str):
+            return
+        for item in self.equations:
+            for power in [] if item.order.names else offset_exponents(item.order.constant, self.offset).values():
+                if any(abs(power - e) < 1e-9 for e in self.initial):
+                    raise ModelError(
+                        f"the offset of {item.output} is t^{power:g} in its equation, and so is one of the initial "
+                        f"terms {', '.join(f'{e:g}' for e in self.initial)}: they cannot be told apart; "
+                        f"leave {power:g} out of initial, or use offset='none'"
+                    )
 
     @property
     def outputs(self) -> tuple[str, ...]:
@@ -318,7 +345,18 @@ class Structure:
         return replace(self, delay=known, free_delays=free)
 
     def __str__(self) -> str:
-        return "\n".join(str(e) for e in self.equations)
+        return "\n".join(f"{e}{self.offset_in_words}" for e in self.equations)
+
+    def written(self, item: Equation) -> str:
+        """Write an identified equation of this structure with its delays and its offset."""
+        return numeric(item, self.delay) + self.offset_in_words
+
+    @property
+    def offset_in_words(self) -> str:
+        """What an offset adds to an equation in words; nothing without one."""
+        taken = {*self.coefficient_names, *self.order_names, *self.signals}
+        name = next(n for n in ("c", *(f"c{k}" for k in range(len(taken) + 1))) if n not in taken)
+        return {"none": "", "constant": f" + {name}", "ramp": f" + ({name} + ramp t)"}[self.offset]
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(str(self))}</pre>"
@@ -327,6 +365,12 @@ class Structure:
 def delay_name(signal: str) -> str:
     """Name under which the estimated delay of an input stands among the parameters."""
     return f"delay_{signal}"
+
+
+def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
+    """Powers of t that an offset is once its equation is integrated, by what they are: c t^alpha / Gamma(alpha + 1)."""
+    names = {"none": (), "constant": ("constant",), "ramp": ("constant", "ramp")}[offset]
+    return {name: round(alpha + i, 9) for i, name in enumerate(names)}
 
 
 def narrowed(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilter | None:

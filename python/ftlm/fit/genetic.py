@@ -237,6 +237,11 @@ def genetic_search(
         import pygad  # type: ignore[import-untyped]  # noqa: PLC0415 — an extra; only this baseline needs it
     except ImportError:
         raise ModelError("the genetic baseline needs PyGAD; pip install 'ftlm[genetic]'") from None
+    if records[0].offset != "none":
+        raise ModelError(
+            f"the genetic baseline knows no offset, and offset = {records[0].offset!r}; "
+            "use method='output-error', or offset='none'"
+        )
     if initial_tuple(records[0].initial) != (False, []):
         raise ModelError(
             "the genetic baseline knows no initial terms and needs runs that start at rest; "

@@ -109,7 +109,7 @@ def descend(
     outcome = _core.output_error(
         experiments, problem.laws(signals), list(problem.bounds),
         problem.coordinates(attempt.coefficients, plain=plain), structure.coupling == "simulated",
-        initial_tuple(structure.initial), attempt.orders, attempt.coefficients,
+        initial_tuple(structure.initial, structure.offset), attempt.orders, attempt.coefficients,
         [
             (signals.index(n), structure.free_delays[n], delay)
             for n, delay in zip(problem.delays, attempt.delays, strict=True)

@@ -76,6 +76,8 @@ def multi_innovation_trace(
     settings = Settings.check(innovation_length=innovation_length, prior_covariance=prior_covariance, rows=rows)
     if len(equation.equations) != 1 or equation.order_names:
         raise ModelError("a trace needs one equation whose orders are numbers; use .equation(…).with_orders(…)")
+    if equation.offset != "none":
+        raise ModelError(f"a trace follows no offset, and offset = {equation.offset!r}; use offset='none'")
     stride = whole_number(every)
     if stride is None or stride < 1:
         raise ModelError(f"every = {every!r} is no whole number from 1; 1 gives every step")

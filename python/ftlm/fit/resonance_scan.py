@@ -91,7 +91,7 @@ def _projected(
         sensor = response if rec.sensor is None else _core.series_multiply(response, rec.sensor, rec.m)
         filtered.append(replace(rec, means=means, sensor=sensor))
     # Caputo's powers of the whole equation: the rest alone would not know those of the own terms.
-    initial = initial_tuple(records[0].initial)
+    initial = initial_tuple(records[0].initial, records[0].offset)
     signals = records[0].signals
     cores = [r.core() for r in filtered]
     raw = _core.least_squares(cores, structure_tuple(rest, signals), inputs, [t.fixed for t in rest.terms], initial)[0]

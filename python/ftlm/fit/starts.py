@@ -277,8 +277,8 @@ def stage_rows(
     scales = [sum(float(np.std(r.of(e.output))) * r.m for r in records) for e in structure.equations]
     joined = _core.search_stage(
         [r.core() for r in records], [axes[n] for n in names], laws, list(records[0].inputs),
-        [[t.fixed for t in e.terms] for e in structure.equations], scales, initial_tuple(records[0].initial),
-        settings.core(), None,
+        [[t.fixed for t in e.terms] for e in structure.equations], scales,
+        initial_tuple(records[0].initial, records[0].offset), settings.core(), None,
     )  # fmt: skip
     rows = []
     for _, _, free, parts in joined["rows"]:
@@ -297,7 +297,7 @@ def equation_rows(
     try:
         table = _core.search(
             [r.core() for r in records], lattice_tuple(item, signals, axes), list(records[0].inputs),
-            [t.fixed for t in item.terms], initial_tuple(records[0].initial), settings.core(), None,
+            [t.fixed for t in item.terms], initial_tuple(records[0].initial, records[0].offset), settings.core(), None,
         )  # fmt: skip
     except ModelError as error:
         raise named_signals(error, signals) from None

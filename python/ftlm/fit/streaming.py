@@ -49,6 +49,11 @@ class Streaming:
                 f"the orders {', '.join(structure.order_names)} are free; a stream needs numbers: give them with "
                 "with_orders(…)"
             )
+        if structure.offset != "none":
+            raise ModelError(
+                f"offset = {structure.offset!r} cannot be followed in a stream; identify the recorded run, or use "
+                "offset='none'"
+            )
         if structure.delay or structure.sensor_filter is not None or structure.initial not in ("auto", "rest"):
             raise ModelError(
                 "delays, initial terms and sensor filters cannot be followed in a stream; identify the recorded run"

@@ -83,6 +83,11 @@ def in_words(initial: Initial) -> str:
     return initial if isinstance(initial, str) else f"t^{list(initial)}"
 
 
+def offset_setting(structure: Structure) -> dict[str, str]:
+    """The setting that an offset is, if there is one."""
+    return {} if structure.offset == "none" else {"offset": structure.offset}
+
+
 def by_output_error(task: Task, m: int | None, threads: int, progress: Told) -> Fit:
     """Orders and coefficients together by joint output error."""
     # An order with one value is known.
@@ -102,7 +107,7 @@ def by_output_error(task: Task, m: int | None, threads: int, progress: Told) -> 
         {
             "method": "output-error", "m": record.m, "initial": in_words(record.initial),
             "refinement": joint.refinement, "starts": len(joint.starts), "noise": joint.noise,
-            "converged": joint.converged,
+            "converged": joint.converged, **offset_setting(structure),
         },
         uncertain(joint, problem), joint=joint,
         covariance=tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None,
@@ -132,6 +137,7 @@ def by_lattice(
         task, method, model, len(orders) + len(fit.values),
         {
             **settings.to_dict(), "m": fit.m, "initial": in_words(fit.initial), **({"rank": rank} if rank > 1 else {}),
+            **offset_setting(structure),
         },
         [
             *fit.warnings, *step_bias(task.runs, at_orders, settings, fit), *broken_law(model),

@@ -14,7 +14,7 @@ from ftlm.data.run import Run
 from ftlm.data.settings import METHODS, Settings, check_used
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Estimate
-from ftlm.data.structures import Structure
+from ftlm.data.structures import Structure, check_offset
 from ftlm.fit.genetic import Genetic
 from ftlm.identification.estimate import Fit, by_genetic_algorithm, by_lattice, by_output_error
 from ftlm.identification.judged import Task
@@ -50,6 +50,7 @@ def identify(
     progress: Callable[[int, int], None] | None = None,
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
+    offset: Literal["none", "constant", "ramp"] | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
@@ -90,6 +91,10 @@ def identify(
     executor
         Any :class:`concurrent.futures.Executor` to work for the order searches; see :func:`ftlm.search_orders`. For
         many runs each by itself: :func:`ftlm.identify_many`.
+    offset
+        ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
+        friction that the model lacks; ``"ramp"``: one that drifts in proportion to time as well. One each run, in
+        ``.comparison.offsets``, estimated anew on any run that the model is judged on. Default what the structure says.
 
     Returns
     -------
@@ -112,6 +117,8 @@ def identify(
         raise ModelError(f"method = {method!r} is not known; use {' or '.join(map(repr, METHODS))}")
     if not isinstance(structure, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
+    if offset is not None:
+        structure = replace(structure, offset=check_offset(offset))
     check_lattice(lattice)
     check_lattice_names(lattice, structure)
     if not (genetic is None or isinstance(genetic, Genetic)):

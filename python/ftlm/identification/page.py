@@ -207,6 +207,8 @@ def _traces(result: Judged) -> list[Figure]:
     """The recursion at the orders found, for the paper's p and the one used, where the first run starts at rest."""
     if result.task is None or result.method != "multi-innovation" or result.settings["initial"] != "rest":
         return []
+    if "offset" in result.settings:
+        return []
     run, used = result.task.runs[0], result.settings
     every = max(1, int(used["m"]) // TRACE_POINTS)
     options = {n: used[n] for n in ("prior_covariance", "rows", "m")}

@@ -11,7 +11,6 @@ from typing import Any
 
 from ftlm.base.errors import ModelError
 from ftlm.base.frames import to_frame
-from ftlm.data.equations import numeric
 from ftlm.data.run import Run
 from ftlm.identification.judged import Judged
 from ftlm.identification.page import identification_html, identification_page
@@ -147,7 +146,7 @@ class Identification(Judged):
         return {
             "method": self.method,
             "settings": self.settings,
-            "equations": {e.output: numeric(e, self.model.structure.delay) for e in self.model.equations},
+            "equations": {e.output: self.model.structure.written(e) for e in self.model.equations},
             "orders": self.orders,
             "coefficients": self.coefficients,
             "delays": self.delays,
@@ -163,7 +162,7 @@ class Identification(Judged):
 
     def __str__(self) -> str:
         lines = [f"{self.model.structure.name}: {self.method}, {settings_in_words(self.settings)}"]
-        lines += [f"  {numeric(e, self.model.structure.delay)}" for e in self.model.equations]
+        lines += [f"  {self.model.structure.written(e)}" for e in self.model.equations]
         reference = self.model.structure.reference
         errors = self.standard_errors
         for name, value in {**self.orders, **self.joint_values, **self.coefficients}.items():

@@ -25,7 +25,8 @@ def settings_in_words(settings: Mapping[str, Any]) -> str:
     if "innovation_length" in settings:
         words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
         words += f", {settings['rows']} rows"
-    return f"{words}, initial terms: {settings['initial']}"
+    offset = f", offset: {settings['offset']}, one a run" if "offset" in settings else ""
+    return f"{words}, initial terms: {settings['initial']}{offset}"
 
 
 def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[Cell]]:
@@ -44,6 +45,8 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
         ]
         rows += [[f"noise found on {symbol(name)}", float(level)] for name, level in settings["noise"].items()]
     rows.append(["initial terms", INITIAL.get(str(settings["initial"]), str(settings["initial"]))])
+    if "offset" in settings:
+        rows.append(["offset of each equation", f"{settings['offset']}, estimated for each run"])
     if searched:
         rows.append(["orders ranked by", f"{settings['criterion']}, {NORMS.get(settings['norm'], settings['norm'])}"])
     return rows

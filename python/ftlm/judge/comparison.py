@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from typing import Any
@@ -15,7 +16,7 @@ from ftlm.base.frames import to_frame
 from ftlm.data.run import Run
 from ftlm.data.several import Runs, as_runs
 from ftlm.data.solved import Solved, check_solved
-from ftlm.data.structures import Structure
+from ftlm.data.structures import Structure, offset_exponents
 from ftlm.judge.metrics import Metrics, pooled
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol_html
@@ -64,6 +65,9 @@ class Comparison:
         When each value of ``simulated`` and ``measured`` holds [s since the first row], one array a run.
     sampled
         Whether the output error is that of samples at the run's instants; False for pulse means, as the paper has them.
+    offsets
+        Unknown constants of the equations, one mapping a run: output -> ``"constant"`` [unit of D^alpha y] (and
+        ``"ramp"``, that a second) -> value. Estimated anew on each run; empty for a model without an offset.
     """
 
     output_error: dict[str, Metrics]
@@ -77,6 +81,7 @@ class Comparison:
     warnings: tuple[str, ...] = field(default=())
     times: list[Floats] = field(default_factory=list)
     sampled: bool = True
+    offsets: tuple[dict[str, dict[str, float]], ...] = field(default=())
 
     @property
     def fit_percent(self) -> dict[str, float]:
@@ -107,6 +112,7 @@ class Comparison:
                 }
                 for name, equation, output in self.per_run
             ],
+            **({"offsets": list(self.offsets)} if self.offsets else {}),
             "warnings": list(self.warnings),
         }
 
@@ -124,6 +130,7 @@ class Comparison:
             lines.append(f"output error over {count} samples, equation error over {self.m} block pulses a run")
         else:
             lines.append(f"over {self.m} block pulses a run")
+        lines += offsets_in_words(self)
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
 
@@ -150,7 +157,8 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
     Returns
     -------
     Comparison
-        On the data that a model was identified from, its figures are those printed with it.
+        On the data that a model was identified from, its figures are those printed with it. Initial terms, and offsets
+        where the structure has them, are estimated anew on each of these runs.
 
     Raises
     ------
@@ -215,6 +223,31 @@ def _checked(model: Solved, runs: Run | Sequence[Run], m: int | None) -> tuple[R
     return several, m
 
 
+def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
+    """Constants of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1)."""
+    out: dict[str, dict[str, float]] = {}
+    for item in model.equations:
+        exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
+        out[item.output] = {
+            name: float(values[np.argmin(np.abs(exponents - power))]) * math.gamma(power + 1.0)
+            for name, power in offset_exponents(item.order.constant, model.structure.offset).items()
+        }
+    return out
+
+
+def offsets_in_words(comparison: Comparison) -> list[str]:
+    """Offsets of every run that has some, a line an output."""
+    lines = []
+    for (run, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False):
+        for output, values in offsets.items():
+            ramp = f" and {values['ramp']:.6g} t" if "ramp" in values else ""
+            lines.append(
+                f"offset in the equation of {output} in {run} (estimated on that run, for it alone): "
+                f"{values['constant']:.6g}{ramp}"
+            )
+    return lines
+
+
 @dataclass(frozen=True)
 class _Beside:
     """A model beside one run, by output: the free run and what was measured, the equation's signal and its error."""
@@ -232,7 +265,7 @@ def _beside(
     initial: dict[str, dict[float, float]],
 ) -> _Beside:  # fmt: skip
     """A free run with what it is compared with, and the equation error, with all signals behind the sensor filter."""
-    core, inputs, powers = full.core(), list(full.inputs), initial_tuple(full.initial)
+    core, inputs, powers = full.core(), list(full.inputs), initial_tuple(full.initial, full.offset)
     missed = {
         e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers) for e in model.equations
     }
@@ -249,6 +282,7 @@ def _comparison(
         {o: [p.simulated[o] for p in parts] for o in model.outputs},
         {o: [p.measured[o] for p in parts] for o in model.outputs}, [p.step for p in parts], m,
         [p.initial for p in parts], tuple(near_identity(model.structure, equation_error, output_error)), times, sampled,
+        tuple(offsets_of(model, p.initial) for p in parts) if model.structure.offset != "none" else (),
     )  # fmt: skip
 
 
@@ -372,7 +406,18 @@ def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms o
     ]
     if not rows:
         return None
+    rows += [
+        [name, symbol_html(output), f"offset: {what}", value]
+        for (name, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False)
+        for output, values in offsets.items()
+        for what, value in values.items()
+    ]
     note = "They describe how that record starts and are never carried to another."
+    if comparison.offsets:
+        note += (
+            " An offset c on the right-hand side is the power alpha with the coefficient c/Gamma(alpha + 1); it is "
+            "estimated on each run for that run alone."
+        )
     return Table(title, ("run", "output", "exponent of t", "coefficient"), rows, note=note)
 
 

@@ -245,8 +245,8 @@ LAGS = 25
 def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Residuals:
     """Test whether the residuals of a model's free run are white, and independent of the inputs.
 
-    Residuals are measured samples minus the free run at the same instants, with initial terms fitted to each run, on a
-    grid fine enough not to matter. Each run is taken about its own mean; runs are pooled.
+    Residuals are measured samples minus the free run at the same instants, with initial terms and offsets fitted to
+    each run, on a grid fine enough not to matter. Each run is taken about its own mean; runs are pooled.
 
     Parameters
     ----------

@@ -8,17 +8,19 @@ from pathlib import Path
 from typing import Literal
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import write_atomically
 from ftlm.data.equations import Equation, Term
 from ftlm.data.orders import Order
 from ftlm.data.solved import Estimate, Solved
-from ftlm.data.structures import SensorFilter, Structure, check_initial
+from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
 
 #: Largest model file read: a model is a few kilobytes.
 MAX_MODEL_BYTES = 1 << 20
-SCHEMA = 2
+#: Schema of a model that every version since the first reads, and of one that has an offset.
+SCHEMA, OFFSET_SCHEMA = 2, 3
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -66,15 +68,19 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     m: int | None
     about: dict[str, str | float | int | bool | None]
     estimate: Estimate | None = None
+    offset: Offset | UnsetType = UNSET
 
     @classmethod
     def of(cls, model: Solved) -> ModelFile:
         """Write a model."""
         s = model.structure
+        # Written only where there is one, so that what has none is as it was.
+        offset: Offset | UnsetType = UNSET if s.offset == "none" else s.offset
         return cls(
-            "ftlm-model", SCHEMA, s.name, [EquationFile.of(e) for e in s.equations], s.coupling, dict(s.delay),
+            "ftlm-model", SCHEMA if offset is UNSET else OFFSET_SCHEMA, s.name,
+            [EquationFile.of(e) for e in s.equations], s.coupling, dict(s.delay),
             s.initial if isinstance(s.initial, str) else list(s.initial), s.sensor_filter, dict(model.units),
-            dict(model.orders), model.m, dict(model.about), model.estimate,
+            dict(model.orders), model.m, dict(model.about), model.estimate, offset,
         )  # fmt: skip
 
     def solved(self) -> Solved:
@@ -88,6 +94,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         structure = Structure(
             equations=tuple(e.equation() for e in self.equations), coupling=self.coupling, delay=self.delay,
             initial=check_initial(self.initial), sensor_filter=self.sensor_filter, name=self.name,
+            offset="none" if self.offset is UNSET else self.offset,
         )  # fmt: skip
         if self.estimate is not None and self.estimate.covariance is not None:
             count = sum(1 + 2 * len(e.terms) for e in self.equations)
@@ -121,8 +128,8 @@ def read_model(path: str | os.PathLike[str]) -> Solved:
         raise
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
-    if read.schema > SCHEMA or read.schema < 1:
-        raise DataError(f"{file} has schema {read.schema}, this version reads up to {SCHEMA}; upgrade ftlm")
+    if read.schema > OFFSET_SCHEMA or read.schema < 1:
+        raise DataError(f"{file} has schema {read.schema}, this version reads up to {OFFSET_SCHEMA}; upgrade ftlm")
     try:
         return read.solved()
     except ModelError as error:

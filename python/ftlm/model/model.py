@@ -10,7 +10,6 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.data.equations import numeric
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.judge.comparison import Comparison, compare
@@ -95,7 +94,7 @@ class Model(Solved):
         return write_model(self, path, force=force)
 
     def __str__(self) -> str:
-        return "\n".join(numeric(e, self.structure.delay) for e in self.equations)
+        return "\n".join(map(self.structure.written, self.equations))
 
     def _repr_html_(self) -> str:
         return model_html(self)

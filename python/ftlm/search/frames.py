@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from ftlm.base.errors import ModelError
-from ftlm.data.structures import Structure, check_initial
+from ftlm.data.structures import Offset, Structure, check_initial
 from ftlm.solve.records import Record
 
 MAGIC = b"ftlm search store 1\n"
@@ -37,8 +37,8 @@ Span = tuple[int, int, int, float]
 Outcomes = tuple[bytes, bytes]
 
 
-class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A record: pulse means as little-endian doubles, row by row."""
+class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A record: pulse means as little-endian doubles, row by row; an offset is written where there is one."""
 
     signals: tuple[str, ...]
     step: float
@@ -47,6 +47,7 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inputs: tuple[bool, ...]
     sensor: bytes | None
     initial: str | tuple[float, ...]
+    offset: Offset = "none"
 
     @classmethod
     def of(cls, record: Record) -> RecordFile:
@@ -54,7 +55,9 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         sensor = None if record.sensor is None else np.ascontiguousarray(record.sensor, "<f8").tobytes()
         rows, m = record.means.shape
         means = np.ascontiguousarray(record.means, "<f8").tobytes()
-        return cls(record.signals, float(record.step), (rows, m), means, record.inputs, sensor, record.initial)
+        return cls(
+            record.signals, float(record.step), (rows, m), means, record.inputs, sensor, record.initial, record.offset
+        )
 
     def record(self) -> Record:
         """Give the record back, or refuse sizes that do not fit one another."""
@@ -64,7 +67,7 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ModelError("the sizes of a record do not fit one another")
         means = np.frombuffer(self.means, "<f8").astype(np.float64).reshape(rows, m)
         sensor = None if self.sensor is None else np.frombuffer(self.sensor, "<f8").astype(np.float64)
-        return Record(self.signals, self.step, means, self.inputs, sensor, check_initial(self.initial))
+        return Record(self.signals, self.step, means, self.inputs, sensor, check_initial(self.initial), self.offset)
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -80,6 +83,8 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def difference(self, other: Request) -> str | None:
         """Say what sets another request apart, or None."""
+        if self.structure.offset != other.structure.offset:
+            return "another offset"
         if self.records != other.records:
             return "other data"
         if self.structure.equations != other.structure.equations:

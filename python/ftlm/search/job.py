@@ -23,7 +23,7 @@ from ftlm.search.result import SearchResult, SearchRow
 from ftlm.search.rounds import search_equation, search_stage
 from ftlm.search.store import Store
 from ftlm.search.work import CoreRecord, EquationWork, StageWork, Told
-from ftlm.solve.records import Record, initial_tuple, named_coefficients, named_signals
+from ftlm.solve.records import InitialTuple, Record, initial_tuple, named_coefficients, named_signals
 
 #: Settings that tell one search from another; threads make no difference to it.
 KEPT = tuple(f.name for f in fields(Settings) if f.name != "threads")
@@ -74,10 +74,10 @@ class Job:
             raise ModelError("an order has no values")
         return cls(request.runs, request.units, structure, request.values, records, settings, progress)
 
-    def _recorded(self) -> tuple[tuple[CoreRecord, ...], list[bool], tuple[bool, list[float]], Settings]:
+    def _recorded(self) -> tuple[tuple[CoreRecord, ...], list[bool], InitialTuple, Settings]:
         record = self.records[0]
         runs = tuple(r.core() for r in self.records)
-        return runs, list(record.inputs), initial_tuple(record.initial), self.settings
+        return runs, list(record.inputs), initial_tuple(record.initial, record.offset), self.settings
 
     def equation_work(self) -> EquationWork:
         """What the rounds of one equation are computed from."""

@@ -19,6 +19,7 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.data.settings import Settings
 from ftlm.search.frames import Outcomes, Part, Span
+from ftlm.solve.records import InitialTuple
 
 #: Searches that a worker keeps ready.
 READY = 2
@@ -34,7 +35,7 @@ class Work(ABC, Generic[Table]):
 
     runs: tuple[CoreRecord, ...]
     inputs: list[bool]
-    initial: tuple[bool, list[float]]
+    initial: InitialTuple
     settings: Settings
 
     @property

@@ -34,7 +34,7 @@ def respond(model: Solved, rec: Record) -> tuple[dict[str, Floats], dict[str, di
     """
     structure = model.structure
     coupled = structure.coupling == "simulated"
-    terms = initial_tuple(rec.initial)
+    terms = initial_tuple(rec.initial, rec.offset)
     inputs = list(rec.inputs)
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
     responses: dict[str, Floats] = {}
@@ -83,6 +83,7 @@ def simulate(
         Relative change at which refinement ends.
     initial
         Coefficients of initial terms, by output and exponent; default at rest. Those of another record mean nothing.
+        An offset c of the equation is the exponent alpha with the coefficient c / Gamma(alpha + 1); default none.
     largest_m
         Most pulses; beyond it the change that is left is an error.
 

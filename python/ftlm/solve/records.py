@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -14,12 +15,12 @@ from ftlm.base.arrays import Floats
 from ftlm.base.checks import check_pulses, nearest
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.statistics import is_rest
-from ftlm.data.equations import Equation
+from ftlm.data.equations import Equation, Term
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.samples import locked
 from ftlm.data.several import Runs
-from ftlm.data.structures import Initial, Structure
+from ftlm.data.structures import Initial, Offset, Structure
 
 #: The paper's number of block pulses, used where the record carries as many.
 PAPER_M = 2048
@@ -28,6 +29,8 @@ MAX_M = 1 << 24
 #: A signal that stays below this loses digits of its squares to the end of the range of numbers.
 SMALLEST = 1e-140
 COULOMB = "coulomb_"
+#: Initial terms as the core takes them.
+InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int]
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,8 @@ class Record:
         Series of the sensor filter, applied to every signal not measured through it, or None.
     initial
         Initial terms, decided.
+    offset
+        Unknown constant of each equation on this run.
     """
 
     signals: tuple[str, ...]
@@ -56,6 +61,7 @@ class Record:
     inputs: tuple[bool, ...]
     sensor: Floats | None
     initial: Initial
+    offset: Offset = "none"
 
     @property
     def m(self) -> int:
@@ -135,6 +141,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         tuple(s in run.inputs for s in structure.signals),
         sensor,
         initial,
+        structure.offset,
     )
 
 
@@ -151,7 +158,7 @@ def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool
         return made()
     filtered = filtered or structure.sensor_filter is None
     read = (structure.signals, structure.delay, structure.free_delays, structure.sensor_filter, structure.initial)
-    return list(runs.keep(repr((read, m, filtered)), made))
+    return list(runs.keep(repr((read, structure.offset, m, filtered)), made))
 
 
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
@@ -222,11 +229,11 @@ def equation_tuple(
     return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
 
 
-def initial_tuple(initial: Initial) -> tuple[bool, list[float]]:
-    """Return decided initial terms: whether Caputo's, else their exponents."""
-    if initial == "caputo":
-        return True, []
-    return False, [] if isinstance(initial, str) else list(initial)
+def initial_tuple(initial: Initial, offset: Offset = "none") -> InitialTuple:
+    """Return decided initial terms: whether Caputo's, else their exponents; the number of offset terms if any."""
+    powers = [] if isinstance(initial, str) else list(initial)
+    decided = (initial == "caputo", powers)
+    return decided if offset == "none" else (*decided, 1 if offset == "constant" else 2)
 
 
 def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
@@ -250,7 +257,20 @@ def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_o
                     f"{term.signal} is 0 throughout, so its coefficient in the equation of {item.output} cannot be "
                     "identified; leave the term out, fix its coefficient, or add a run in which it moves"
                 )
+            if structure.offset != "none" and _is_offset(term, item, prepared):
+                raise DataError(
+                    f"{term.signal} is constant on every run, so {term} and the offset in the equation of "
+                    f"{item.output} cannot be told apart; add a run in which it changes, fix its coefficient, "
+                    "or use offset='none'"
+                )
     return prepared
+
+
+def _is_offset(term: Term, item: Equation, prepared: Sequence[Record]) -> bool:
+    """Whether a free term of order 0 does on every run what an offset does."""
+    if term.fixed is not None or term.signal == item.output or term.order.names or term.order.constant != 0:
+        return False
+    return all(float(np.ptp(r.of(term.signal))) == 0.0 for r in prepared)
 
 
 def named_coefficients(item: Equation, raw: Sequence[float]) -> dict[str, float]:

@@ -6,6 +6,7 @@ it. What integrates is continuous there; what feeds through (a term of the equat
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -17,7 +18,7 @@ from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
-from ftlm.data.structures import Initial, SensorFilter
+from ftlm.data.structures import Initial, Offset, SensorFilter, offset_exponents
 from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
@@ -53,15 +54,14 @@ class Sampled:
     change: Floats
 
 
-def initial_exponents(item: Equation, initial: Initial) -> list[float]:
-    """Exponents of the initial terms of an equation whose orders are numbers, distinct and ascending."""
-    if initial != "caputo":
-        return [] if isinstance(initial, str) else sorted({round(e, 9) for e in initial})
+def initial_exponents(item: Equation, initial: Initial, offset: Offset) -> list[float]:
+    """Exponents of the initial terms and the offset of an equation whose orders are numbers, distinct and ascending."""
     alpha = item.order.constant
-    found = {float(i) for i in range(4) if i < alpha - GRAIN}
-    for term in item.terms:
-        order = term.order.constant
-        found |= {round(alpha - order + i, 9) for i in range(4) if i < order - GRAIN}
+    found = {round(e, 9) for e in offset_exponents(alpha, offset).values()}
+    if initial != "caputo":
+        return sorted(found | ({round(e, 9) for e in initial} if not isinstance(initial, str) else set()))
+    for lowest, order in [(0.0, alpha), *((alpha - t.order.constant, t.order.constant) for t in item.terms)]:
+        found |= {round(lowest + i, 9) for i in range(math.ceil(order - GRAIN))}
     return sorted(found)
 
 
@@ -128,7 +128,7 @@ def sampled(model: Solved, run: Run, every: int, initial: Terms | None) -> tuple
     if initial is not None:
         kept = {o: dict(initial.get(o, {})) for o in model.outputs}
         return _read(model, run, rec, every, _responses(model, rec, kept), kept), kept
-    names = [(e.output, power) for e in model.equations for power in initial_exponents(e, rec.initial)]
+    names = [(e.output, power) for e in model.equations for power in initial_exponents(e, rec.initial, rec.offset)]
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
     driven = _read(model, run, rec, every, _responses(model, rec, none), none)
     if not names or not np.all(np.isfinite(driven)):

@@ -179,7 +179,7 @@ impl FreeModel {
     /// is that towards longer delays where the delay is a whole number of steps.
     pub(super) fn shifted(&self, record: &Record, signal: usize, delay: f64) -> Result<(Vec<f64>, Vec<f64>)> {
         let means = record.signal(signal);
-        let before = if self.initial == Initial::Rest { 0.0 } else { means.first().copied().unwrap_or(0.0) };
+        let before = if self.initial.at_rest() { 0.0 } else { means.first().copied().unwrap_or(0.0) };
         let steps = delay / record.step();
         let whole = steps.floor();
         let (near, far) = (delayed(means, whole, before)?, delayed(means, whole + 1.0, before)?);

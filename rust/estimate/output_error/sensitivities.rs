@@ -4,7 +4,6 @@ use super::experiment::Experiment;
 use super::feedthrough::add_slope;
 use super::free_run::{inverse_spectra, Evaluation, Part, FACTORS};
 use super::model::{FreeModel, Point};
-use crate::equation::Initial;
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel, SumOfProducts};
@@ -138,7 +137,7 @@ fn initial_slope(
     // Exponents move linearly with orders, and powers of t smoothly with exponents: a central difference of the
     // powers has an error of 1e−10, far below what a Jacobian needs.
     const SHIFT: f64 = 1e-5;
-    if values.is_empty() || model.initial != Initial::Caputo {
+    if values.is_empty() || !model.initial.follows_orders() {
         return Ok(None);
     }
     let mut lists = Vec::with_capacity(2);

@@ -23,8 +23,11 @@ impl<'a> Needed<'a> {
         if !self.alphas.insert(grains(alpha)) {
             return;
         }
-        match self.initial {
-            Initial::Rest => {}
+        for exponent in self.initial.offset_exponents(alpha) {
+            self.index.insert(Key::initial(exponent));
+        }
+        match self.initial.under() {
+            Initial::Rest | Initial::Offset { .. } => {}
             Initial::Powers(powers) => powers.iter().for_each(|&e| {
                 self.index.insert(Key::initial(e));
             }),
@@ -36,7 +39,7 @@ impl<'a> Needed<'a> {
     pub(crate) fn term(&mut self, alpha: f64, signal: usize, order: f64) {
         if self.orders.insert((grains(alpha), signal, grains(order))) {
             self.index.insert(Key::integral(signal, alpha - order));
-            if *self.initial == Initial::Caputo {
+            if *self.initial.under() == Initial::Caputo {
                 self.powers(alpha - order, order);
             }
         }

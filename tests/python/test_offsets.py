@@ -1,0 +1,318 @@
+"""Unknown constants in equations: estimated for each run, told, written, refused where they cannot be told apart."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from math import gamma
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter, lsim
+from typer.testing import CliRunner
+
+import ftlm
+import oracles
+from ftlm import cli
+from ftlm.fit.streaming import Streaming
+
+DATA = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+WORDS = "D^0.8 y = -a y + b u + c"
+TRUTH = {"a": 0.7, "b": 1.4}
+
+
+def switched(rows: int, seed: int, *, every: int = 10) -> np.ndarray:
+    """A command of random levels, each held for some rows."""
+    levels = np.random.default_rng(seed).uniform(-1, 1, rows // every + 1)
+    return np.repeat(levels, every)[:rows]
+
+
+def fractional_run(
+    seed: int, constant: float, *, noise: float = 0.01, ramp: float = 0.0, name: str = "run", rows: int = 201
+) -> ftlm.Run:
+    """D^0.8 y = -0.7 y + 1.4 u + c + r t from rest, by dense matrices on a grid four times as fine as the samples."""
+    step, fine = 0.05, 4
+    u = switched(rows, seed)
+    m = (rows - 1) * fine
+    driven = oracles.pulse_means(u, m, "zoh")
+    clock = (np.arange(m) + 0.5) * step / fine
+    y = oracles.free_run(
+        [(-0.7, 0.0)], [(1.4, 0.0, driven), (1.0, 0.0, constant + ramp * clock)], 0.8, m, (rows - 1) * step
+    )
+    samples = np.concatenate([[0.0], 1.5 * y[fine - 1 :: fine] - 0.5 * y[fine - 2 :: fine]])
+    samples += noise * np.std(samples) * np.random.default_rng(1000 + seed).standard_normal(rows)
+    return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": samples}, name=name)
+
+
+def motor_run(offset: float, seed: int = 1) -> ftlm.Run:
+    """A motor: 8 rad/s a volt, 0.2 s, 0.035 s late, 1 % noise; its tachometer reads so much at rest. By SciPy."""
+    fine, step, rows = 10, 0.01, 1500
+    u = 2.0 * switched(rows, seed, every=25)
+    late = np.concatenate([np.zeros(35), np.repeat(u, fine)])[: rows * fine]
+    pole = np.exp(-step / fine / 0.2)
+    speed = lfilter([0.0, 8.0 * (1 - pole)], [1.0, -pole], late)[::fine]
+    speed += 0.01 * np.std(speed) * np.random.default_rng(seed).standard_normal(rows)
+    return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"w": speed + offset}, name="motor")
+
+
+@pytest.mark.parametrize(("offset", "exponents"), [("none", []), ("constant", [0.8]), ("ramp", [0.8, 1.8])])
+def test_least_squares_is_that_of_one_more_power_of_time(offset, exponents):
+    # The oracle: dense regressors I^0.8 y, I^0.8 u, and I^0.8 of a column of ones and one of t.
+    run = fractional_run(3, 0.5, ramp=0.1, noise=0.0)
+    m, length = run.length - 1, run.duration
+    y, u = oracles.pulse_means(run["y"], m, "foh"), oracles.pulse_means(run["u"], m, "zoh")
+    clock = (np.arange(m) + 0.5) * run.step
+    columns = [oracles.integrate(x, 0.8, length) for x in (-y, u, np.ones(m), clock)][: 2 + len(exponents)]
+    expected = np.linalg.lstsq(np.stack(columns, axis=1), y, rcond=None)[0]
+    structure = ftlm.equation("D^0.8 y = -a y + b u", initial="rest", offset=offset)
+    found = ftlm.identify(run, structure, method="least-squares", m=m)
+    # Means of t are exact, I^0.8 of their steps is not that of a line: the second column differs a little.
+    assert [found.coefficients[n] for n in "ab"] == pytest.approx(
+        list(expected[:2]), rel=1e-6 if offset != "ramp" else 1e-3
+    )
+    assert list(found.comparison.initial[0]["y"]) == pytest.approx(exponents)
+    assert found.settings.get("offset", "none") == offset
+
+
+@pytest.mark.parametrize("method", ["least-squares", "instrumental-variables", "output-error"])
+def test_an_offset_and_coefficients_are_found_in_ten_seeds(method):
+    errors = []
+    for seed in range(10):
+        # Instrumental variables end on pulses as wide as the samples; with less noise their step shows.
+        short = method != "instrumental-variables"
+        run = fractional_run(seed, 0.5, noise=0.01 if short else 0.03, rows=201 if short else 401)
+        structure = ftlm.equation(WORDS if method != "output-error" else WORDS.replace("0.8", "alpha"), initial="rest")
+        found = ftlm.identify(run, structure, method=method)
+        truth = TRUTH | ({"alpha": 0.8} if method == "output-error" else {})
+        values = {**found.orders, **found.coefficients}
+        spread = found.standard_errors or dict.fromkeys(truth, np.nan)
+        errors.append([(values[n] - v) / spread[n] if spread[n] > 0 else values[n] / v - 1 for n, v in truth.items()])
+        assert found.comparison.offsets[0]["y"]["constant"] == pytest.approx(0.5, rel=0.1)
+    # Standard errors where the method has them; least squares on the equation error has none.
+    if method == "least-squares":
+        assert np.max(np.abs(errors)) < 0.05
+    else:
+        assert np.mean(np.abs(errors) < 3) >= 0.95
+        assert np.sqrt(np.mean(np.square(errors))) < 1.7
+
+
+def test_two_runs_have_two_offsets():
+    runs = [fractional_run(1, 0.5, name="first"), fractional_run(2, -0.3, name="second")]
+    for method in ("least-squares", "output-error"):
+        found = ftlm.identify(runs, ftlm.equation(WORDS, initial="rest"), method=method)
+        assert [o["y"]["constant"] for o in found.comparison.offsets] == pytest.approx([0.5, -0.3], abs=0.03)
+        assert found.coefficients == pytest.approx(TRUTH, rel=0.05)
+        assert found.to_dict()["offsets"] == list(found.comparison.offsets)
+        for name in ("first", "second"):
+            assert f"offset in the equation of y in {name} (estimated on that run, for it alone): " in str(found)
+
+
+def test_a_ramp_is_found():
+    found = ftlm.identify(
+        fractional_run(4, 0.5, ramp=0.2), ftlm.equation("D^0.8 y = -a y + b u", initial="rest"), offset="ramp"
+    )
+    assert found.comparison.offsets[0]["y"] == pytest.approx({"constant": 0.5, "ramp": 0.2}, rel=0.1)
+    assert found.coefficients == pytest.approx(TRUTH, rel=0.05)
+
+
+@pytest.mark.parametrize("method", ["least-squares", "instrumental-variables", "output-error"])
+def test_a_constant_added_to_the_input_changes_only_the_offset(method):
+    run = fractional_run(5, 0.5)
+    shifted = ftlm.Run.from_arrays(step=run.step, inputs={"u": run["u"] + 3.0}, outputs={"y": run["y"]})
+    structure = ftlm.equation(WORDS, initial="rest")
+    one, other = (ftlm.identify(r, structure, method=method) for r in (run, shifted))
+    # Instruments are made of the input, so its shift moves them within the noise.
+    close = 1e-6 if method == "least-squares" else 1e-4 if method == "output-error" else 2e-2
+    assert other.coefficients == pytest.approx(one.coefficients, rel=close)
+    moved = other.comparison.offsets[0]["y"]["constant"] - one.comparison.offsets[0]["y"]["constant"]
+    assert moved == pytest.approx(-3.0 * one.coefficients["b"], rel=10 * close)
+    assert other.fit_percent["y"] == pytest.approx(one.fit_percent["y"], abs=0.1)
+
+
+def test_a_motor_whose_tachometer_has_a_zero_of_its_own():
+    structure = ftlm.equation("D w = -a w + b u", delay={"u": (0.0, 0.1)})
+    found = ftlm.identify(motor_run(5.0), structure, offset="constant")
+    low, high = found.intervals["delay_u"]
+    assert low <= 0.035 <= high
+    assert found.delays["u"] == pytest.approx(0.035, abs=1e-3)
+    a, b = found.coefficients["a"], found.coefficients["b"]
+    covariance = found.joint.covariance[:2, :2]
+    slope = np.array([-b / a**2, 1.0 / a])
+    assert abs(b / a - 8.0) < 3 * np.sqrt(slope @ covariance @ slope)
+    assert found.comparison.offsets[0]["w"]["constant"] / a == pytest.approx(5.0, rel=0.02)
+
+
+def test_a_cell_with_a_constant_voltage():
+    # 3.7 V, 20 mOhm and a constant-phase element of order 0.8 beside 50 mOhm, in amperes and volts.
+    run = fractional_run(6, 0.0, noise=0.005)
+    cell = ftlm.Run.from_arrays(step=run.step, inputs={"i": run["u"]}, outputs={"v": 3.7 + 0.05 * run["y"]})
+    found = ftlm.identify(cell, ftlm.equation("D^alpha v = -a v + b i + c"))
+    low, high = found.intervals["alpha"]
+    assert low - 0.01 <= 0.8 <= high + 0.01
+    assert found.coefficients == pytest.approx({"a": 0.7, "b": 0.07}, rel=0.1)
+    assert found.comparison.offsets[0]["v"]["constant"] / found.coefficients["a"] == pytest.approx(3.7, rel=0.02)
+
+
+def test_another_run_gets_its_own_offset():
+    found = ftlm.identify(fractional_run(1, 0.5), ftlm.equation(WORDS, initial="rest"))
+    other = fractional_run(2, -2.0, name="other")
+    checked = found.validate([other])
+    assert checked.offsets[0]["y"]["constant"] == pytest.approx(-2.0, rel=0.05)
+    assert checked.fit_percent["y"] > 95
+    assert "offset in the equation of y in other (estimated on that run, for it alone): -" in str(checked)
+    assert found.resid(other).initial_terms == 1
+    # A simulation has none unless it is given.
+    free = found.model.simulate(other)
+    given = found.model.simulate(other, initial=checked.initial[0])
+    step = float(np.std(given["y"] - other["y"]))
+    assert step < 0.05 * np.std(other["y"]) < np.std(free["y"] - other["y"])
+    assert checked.initial[0]["y"][0.8] * gamma(1.8) == pytest.approx(checked.offsets[0]["y"]["constant"])
+
+
+def test_searches_find_orders_beside_an_offset(tmp_path):
+    run = fractional_run(7, 1.0, noise=0.001)
+    structure = ftlm.equation("D^alpha y = -a y + b u + c", initial="rest", orders={"alpha": "0.5:1.1:0.1"})
+    tables = [
+        ftlm.search_orders(run, structure, coefficients=how, store=tmp_path / how)
+        for how in ("least-squares", "multi-innovation", "instrumental-variables")
+    ]
+    assert [t.orders["alpha"] for t in tables] == [pytest.approx(0.8)] * 3
+    again = ftlm.resume_search(tmp_path / "least-squares")
+    assert next(iter(again.values())).table == tables[0].table
+    with pytest.raises(ftlm.DataError, match="another offset"):
+        ftlm.search_orders(
+            run, replace(structure, offset="none"), coefficients="least-squares", store=tmp_path / "least-squares"
+        )
+
+
+def test_two_mass_system_with_a_load_and_no_term_of_order_zero():
+    # D^2 y = -d D y + b u + c from SciPy: a load that nobody measured, and no term of order 0.
+    step, rows = 0.02, 1001
+    u = switched(rows, 8, every=20)
+    clock = np.arange(rows) * step
+    fine = np.arange((rows - 1) * 10 + 1) * step / 10
+    driven = np.repeat(u, 10)[: fine.size]
+    _, y, _ = lsim(([2.0], [1.0, 0.5, 0.0]), driven - 0.2, fine, interp=False)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y[::10][: clock.size]})
+    found = ftlm.identify(run, ftlm.equation("D^2 y = -d D y + b u + c", initial="rest"))
+    assert found.coefficients == pytest.approx({"d": 0.5, "b": 2.0}, rel=1e-2)
+    assert found.comparison.offsets[0]["y"]["constant"] == pytest.approx(-0.4, rel=2e-2)
+
+
+def test_words_say_an_offset_and_are_printed_back():
+    structure = ftlm.equation("D^1.5 y = -a y + b u + c")
+    assert structure.offset == "constant"
+    assert str(structure) == "D^1.5 y = -a y + b u + c"
+    assert ftlm.equation(str(structure)) == structure
+    assert str(ftlm.equation("D y = -c y + b u", offset="constant")) == "D^1 y = -c y + b u + c0"
+    assert ftlm.equation("D y = -c y + b u + c0").offset == "constant"
+    # As ever: another name alone is a signal, and so is c with a number.
+    assert ftlm.equation("D y = -a y + u").signals == ("y", "u")
+    assert ftlm.equation("D y = -a y + 1 c").signals == ("y", "c")
+    assert ftlm.flexible_link(stage=1, offset="constant").offset == "constant"
+    assert ftlm.equation("D x = a x + b u + c; D y = d y + e u + c", offset="ramp").offset == "ramp"
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: ftlm.equation("D y = -a y + 3.7"), "an offset is unknown: write '\\+ c'"),
+        (lambda: ftlm.equation("D y = -a y + 3.7 + b u"), "3.7 at character 14 is a constant without a signal"),
+        (lambda: ftlm.equation("D y = -a y - c"), "has a sign, but an unknown constant has its own"),
+        (lambda: ftlm.equation("D y = -a y + c + c0"), "stands there twice"),
+        (lambda: ftlm.equation("D x = a x + c; D y = b y"), "the equation of x has an offset, that of y has none"),
+        (lambda: ftlm.equation("D y = -a y + c", offset="none"), "has an offset, but offset='none'"),
+        (lambda: ftlm.equation("D y = -a y", offset="auto"), "use 'none', 'constant' or 'ramp'"),
+        (lambda: ftlm.equation("D^0.8 y = -a y + c", initial=(0.0, 0.8)), "leave 0.8 out of initial"),
+        (lambda: ftlm.equation("D^0.8 y = -a y", initial=(1.8,), offset="ramp"), "leave 1.8 out of initial"),
+    ],
+)
+def test_what_is_no_offset_is_refused_in_words(make, words):
+    with pytest.raises(ftlm.ModelError, match=words):
+        make()
+
+
+def test_an_offset_that_is_the_input_or_that_a_method_lacks_is_refused():
+    structure = ftlm.equation(WORDS, initial="rest")
+    step = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.ones(200)}, outputs={"y": 1 - np.exp(-0.1 * np.arange(200))})
+    for method in ("least-squares", "output-error"):
+        with pytest.raises(ftlm.DataError, match=r"u is constant on every run, so b u and the offset .* of y"):
+            ftlm.identify(step, structure, method=method)
+    with pytest.raises(ftlm.ModelError, match="the genetic baseline knows no offset"):
+        ftlm.identify(fractional_run(1, 0.5), structure, method="genetic", genetic=ftlm.Genetic(seeds=(1,)))
+    with pytest.raises(ftlm.ModelError, match="cannot be followed in a stream"):
+        Streaming(structure, step=0.1, longest=10.0, inputs=("u",))
+
+
+def test_a_model_keeps_its_offset_and_one_without_is_as_it_was(tmp_path):
+    run = fractional_run(1, 0.5)
+    for offset, schema in (("none", 2), ("constant", 3)):
+        model = ftlm.identify(run, ftlm.equation("D^0.8 y = -a y + b u", offset=offset)).model
+        file = model.save(tmp_path / f"{offset}.json")
+        held = json.loads(file.read_text())
+        assert (held["schema"], held.get("offset", "none")) == (schema, offset)
+        again = ftlm.load_model(file)
+        assert again.structure.offset == offset
+        assert ftlm.compare(again, run).output_error == ftlm.compare(model, run).output_error
+        assert str(again).endswith(" + c") == (offset == "constant")
+
+
+def test_the_command_line_and_the_report_tell_the_offset(tmp_path):
+    run = fractional_run(1, 0.5)
+    run.to_csv(tmp_path / "run.csv")
+    words = ["identify", str(tmp_path / "run.csv"), "--structure", "D^0.8 y = -a y + b u", "--initial", "rest"]
+    for more in (["--offset", "constant"], []):
+        said = CliRunner().invoke(cli.app, [*words, *more, "--json", "--report", str(tmp_path / "r.html"), "--force"])
+        assert said.exit_code == 0, said.output
+        page = (tmp_path / "r.html").read_text()
+        told = json.loads(said.stdout)
+        assert ("offsets" in told) == ("offset: constant" in page) == bool(more)
+        if more:
+            assert told["offsets"][0]["y"]["constant"] == pytest.approx(0.5, rel=0.05)
+            assert told["equations"]["y"].endswith(" + c")
+    wrong = CliRunner().invoke(cli.app, [*words, "--offset", "sometimes"])
+    assert wrong.exit_code == 2
+
+
+@pytest.mark.parametrize("kind", ["constant", "linear"])
+def test_detrending_is_that_of_numpy_and_said(kind, tmp_path):
+    run = fractional_run(1, 0.5)
+    clock = np.arange(run.length) * run.step
+    degree = 0 if kind == "constant" else 1
+    flat = run.detrend(kind)
+    for name in ("u", "y"):
+        expected = run[name] - np.polyval(np.polyfit(clock, run[name], degree), clock)
+        np.testing.assert_allclose(flat[name], expected, atol=1e-12)
+    assert len(flat.warnings) == 2
+    assert "subtracted from y" in flat.warnings[1]
+    only = run.detrend(kind, signals=["y"])
+    assert np.array_equal(only["u"], run["u"])
+    assert np.array_equal(only["y"], flat["y"])
+    run.to_csv(tmp_path / "run.csv")
+    words = ["identify", str(tmp_path / "run.csv"), "--structure", "D^0.8 y = -a y + b u", "--detrend", kind]
+    said = CliRunner().invoke(cli.app, [*words, "--method", "least-squares"])
+    assert said.exit_code == 0
+    assert flat.warnings[1] in said.output.replace("\n", " ")
+
+
+def test_detrending_refuses_in_words():
+    run = fractional_run(1, 0.5)
+    with pytest.raises(ftlm.DataError, match="use 'constant' or 'linear'"):
+        run.detrend("quadratic")
+    with pytest.raises(ftlm.DataError, match="'z'"):
+        run.detrend(signals=["z"])
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="measured data are not here; set FTLM_DATA")
+def test_the_hub_of_the_arm_runs_free_with_an_offset_of_the_current():
+    run = ftlm.load(
+        DATA / "two_link_lqr" / "lqr.csv", time="t_s", inputs={"I1": "Im1_cmd_A"},
+        outputs={"theta11": "th11_deg", "theta12": "th12_deg"}, units={"theta11": "deg", "theta12": "deg"},
+    )  # fmt: skip
+    structure = ftlm.equation("D^2 theta11 = -d D theta11 + b I1 + k theta12")
+    without, found = ftlm.identify(run, structure), ftlm.identify(run, structure, offset="constant")
+    assert without.fit_percent["theta11"] < 70
+    assert found.fit_percent["theta11"] > 85
+    assert found.information.bic < without.information.bic - 1000
