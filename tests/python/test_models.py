@@ -163,7 +163,7 @@ def test_equation_is_read(text, output, order, terms):
         ("D^1.5 y = a y +", 16, "expected the name of a signal at character 16, found 'the end'"),
         ("D^1.5 y = a y b u", 15, "expected '+', '-' or the end at character 15, found 'b'"),
         ("D^1.5 y = a y = b u", 15, "expected '+', '-' or the end at character 15, found '='"),
-        ("D^1.5 y = 3", 12, "expected the name of a signal at character 12, found 'the end'"),
+        ("D^1.5 y = 3", 11, "3 at character 11 is a constant without a signal"),
         ("D^1.5 y = a D^ + u", 16, "expected an order: a number, a name or (…) at character 16, found '+'"),
         # An order -u, and no signal after it.
         ("D^1.5 y = a D^- u + 1 y", 19, "expected the name of a signal at character 19, found '+'"),

@@ -128,8 +128,9 @@ def read_model(path: str | os.PathLike[str]) -> Solved:
         raise
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
-    if read.schema > OFFSET_SCHEMA or read.schema < 1:
-        raise DataError(f"{file} has schema {read.schema}, this version reads up to {OFFSET_SCHEMA}; upgrade ftlm")
+    latest = SCHEMA if read.offset is UNSET else OFFSET_SCHEMA
+    if read.schema > latest or read.schema < 1:
+        raise DataError(f"{file} has schema {read.schema}, this version reads up to {latest}; upgrade ftlm")
     try:
         return read.solved()
     except ModelError as error:

@@ -83,7 +83,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def difference(self, other: Request) -> str | None:
         """Say what sets another request apart, or None."""
-        if self.structure.offset != other.structure.offset:
+        if [r.offset for r in self.records] != [r.offset for r in other.records]:
             return "another offset"
         if self.records != other.records:
             return "other data"

@@ -53,6 +53,8 @@ class Job:
         records = tuple(RecordFile.of(r) for r in self.records)
         # Hints are not written: they tell a fit where to start and change no search.
         structure = replace(self.structure, hints=UNSET)
+        # The records say it, where there is one: what has none is written as it always was.
+        object.__setattr__(structure, "offset", UNSET)
         return Request(name, structure, dict(self.values), settings, records, self.runs, dict(self.units))
 
     @classmethod
@@ -64,7 +66,7 @@ class Job:
             raise ModelError(f"setting {error} is missing") from None
         settings = Settings.check(**kept | {"threads": threads, "early_stopping": bool(kept["early_stopping"])})
         records = [r.record() for r in request.records]
-        structure = request.structure
+        structure = replace(request.structure, offset=records[0].offset if records else "none")
         signals = structure.signals
         if not records or (len(structure.equations) != 1 and not structure.has_order_law):
             raise ModelError("it is not the search of one equation, or of some under a law, on a record")
