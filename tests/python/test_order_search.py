@@ -649,7 +649,7 @@ def test_control_c_ends_a_search(large):
         ({"threads": float("inf")}, "threads = inf is outside"),
         ({"innovation_length": 0}, "innovation length p = 0 is no whole number from 1"),
         ({"innovation_length": -7}, "innovation length p = -7 is no whole number from 1"),
-        ({"innovation_length": None}, "innovation length p = None is no whole number from 1"),
+        ({"innovation_length": "seven"}, "innovation length p = 'seven' is no whole number from 1"),
         ({"prior_covariance": 0}, "prior covariance K0 = 0 is not positive"),
         ({"prior_covariance": -1.0}, "prior covariance K0 = -1.0 is not positive"),
         ({"prior_covariance": float("nan")}, "prior covariance K0 = nan is not positive"),
