@@ -55,9 +55,9 @@ def test_without_noise_the_coefficients_are_those_of_the_system(words, system, t
     ("words", "system", "truth"), [(LEAD, LEAD_SYSTEM, LEAD_TRUTH), (SECOND, SECOND_SYSTEM, SECOND_TRUTH)]
 )
 def test_the_truth_lies_within_three_standard_errors(words, system, truth, intersample: str) -> None:
-    z = np.array([
-        scores(fit_output_error([sampled(system, 600, seed, intersample, 0.01)], words), truth) for seed in range(10)
-    ])
+    z = np.array(
+        [scores(fit_output_error([sampled(system, 600, seed, intersample, 0.01)], words), truth) for seed in range(10)]
+    )
     assert np.max(np.abs(z)) < 3.0
     # A bias of half an error, or errors of half the size, would show.
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.6
