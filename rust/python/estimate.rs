@@ -125,7 +125,7 @@ fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     let instants = (argument.5.iter())
         .map(|(values, held)| {
             let values = values.as_ref().map(|v| vector("signal at the samples", v)).transpose()?;
-            Ok(joint::Instant { values: values.map(Into::into), held: *held })
+            Ok(joint::Instant { values, held: *held })
         })
         .collect::<PyResult<Vec<_>>>()?;
     let experiment = experiment.with_instants(instants)?;

@@ -70,7 +70,8 @@ fn a_linear_problem_is_solved_like_its_normal_equations() {
     let gram: Vec<f64> = columns.iter().flat_map(|a| columns.iter().map(|b| dot(a, b))).collect();
     let rhs: Vec<f64> = columns.iter().map(|a| dot(a, &target)).collect();
     assert_eq!(found.status, Status::Converged);
-    check("linear least squares", distance(&found.point, &dense_solve(&gram, &rhs)), 1e-9);
+    // The gradient's cosine at which the search ends is the root of its tolerance.
+    check("linear least squares", distance(&found.point, &dense_solve(&gram, &rhs)), 1e-7);
 }
 
 #[test]

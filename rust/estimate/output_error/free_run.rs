@@ -1,7 +1,7 @@
 //! The free run of a model at a point, its residuals on every experiment, and the initial terms that are projected out.
 
 use super::experiment::Experiment;
-use super::feedthrough::Direct;
+use super::feedthrough::{Direct, Early};
 use super::model::{FreeModel, Point};
 use crate::dense;
 use crate::equation::Structure;
@@ -45,6 +45,8 @@ pub(super) struct Part {
     pub(super) shifted: Vec<(Vec<f64>, Vec<f64>)>,
     /// What feeds through at once.
     pub(super) direct: Option<Direct>,
+    /// What pulses see too early.
+    pub(super) early: Early,
 }
 
 /// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
@@ -119,7 +121,10 @@ impl FreeModel {
             .flat_map(|(y, w)| y[1..=experiment.compared()].iter().map(move |v| v * w))
             .collect();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
-        residuals.iter_mut().zip(experiment.sampled(&response)).for_each(|(e, v)| *e -= v);
+        let mut sampled = experiment.sampled(&response);
+        let early = Early::of(self, experiment, &shifted);
+        early.correct(self, experiment, point, &mut sampled)?;
+        residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
         let direct = Direct::of(self, experiment, structures, point, &shifted)?;
         if let Some(direct) = &direct {
             residuals.iter_mut().zip(direct.samples(experiment)).for_each(|(e, v)| *e -= v);
@@ -167,7 +172,7 @@ impl FreeModel {
         }
         out.residuals.extend(residuals);
         out.initial.push(initial);
-        out.parts.push(Part { matrix, inverse, operators, response, basis, shifted, direct });
+        out.parts.push(Part { matrix, inverse, operators, response, basis, shifted, direct, early });
         Ok(())
     }
 }

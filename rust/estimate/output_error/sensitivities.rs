@@ -113,6 +113,7 @@ impl FreeModel {
                 })
                 .collect();
             let mut column = experiment.sampled(&means);
+            part.early.correct_slope(self, experiment, point, parameter, &mut column)?;
             add_slope(self, experiment, part, point, parameter, &mut column);
             for direction in &part.basis {
                 let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
