@@ -27,7 +27,7 @@ def feasible(problem: FreeProblem, at: Floats, towards: Floats) -> Floats:
     room = np.maximum(room - np.minimum(margins, room), 0.0)
     step = towards - at
     active = np.zeros(room.size, dtype=bool)
-    for _ in range(room.size):
+    while True:
         blocked = (room <= ROUNDED) & (normals @ step < -1e-15) & ~active
         if not blocked.any():
             break
