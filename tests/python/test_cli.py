@@ -203,7 +203,7 @@ BAD = [
     (("identify", "square.csv", *SEARCH, "--slice", "5"), 2, "--slice"),
     (("identify", "square.csv", *SEARCH, "--slice", "5:4"), 3, "slice"),
     (("identify", "square.csv", *SEARCH, "--order", "alhpa=1.5"), 2, "alpha"),
-    (("identify", "square.csv", *SEARCH, "--order", "alpha=3.5"), 2, "3.5"),
+    (("identify", "square.csv", *SEARCH, "--order", "alpha=10.5"), 2, "10.5"),
     (("identify", "square.csv", *SEARCH, "--fixed", "a1=x"), 2, "'x'"),
     (("identify", "square.csv", *SEARCH, "--delay", "u=-1"), 2, "delay"),
     (("identify", "square.csv", *SEARCH, "--initial", "sleepy"), 2, "sleepy"),

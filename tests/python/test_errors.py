@@ -48,14 +48,14 @@ MODEL, DATA, CONVERGENCE = ftlm.ModelError, ftlm.DataError, ftlm.ConvergenceErro
 BAD = {
     # Orders
     "alpha of 0": (MODEL, "order alpha = 0 of y", lambda: ftlm.equation("D^0 y = a u")),
-    "alpha above 3": (MODEL, "order alpha = 3.01 of y", lambda: ftlm.equation("D^3.01 y = a u")),
+    "alpha above 10": (MODEL, "order alpha = 10.01 of y", lambda: ftlm.equation("D^10.01 y = a u")),
     "alpha below 0": (MODEL, "order alpha = -1 of y", lambda: ftlm.equation("D^(-1) y = a u")),
-    "alpha above 3 in a lattice": (MODEL, "order alpha = 3.5", lambda: ftlm.lattice(alpha=(1.0, 3.5))),
+    "alpha above 10 in a lattice": (MODEL, "order alpha = 10.5", lambda: ftlm.lattice(alpha=(1.0, 10.5))),
     "alpha of 0 in a lattice": (MODEL, "alpha interval 0:2", lambda: ftlm.lattice(alpha=(0.0, 2.0))),
-    "alpha above 3 by name": (
+    "alpha above 10 by name": (
         MODEL,
-        "order alpha = 4",
-        lambda: ftlm.equation(WORDS, orders={"alpha": 4.0}),
+        "order alpha = 11",
+        lambda: ftlm.equation(WORDS, orders={"alpha": 11.0}),
     ),
     "own order at alpha": (
         MODEL,
@@ -236,10 +236,10 @@ BAD = {
         "x has length 3, but 4 is needed",
         lambda: ftlm.fractional_derivative([1.0, 2.0, 3.0], 1.5, step=1, definition="caputo"),
     ),
-    "order of an operator above 3": (
+    "order of an operator above 10": (
         MODEL,
-        "order = 3.5 is outside [0, 3]",
-        lambda: ftlm.fractional_integral(Y, 3.5, step=1),
+        "order = 10.5 is outside [0, 10]",
+        lambda: ftlm.fractional_integral(Y, 10.5, step=1),
     ),
     "order of an operator below 0": (
         MODEL,
@@ -248,7 +248,7 @@ BAD = {
     ),
     "order of an operator NaN": (
         MODEL,
-        "order = NaN is outside [0, 3]",
+        "order = NaN is outside [0, 10]",
         lambda: ftlm.block_pulse_matrix(math.nan, 4, 1.0),
     ),
     "order of an operator in words": (

@@ -71,7 +71,8 @@ def test_standard_errors_wider_than_the_bounds_say_so(noisy):
         covariance = joint.covariance.copy()
         covariance[0, 0] = value
         words = _uncertain(replace(joint, covariance=covariance), problem)
-        assert "order alpha cannot be told from these runs: its standard error exceeds its bounds" in words, value
+        said = "these runs do not tell alpha apart" if value == np.inf else "order alpha cannot be told from these runs"
+        assert any(w.startswith(said) for w in words), value
 
 
 def test_correlated_numbers_are_told_apart_where_each_is_known(noisy):

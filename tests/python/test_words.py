@@ -53,7 +53,7 @@ GIVEN = {
     "executor": (object(), None),
 }
 #: What belongs to every method: what is identified, on which grid, with how much of the machine.
-EVERYONE = {"runs", "structure", "method", "m", "threads", "progress"}
+EVERYONE = {"runs", "structure", "method", "offset", "m", "threads", "progress"}
 
 
 def test_the_table_knows_every_option_of_identify():

@@ -191,7 +191,7 @@ fn improper_filters_are_refused() {
     let mut filter = low_pass();
     filter.numerator.push((1.0, 2.5));
     assert!(matches!(filter.series(10, 0.1), Err(Error::OutOfRange { value, .. }) if value == 2.5));
-    let steep = Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 3.5)] };
+    let steep = Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0, 10.5)] };
     assert!(matches!(steep.series(10, 0.1), Err(Error::OutOfRange { .. })));
     let negative = Filter { numerator: vec![(1.0, -0.5)], denominator: vec![(1.0, 1.0)] };
     assert!(matches!(negative.series(10, 0.1), Err(Error::OutOfRange { .. })));

@@ -121,7 +121,7 @@ fn the_operational_matrix_integrates_haar_coefficients() {
 
 #[test]
 fn operational_matrices_refuse_bad_arguments() {
-    for (eta, step) in [(-0.1, 0.1), (3.1, 0.1), (f64::NAN, 0.1), (0.5, 0.0), (0.5, -1.0), (0.5, f64::INFINITY)] {
+    for (eta, step) in [(-0.1, 0.1), (10.1, 0.1), (f64::NAN, 0.1), (0.5, 0.0), (0.5, -1.0), (0.5, f64::INFINITY)] {
         for made in [
             operational::block_pulse_matrix(eta, 8, step),
             operational::operational_matrix(eta, 8, step),

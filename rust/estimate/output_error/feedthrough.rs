@@ -5,7 +5,6 @@
 //! with δ = s(t⁺) less that mean: half a jump of a held signal, a quarter of the second difference of a linear one.
 
 use super::experiment::Experiment;
-use super::free_run::Part;
 use super::model::{FreeModel, Point};
 use crate::equation::Structure;
 use crate::error::Result;
@@ -129,12 +128,11 @@ impl Direct {
 pub(super) fn add_slope(
     model: &FreeModel,
     experiment: &Experiment,
-    part: &Part,
+    direct: &Direct,
     point: &Point,
     parameter: usize,
     column: &mut [f64],
 ) {
-    let Some(direct) = &part.direct else { return };
     let (orders, numbers) = (point.orders.len(), point.orders.len() + point.coefficients.len());
     if parameter < orders {
         return;

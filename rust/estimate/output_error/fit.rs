@@ -187,5 +187,13 @@ fn check_start(model: &FreeModel, start: &Point) -> Result<()> {
         }
     }
     check_finite("orders of the start", &start.orders)?;
-    check_finite("delays of the start", &start.delays)
+    match start.delays.iter().position(|v| !v.is_finite()) {
+        None => Ok(()),
+        Some(index) => Err(Error::OutOfRange {
+            name: format!("start of delay {index}"),
+            value: start.delays[index],
+            range: "times within its bounds".into(),
+            remedy: "start each delay at a finite time [s]".into(),
+        }),
+    }
 }

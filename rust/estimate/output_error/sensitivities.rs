@@ -114,7 +114,9 @@ impl FreeModel {
                 .collect();
             let mut column = experiment.sampled(&means);
             part.early.correct_slope(self, experiment, point, parameter, &mut column)?;
-            add_slope(self, experiment, part, point, parameter, &mut column);
+            if let Some(direct) = &part.direct {
+                add_slope(self, experiment, direct, point, parameter, &mut column);
+            }
             for direction in &part.basis {
                 let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
                 column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
