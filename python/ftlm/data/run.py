@@ -83,7 +83,8 @@ class Run(Measured):
             What reports call this run.
         resample : float, optional
             Interpolate onto this step [s]: held inputs by the mean of the hold over each new interval, everything
-            else linearly. Recorded in `warnings`.
+            else linearly. Recorded in `warnings`. Intervals of estimates do not know what this costs: times that
+            jitter by 30 % of a step moved the order of a plant with 1 % noise by one standard error.
         slice : pair of float or None, optional
             Use the rows with a ≤ t < b only, [s] since the first row; applied before any other check of the rows.
         time_unit : {"s", "ms", "us", "min", "h"}, default "s"
