@@ -1,17 +1,14 @@
 """Advice on runs: every injected fault is found, clean runs raise no alarm, measured runs get what is true of them."""
 
 import json
-import os
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import ftlm
 from ftlm.data.advice import spectral_lines
+from measured import DATA, needs_data
 
-DATA = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="measured data are not here; set FTLM_DATA")
 ARM = {
     "time": "t_s",
     "inputs": {"I1": "Im1_meas_A", "I2": "Im2_meas_A"},

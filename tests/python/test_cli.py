@@ -15,9 +15,7 @@ import numpy as np
 import pytest
 
 import ftlm
-
-DATA = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2].parent / "shared" / "data"))
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="measured data are not here; set FTLM_DATA")
+from measured import DATA, needs_data
 
 
 def ftlm_command(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 import ftlm
 from ftlm.fit.extrapolation import LEAST_INTEGRATION, feasible
 from ftlm.fit.problem import FreeProblem
+from measured import DATA, needs_data
 
 WORDS = "D^alpha y = d D^mu y + a y + c D^gamma u + b u"
-DATA = os.environ.get("FTLM_DATA")
 
 
 def holds(problem: FreeProblem, values: np.ndarray) -> bool:
@@ -68,9 +64,9 @@ def test_a_bound_that_already_binds_is_kept_alone() -> None:
     np.testing.assert_allclose(found, [1.5, -1.1, 2.2], rtol=1e-12)
 
 
-@pytest.mark.skipif(not DATA, reason="FTLM_DATA, the folder of measured records, is not set")
+@needs_data
 def test_the_robot_arm_becomes_a_model() -> None:
-    torque, acceleration = np.loadtxt(Path(str(DATA)) / "robot_arm" / "robot_arm.dat").T
+    torque, acceleration = np.loadtxt(DATA / "robot_arm" / "robot_arm.dat").T
     run = ftlm.Run.from_arrays(inputs={"u": torque}, outputs={"y": acceleration}, step=1.0)
     found = ftlm.identify(run, ftlm.equation(WORDS))
     assert found.orders["gamma"] <= found.orders["alpha"]

@@ -6,7 +6,6 @@ import os
 import struct
 import warnings
 import zlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,8 +17,8 @@ from ftlm.data.run import Run
 from ftlm.errors import DataError
 from ftlm.files import apart
 from ftlm.files.load import load
+from measured import DATA
 
-DATA = Path(os.environ.get("FTLM_DATA") or Path(__file__).resolve().parents[2].parent / "shared" / "data")
 PSF = DATA / "two_link_psf"
 SIGNALS = {"inputs": {"u": "c2"}, "outputs": {"y": "c3"}}
 HEADED = {"inputs": ["u"], "outputs": ["y"]}

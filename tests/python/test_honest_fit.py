@@ -1,16 +1,12 @@
 """The printed fit is that of the printed model: sample by sample, as SciPy and the model's own simulation have it."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy import signal
 
 import ftlm
 from ftlm.judge.comparison import compare_means
-
-DATA = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
+from measured import DATA
 
 
 def commands(rows, seed, hold=4):

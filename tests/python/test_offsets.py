@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 from dataclasses import replace
 from math import gamma
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +15,8 @@ import ftlm
 import oracles
 from ftlm import cli
 from ftlm.fit.streaming import Streaming
+from measured import DATA, needs_data
 
-DATA = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 WORDS = "D^0.8 y = -a y + b u + c"
 TRUTH = {"a": 0.7, "b": 1.4}
 
@@ -305,7 +303,7 @@ def test_detrending_refuses_in_words():
         run.detrend(signals=["z"])
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="measured data are not here; set FTLM_DATA")
+@needs_data
 def test_the_hub_of_the_arm_runs_free_with_an_offset_of_the_current():
     run = ftlm.load(
         DATA / "two_link_lqr" / "lqr.csv", time="t_s", inputs={"I1": "Im1_cmd_A"},

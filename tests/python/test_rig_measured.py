@@ -1,8 +1,6 @@
 """The virtual rig beside measured runs of the real arm under the same currents: steps, noise levels, spectra."""
 
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +8,8 @@ from scipy import signal
 
 import ftlm
 from ftlm import rig
+from measured import DATA
 
-DATA = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[3] / "shared" / "data"))
 ANGLES = ("theta11", "theta12", "theta21", "theta22")
 #: Bands of the arm's motion and of the sensors' noise [Hz].
 MOTION, NOISE = [(0.2, 1.0), (1.0, 1.5), (1.5, 2.0), (2.0, 3.0), (3.0, 5.0)], [(80.0, 160.0)]
