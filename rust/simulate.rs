@@ -211,7 +211,7 @@ pub fn respond_with_initial(
     let exponents: Vec<Vec<f64>> = equations.iter().map(|e| e.structure.initial_exponents(initial)).collect();
     let through = |mut outputs: Vec<Vec<f64>>| {
         if let Some(filter) = filter {
-            for (output, _) in outputs.iter_mut().zip(filter.applies).filter(|(_, &applies)| applies) {
+            for (output, _) in outputs.iter_mut().zip(filter.applies).filter(|&(_, &applies)| applies) {
                 *output = series::multiply(filter.series, output, record.m());
             }
         }

@@ -103,7 +103,7 @@ _Part: TypeAlias = tuple[
     tuple[int, int, int, int, int, int, int],
     Sequence[tuple[int, bool]],
 ]
-_Checkpoint: TypeAlias = tuple[tuple[int, int, int, int, float], _Part]
+_Checkpoint: TypeAlias = tuple[tuple[int, int, int, int, float, int], bool, _Part]
 
 #: equation, first candidate, the one behind the last, limit
 _Span: TypeAlias = tuple[int, int, int, float]

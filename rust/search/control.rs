@@ -29,6 +29,7 @@ impl Control {
         let mut slot = self.checkpoint.lock().unwrap_or_else(PoisonError::into_inner);
         if let Some(missed) = slot.take() {
             checkpoint.part.rows.extend(missed.part.rows);
+            checkpoint.anew |= missed.anew;
         }
         *slot = Some(checkpoint);
     }
@@ -71,18 +72,25 @@ pub struct Place {
     pub size: u64,
     /// The limit of that batch.
     pub limit: f64,
+    /// Digest of the order in which the round's open candidates are visited, below 2^63; 0 where `end` is.
+    pub order: u64,
 }
 
 impl Place {
     /// Before a round.
     pub(crate) fn start(round: u64) -> Self {
-        Self { round, followed: 0, end: 0, size: 0, limit: f64::INFINITY }
+        Self { round, followed: 0, end: 0, size: 0, limit: f64::INFINITY, order: 0 }
     }
 
-    /// Whether a search may stand here in a round with so many candidates to follow.
-    pub(crate) fn fits(&self, open: u64) -> bool {
+    /// Whether a search may stand here.
+    pub(crate) fn sound(&self) -> bool {
         let begun = self.end == 0 || (self.size > 0 && self.limit >= 0.0);
-        begun && self.followed <= self.end && self.end <= open
+        begun && self.followed <= self.end
+    }
+
+    /// Whether this lies before a round, or in one that visits so many open candidates in the order of this digest.
+    pub(crate) fn fits(&self, open: u64, order: u64) -> bool {
+        self.end == 0 || (self.end <= open && self.order == order)
     }
 }
 
@@ -91,6 +99,8 @@ impl Place {
 pub struct Checkpoint {
     /// Where it stands.
     pub place: Place,
+    /// Whether this is the first one of a stretch that was begun at its start: what was kept of it before does not count.
+    pub anew: bool,
     /// What it came to so far. A checkpoint that is taken holds only the rows found since the one before; one to go on
     /// from must hold all of them.
     pub part: Part,

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import json
+import math
 import os
 import resource
 import signal
@@ -21,7 +22,8 @@ import store as bench
 from ftlm import _core
 from ftlm.data.settings import Settings
 from ftlm.errors import ModelError
-from ftlm.search.contents import read_store
+from ftlm.search import frames
+from ftlm.search.contents import Section, contents_of, read_store
 from ftlm.search.frames import MAGIC, Joined, Rounds, Verdicts
 from ftlm.search.orders import make_job
 from ftlm.search.store import Store
@@ -65,7 +67,7 @@ def job_of(run, structure, lattice, *, m, keep=20, early_stopping=True):
 
 def rows_of(contents):
     parts = [frame.part for frame in contents.sections[0].done.values()]
-    parts += [half.checkpoint[1] for half in contents.sections[0].open.values()]
+    parts += [half.checkpoint[2] for half in contents.sections[0].open.values()]
     return [row for rows, _, _ in parts for row in rows]
 
 
@@ -263,6 +265,41 @@ def test_a_store_cut_at_any_byte_holds_only_right_rows_and_goes_on(run, whole, e
         if size >= begun:
             path.write_bytes(whole[: size - 1] if size > begun else whole[:size])
             assert bytes_of(ftlm.resume_search(path)["y"]) == expected
+
+
+@pytest.mark.parametrize("order", [0, 12345])
+def test_a_half_done_stretch_of_another_visiting_order_is_done_again(run, whole, expected, tmp_path, order):
+    """Its candidates would be followed twice or never: the table is that of an uninterrupted search all the same."""
+    _, digest, end = frames.next_frame(memoryview(whole), len(MAGIC), bytes(frames.DIGEST))
+    _, (wave, *_) = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32).equation_work().plan()
+    found = contents_of("whole", memoryview(whole)).sections[0].done[0].part
+    # A row that would win, were it believed.
+    rows = ((found[0][0][0], 0.0, *found[0][0][2:]),)
+    place = (0, 5, 256, 256, math.inf)
+    begun = frames.Begun(0, 0, wave, place, rows, (0, 0, 5, 0, 0, 0, 0), (), order)
+    path = tmp_path / "half.ftlm"
+    path.write_bytes(whole[:end] + frames.framed(frames.ENCODER.encode(begun), end, digest)[0])
+    assert read_store(path).sections[0].open[0].order == order
+    assert bytes_of(search(run, path)) == expected
+    section = read_store(path).sections[0]
+    assert not section.open
+    assert section.dealt == sum(sum(f.part[1][1:]) for f in section.done.values()) > 0
+
+
+def test_what_stood_before_a_stretch_was_begun_anew_does_not_count():
+    section = Section()
+    row = (3, 1.0, (1.0, 2.0, 3.0), ((),))
+    counts = (0, 0, 5, 0, 0, 0, 0)
+    first = frames.Begun(0, 0, 2, (1, 5, 256, 256, 1.0), (row,), counts, ((7, False),), 9, True)
+    section.take(first)
+    section.take(msgspec.structs.replace(first, rows=((4, *row[1:]),), failures=None, anew=False))
+    assert [r[0] for r in section.open[0].rows] == [3, 4]
+    assert section.open[0].failures == ((7, False),)
+    assert section.open[0].checkpoint[0] == (1, 5, 256, 256, 1.0, 9)
+    section.take(msgspec.structs.replace(first, rows=((5, *row[1:]),), failures=()))
+    assert [r[0] for r in section.open[0].rows] == [5]
+    assert section.open[0].failures == ()
+    assert section.dealt == 5
 
 
 @pytest.mark.parametrize("mask", [0xFF, 0x01])
@@ -806,17 +843,18 @@ def test_the_core_refuses_checkpoints_and_parts_of_another_search(run):
     for first, last, start in (
         (0, 6, None),
         (3, 2, None),
-        (0, 1, ((2, 0, 0, 0, 1.0), ((), counts, ()))),
-        (0, 1, ((0, 5, 4, 256, 1.0), ((), counts, ()))),
-        (0, 1, ((0, 0, 5000, 256, 1.0), ((), counts, ()))),
-        (0, 1, ((0, 0, 256, 0, 1.0), ((), counts, ()))),
-        (0, 1, ((0, 0, 256, 256, float("nan")), ((), counts, ()))),
-        (0, 1, ((0, 0, 0, 0, 1.0), (((3, 1.0, (1.0,), ((),)),), counts, ()))),
-        (0, 1, ((0, 0, 0, 0, 1.0), (((1 << 60, 1.0, (1.0, 2.0, 3.0), ((),)),), counts, ()))),
+        (0, 1, ((2, 0, 0, 0, 1.0, 0), False, ((), counts, ()))),
+        (0, 1, ((0, 5, 4, 256, 1.0, 0), False, ((), counts, ()))),
+        (0, 1, ((0, 0, 256, 0, 1.0, 0), False, ((), counts, ()))),
+        (0, 1, ((0, 0, 256, 256, float("nan"), 0), False, ((), counts, ()))),
+        (0, 1, ((0, 0, 0, 0, 1.0, 0), False, (((3, 1.0, (1.0,), ((),)),), counts, ()))),
+        (0, 1, ((0, 0, 0, 0, 1.0, 0), False, (((1 << 60, 1.0, (1.0, 2.0, 3.0), ((),)),), counts, ()))),
     ):
         with pytest.raises(ftlm.ModelError, match="start the search again"):
             ready.rounds(first, last, [], start, 1, None, None)
     part = ready.rounds(0, 1, [], None, 1, None, None)
+    # One that lies in a round of another visiting order is left for the start of its stretch.
+    assert ready.rounds(0, 1, [], ((0, 0, 5000, 256, 1.0, 0), False, ((), counts, ())), 1, None, None) == part
     for parts in ([], [part], [part] * 5, [(((1 << 40, *row[1:]),), counts, ())], [((), (19_295, *counts[1:]), ())]):
         with pytest.raises(ftlm.ModelError, match="start the search again"):
             work.join(parts)

@@ -314,7 +314,7 @@ fn relaxation_means_have_the_stated_errors() {
             let worst = counts(&means["k"])
                 .iter()
                 .zip(numbers(&means["mean"]))
-                .filter(|(&k, _)| (k as f64 - 0.5) * h > 1.0)
+                .filter(|&(&k, _)| (k as f64 - 0.5) * h > 1.0)
                 .fold(0.0, |worst, (&k, mean)| f64::max(worst, (found[0][k - 1] - mean).abs()));
             check_between(
                 &format!("error of D^{alpha} y + 2y = 2 at {m}, of the stated one"),

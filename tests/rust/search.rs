@@ -790,6 +790,17 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
                 if let Some(mut checkpoint) = control.take() {
                     rows.append(&mut checkpoint.part.rows);
                     checkpoint.part.rows.clone_from(&rows);
+                    if stopped == 1 {
+                        // One of another visiting order is of no use: neither a candidate missed nor one met twice.
+                        let mut other = checkpoint.clone();
+                        other.place.order ^= 1;
+                        let control = Control::default();
+                        control.saving.store(true, Relaxed);
+                        assert_eq!(run(&ready, Some(other), &control).unwrap(), whole);
+                        assert_eq!(control.done.load(Relaxed), whole.counts.done());
+                        assert!(control.take().is_some_and(|first| first.anew));
+                    }
+                    assert_eq!(checkpoint.anew, from.is_none());
                     from = Some(checkpoint);
                 }
             };

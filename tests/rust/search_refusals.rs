@@ -143,7 +143,7 @@ fn rounds_refuse_what_belongs_to_another_search() {
         let found = ready.rounds(first, last, seed, from, &pool, &control);
         assert!(matches!(found, Err(Error::Structure { .. })), "{found:?}");
     };
-    let place = Place { round: 0, followed: 0, end: 0, size: 0, limit: f64::INFINITY };
+    let place = Place { round: 0, followed: 0, end: 0, size: 0, limit: f64::INFINITY, order: 0 };
     assert_eq!(rounds(lattice.count(), &options), 1);
     refused(0, 2, &[], None);
     refused(1, 0, &[], None);
@@ -151,20 +151,19 @@ fn rounds_refuse_what_belongs_to_another_search() {
     refused(0, 1, &[(lattice.count(), 1.0)], None);
     refused(0, 1, &[(0, f64::NAN)], None);
     refused(0, 1, &[(0, -1.0)], None);
-    let at = |place| Some(Checkpoint { place, part: Part::default() });
+    let at = |place| Some(Checkpoint { place, anew: false, part: Part::default() });
     for place in [
         Place { round: 2, ..place },
         Place { followed: 1, ..place },
         Place { end: 1, ..place },
+        Place { end: 1, size: 1, followed: 2, ..place },
         Place { end: 1, size: 1, limit: f64::NAN, ..place },
         Place { end: 1, size: 1, limit: -1.0, ..place },
-        Place { end: 1, size: 1, followed: 2, ..place },
-        Place { end: u64::MAX, size: u64::MAX, ..place },
     ] {
         refused(0, 1, &[], at(place));
     }
     let row = |index, score, width| Row { index, score, coefficients: vec![0.0; width], initial: vec![vec![]] };
-    let with = |part| Some(Checkpoint { place, part });
+    let with = |part| Some(Checkpoint { place, anew: false, part });
     for row in [row(lattice.count(), 1.0, 2), row(0, 1.0, 3), row(0, f64::NAN, 2)] {
         refused(0, 1, &[], with(Part { rows: vec![row], ..Part::default() }));
     }
@@ -172,6 +171,11 @@ fn rounds_refuse_what_belongs_to_another_search() {
     let counts = Counts { beaten: u64::MAX, ..Counts::default() };
     refused(0, 1, &[], with(Part { counts, ..Part::default() }));
     assert!(ready.rounds(0, 1, &[(0, 1.0)], at(place), &pool, &control).is_ok());
+    // A place in a round of another visiting order is left for the start of its stretch.
+    let whole = ready.rounds(0, 1, &[], None, &pool, &control).unwrap();
+    for place in [Place { end: u64::MAX, size: u64::MAX, ..place }, Place { end: 1, size: 1, order: 1, ..place }] {
+        assert_eq!(ready.rounds(0, 1, &[], at(place), &pool, &control).unwrap(), whole);
+    }
 }
 
 #[test]

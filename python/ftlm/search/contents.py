@@ -20,6 +20,7 @@ class Half:
 
     last: int
     place: frames.Place
+    order: int
     rows: list[frames.Row]
     counts: frames.Counts
     failures: frames.Failures
@@ -27,7 +28,7 @@ class Half:
     @property
     def checkpoint(self) -> frames.Checkpoint:
         """Where to go on, as the core takes it."""
-        return self.place, (tuple(self.rows), self.counts, self.failures)
+        return (*self.place, self.order), False, (tuple(self.rows), self.counts, self.failures)
 
 
 @dataclass
@@ -72,9 +73,9 @@ class Section:
         _, followed, end, size, limit = frame.place
         if not (followed <= end and size >= (end > 0) and not math.isnan(limit)):
             raise ModelError(f"rounds {frame.first} to {frame.last} stand nowhere")
-        if half is None:
-            half = self.open[frame.first] = Half(frame.last, frame.place, [], frame.counts, ())
-        half.place, half.counts = frame.place, frame.counts
+        if half is None or frame.anew:
+            half = self.open[frame.first] = Half(frame.last, frame.place, frame.order, [], frame.counts, ())
+        half.place, half.order, half.counts = frame.place, frame.order, frame.counts
         half.rows.extend(frame.rows)
         half.failures = half.failures if frame.failures is None else frame.failures
 

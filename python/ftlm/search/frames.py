@@ -29,8 +29,8 @@ Failures = tuple[tuple[Natural, bool], ...]
 Part = tuple[tuple[Row, ...], Counts, Failures]
 #: Round, candidates followed, end and length of the batch, its limit.
 Place = tuple[Natural, Natural, Natural, Natural, float]
-#: Where to go on with a stretch that is half done.
-Checkpoint = tuple[Place, Part]
+#: Where to go on with a stretch that is half done: also the digest of the visiting order, and whether it was begun anew.
+Checkpoint = tuple[tuple[Natural, Natural, Natural, Natural, float, Natural], bool, Part]
 #: Equation, first candidate, the one behind the last, limit.
 Span = tuple[int, int, int, float]
 #: What candidates under an order law came to: values and kinds (see :class:`Verdicts`).
@@ -106,7 +106,11 @@ class Requests(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="req
 
 
 class Begun(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progress"):
-    """A stretch of rounds, half done; rows are those found since the frame before, failures None where unchanged."""
+    """A stretch of rounds, half done; rows are those found since the frame before, failures None where unchanged.
+
+    Where the stretch was begun anew, frames before do not count. Order is the digest of the order in which the round is
+    visited; 0, which older stores mean, is that of none.
+    """
 
     search: Natural
     first: Natural
@@ -115,6 +119,8 @@ class Begun(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="progre
     rows: tuple[Row, ...]
     counts: Counts
     failures: Failures | None
+    order: Natural = 0
+    anew: bool = False
 
 
 class Rounds(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="rounds"):

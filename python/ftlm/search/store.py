@@ -25,6 +25,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import cast
 
 import msgspec
 
@@ -189,10 +190,12 @@ class Store:
     def save(self, search: int, first: int, last: int, checkpoint: frames.Checkpoint | None) -> None:
         """Note how far a stretch of rounds is; it is written with others, or when it is time."""
         if checkpoint is not None:
-            place, (rows, counts, failures) = checkpoint
+            (*place, order), anew, (rows, counts, failures) = checkpoint
             before = self._waiting.get((search, first))
             rows = (*(before.rows if before else ()), *rows)
-            self._waiting[search, first] = frames.Begun(search, first, last, place, rows, counts, failures)
+            anew = anew or (before is not None and before.anew)
+            told = cast("frames.Place", tuple(place))
+            self._waiting[search, first] = frames.Begun(search, first, last, told, rows, counts, failures, order, anew)
         if time.monotonic() - self._last >= INTERVAL:
             self.flush()
 
@@ -200,7 +203,7 @@ class Store:
         """Write what waits."""
         due = []
         for key, frame in self._waiting.items():
-            same = self._failures.get(key) == frame.failures
+            same = not frame.anew and self._failures.get(key) == frame.failures
             due.append(msgspec.structs.replace(frame, failures=None) if same else frame)
             self._failures[key] = frame.failures
         self._waiting.clear()

@@ -139,7 +139,7 @@ pub fn step(
             });
         }
         let mut places: Vec<usize> = (0..free.len()).collect();
-        for (place, &(_, i)) in kept.iter().enumerate().filter(|(_, &(record, _))| record == r) {
+        for (place, &(_, i)) in kept.iter().enumerate().filter(|&(_, &(record, _))| record == r) {
             let column = product(filter, source.initial[i], m, scratch);
             psi.push(column.clone());
             phi.push(column);

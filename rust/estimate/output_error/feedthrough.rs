@@ -78,7 +78,7 @@ impl Direct {
         which: impl Fn(&'a (Vec<f64>, Vec<f64>)) -> &'a [f64],
     ) {
         for (i, row) in self.terms.iter().enumerate() {
-            for (k, _) in row.iter().enumerate().filter(|(_, &at_once)| at_once) {
+            for (k, _) in row.iter().enumerate().filter(|&(_, &at_once)| at_once) {
                 let signal = model.equations[i].terms[k].0;
                 let (c, unknown) = (weight(i, k), model.unknown(i, signal));
                 let series = match (unknown, &self.lacking[signal]) {

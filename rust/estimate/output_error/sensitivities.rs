@@ -104,7 +104,7 @@ impl FreeModel {
             let means: Vec<Vec<f64>> = inverse
                 .iter()
                 .map(|row| {
-                    for (i, _) in moves.iter().enumerate().filter(|(_, &moves)| moves) {
+                    for (i, _) in moves.iter().enumerate().filter(|&(_, &moves)| moves) {
                         target.add_product(&rights[i], &row[i]);
                     }
                     let mut means = vec![0.0; m];

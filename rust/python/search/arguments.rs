@@ -185,8 +185,8 @@ type RowArg = (u64, f64, Vec<f64>, Vec<Vec<f64>>);
 type CountsArg = (u64, u64, u64, u64, u64, u64, u64);
 /// Rows, counts, (index, whether diverged rather than singular) of failures.
 pub type PartArg = (Vec<RowArg>, CountsArg, Vec<(u64, bool)>);
-/// (round, followed, end, size, limit) and what the stretch came to.
-pub type CheckpointArg = ((u64, u64, u64, u64, f64), PartArg);
+/// (round, followed, end, size, limit, order), whether the stretch was begun anew, and what it came to.
+pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 
 /// What rounds came to, as Python keeps it.
 pub fn part_of(part: Part) -> PartArg {
@@ -215,14 +215,14 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
 }
 
 /// A checkpoint from what Python kept.
-pub fn checkpoint(((round, followed, end, size, limit), found): CheckpointArg) -> Checkpoint {
-    Checkpoint { place: Place { round, followed, end, size, limit }, part: part(found) }
+pub fn checkpoint(((round, followed, end, size, limit, order), anew, found): CheckpointArg) -> Checkpoint {
+    Checkpoint { place: Place { round, followed, end, size, limit, order }, anew, part: part(found) }
 }
 
 /// A checkpoint as Python keeps it.
 pub fn checkpoint_of(checkpoint: Checkpoint) -> CheckpointArg {
     let p = checkpoint.place;
-    ((p.round, p.followed, p.end, p.size, p.limit), part_of(checkpoint.part))
+    ((p.round, p.followed, p.end, p.size, p.limit, p.order), checkpoint.anew, part_of(checkpoint.part))
 }
 
 /// (equation, first candidate, the one behind the last, limit).

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use crate::error::Result;
 use crate::search::candidate::problem::Scratch;
 use crate::search::catalogue::Catalogue;
-use crate::search::control::{another, Checkpoint, Control, Place};
+use crate::search::control::{Checkpoint, Control, Place};
 use crate::search::lattice::cursor::Cursor;
 use crate::search::outcome::{Failure, Kept, Part, Row, Verdict, LISTED};
 use crate::search::screen::{by_guess, screen, Open};
@@ -31,19 +31,22 @@ pub(super) struct Hunt<'a> {
     scratches: PerThread<Scratch>,
     /// Of the rounds done, and of the candidates done in this one but for its rows.
     pub(super) part: Part,
+    /// Whether the next checkpoint is the first one of a stretch begun at its start.
+    pub(super) anew: bool,
 }
 
 impl<'a> Hunt<'a> {
     pub(super) fn new(catalogue: &'a Catalogue<'a>, pool: &'a rayon::ThreadPool, control: &'a Control) -> Self {
-        Self { catalogue, pool, control, scratches: PerThread::new(pool), part: Part::default() }
+        Self { catalogue, pool, control, scratches: PerThread::new(pool), part: Part::default(), anew: true }
     }
 
     pub(super) fn check_stop(&self) -> Result<()> {
         self.control.check_stop()
     }
 
-    /// Screens a round and follows what is open, from a place on: its rows.
-    pub(super) fn round(&mut self, bounds: (u64, u64), kept: &mut Kept, place: Place) -> Result<()> {
+    /// Screens a round and follows what is open, from a place on: its rows. False where the place lies in a round that
+    /// visits its candidates in another order, as one of another kind of processor may.
+    pub(super) fn round(&mut self, bounds: (u64, u64), kept: &mut Kept, mut place: Place) -> Result<bool> {
         let (start, end) = bounds;
         let (limit, resumed) = (kept.limit, place.end > 0);
         let (catalogue, control) = (self.catalogue, self.control);
@@ -71,18 +74,19 @@ impl<'a> Hunt<'a> {
             open.extend(found);
             singular.extend(failed);
         }
+        by_guess(&mut open);
+        let order = digest(&open);
+        if !place.fits(open.len() as u64, order) {
+            return Ok(false);
+        }
+        place.order = order;
         if !resumed {
             let failed = singular.len() as u64;
             self.part.counts.singular += failed;
             self.part.counts.bounded += end - start - open.len() as u64 - failed;
             self.part.failures.extend(singular.into_iter().take(LISTED).map(|index| (index, Failure::Singular)));
         }
-        if !place.fits(open.len() as u64) {
-            let (at, of) = (place.followed, open.len());
-            return Err(another(format!("a checkpoint stands at {at} of {of} candidates to follow")));
-        }
-        by_guess(&mut open);
-        self.follow(&open, kept, place, true)
+        self.follow(&open, kept, place, true).map(|()| true)
     }
 
     /// Follows open candidates in this order from a place on; what is learnt goes to `kept`, and to the counts and
@@ -117,7 +121,8 @@ impl<'a> Hunt<'a> {
                     self.part.failures.truncate(LISTED);
                     let rows = rows.into_iter().filter(|row| kept.holds(row)).collect();
                     let part = Part { rows, counts: self.part.counts, failures: self.part.failures.clone() };
-                    self.control.save(Checkpoint { place, part });
+                    let anew = std::mem::take(&mut self.anew);
+                    self.control.save(Checkpoint { place, anew, part });
                 } else {
                     kept.take(rows.into_iter());
                 }
@@ -197,4 +202,12 @@ impl<'a> Hunt<'a> {
             }
         }
     }
+}
+
+/// Digest of the order in which candidates are visited, below 2^63 and never 0 (64-bit FNV-1a over their indices).
+fn digest(open: &[Open]) -> u64 {
+    let bytes = open.iter().flat_map(|candidate| candidate.index.to_le_bytes());
+    let whole =
+        bytes.fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
+    (whole >> 1).max(1)
 }

@@ -101,7 +101,8 @@ impl<'a> Search<'a> {
     /// Does rounds `first … last − 1` of one wave.
     ///
     /// `seed` gives index and raw score of the rows kept before the wave. `from` goes on from a checkpoint of the same
-    /// stretch and seed that holds all rows found since its start.
+    /// stretch and seed that holds all rows found since its start; where it stands in a round that visits its candidates
+    /// in another order here (it may on another kind of processor), the stretch is begun again.
     ///
     /// # Errors
     /// [`crate::error::Error::Interrupted`], or rounds, seed or checkpoint that do not fit this search.
@@ -139,10 +140,17 @@ impl<'a> Search<'a> {
         let Catalogue { lattice, options, .. } = &self.catalogue;
         let count = lattice.count();
         let (all, length) = (rounds(count, options), round_length(options));
-        let from = from.unwrap_or_else(|| Checkpoint { place: Place::start(first), part: Part::default() });
+        let begun = from.is_none();
+        let from = from.unwrap_or_else(|| Checkpoint { place: Place::start(first), anew: true, part: Part::default() });
         if !(first <= from.place.round && from.place.round <= last && last <= all) {
             let what = format!("rounds {first} to {last} from {} on are not among {all}", from.place.round);
             return Err(another(what));
+        }
+        if !from.place.sound() {
+            let Place { followed, end, size, limit, .. } = from.place;
+            return Err(another(format!(
+                "a checkpoint stands at {followed} of {end} ({size} at a time, limit {limit})"
+            )));
         }
         if let Some((index, score)) = seed.iter().find(|(index, score)| *index >= count || strange(*score)) {
             return Err(another(format!("a row of score {score} has index {index} among {count} candidates")));
@@ -151,10 +159,12 @@ impl<'a> Search<'a> {
         // Rounds are spread over the lattice, so that early waves see all of it and later ones get a good limit.
         let order = visit(all);
         let mut hunt = Hunt::new(&self.catalogue, pool, control);
-        let Checkpoint { mut place, part } = from;
+        let Checkpoint { mut place, part, .. } = from;
         control.total.store(count, Ordering::Relaxed);
-        control.count(part.counts.done(), 0);
+        let known = part.counts.done();
+        control.count(known, 0);
         hunt.part = part;
+        hunt.anew = begun;
         while place.round < last {
             let start = order(place.round) * length;
             let bounds = (start, count.min(start + length));
@@ -165,7 +175,12 @@ impl<'a> Search<'a> {
             kept.lower(options.early_stopping);
             kept.take(hunt.part.rows.iter().filter(|row| own(row)).cloned());
             hunt.part.rows.retain(|row| !own(row));
-            hunt.round(bounds, &mut kept, place)?;
+            if !hunt.round(bounds, &mut kept, place)? {
+                // Its candidates would be followed twice or never: what it came to elsewhere is of no use here.
+                control.done.fetch_sub(known, Ordering::Relaxed);
+                (hunt.part, hunt.anew, place) = (Part::default(), true, Place::start(first));
+                continue;
+            }
             let part = Part {
                 rows: kept.rows.into_iter().filter(own).collect(),
                 counts: Counts { candidates: bounds.1 - bounds.0, ..Counts::default() },
