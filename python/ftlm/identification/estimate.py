@@ -14,7 +14,7 @@ import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.settings import Settings
-from ftlm.data.structures import Initial, Structure
+from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.coefficients import estimate_coefficients, step_bias
 from ftlm.fit.genetic import Genetic, genetic_search
 from ftlm.fit.joint import JointFit, fit_output_error
@@ -80,6 +80,8 @@ def solved(task: Task, method: str, structure: Structure, orders: Mapping[str, f
 
 def in_words(initial: Initial) -> str:
     """Decided initial terms as settings name them."""
+    if isinstance(initial, History):
+        return f"history, {len(initial)} powers of t up to {initial[-1]:g}"
     return initial if isinstance(initial, str) else f"t^{list(initial)}"
 
 
