@@ -43,9 +43,7 @@ class Plant:
             for angle in np.linspace(0.05, np.pi - 0.05, 25):
                 s = radius * np.exp(1j * angle)
                 for _ in range(60):
-                    slope = self.alpha * s ** (self.alpha - 1) - sum(
-                        c * nu * s ** (nu - 1) for c, nu in self.own if nu
-                    )
+                    slope = self.alpha * s ** (self.alpha - 1) - sum(c * nu * s ** (nu - 1) for c, nu in self.own if nu)
                     s = s - self.divisor(s) / slope
                     if not np.isfinite(s) or abs(s) < 1e-9:
                         break

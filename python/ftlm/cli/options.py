@@ -175,7 +175,9 @@ class StructureOptions:
         try:
             return tuple(float(exponent) for exponent in self.initial.split(","))
         except ValueError:
-            raise ModelError(f"--initial {self.initial!r} is not {', '.join(START_WORDS)} or exponents such as 0,1") from None
+            raise ModelError(
+                f"--initial {self.initial!r} is not {', '.join(START_WORDS)} or exponents such as 0,1"
+            ) from None
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from ftlm.data.equations import Equation, Term, numeric
 from ftlm.data.orders import MAX_ORDER, Order, Values, parse_values
 
 
-
 class History(tuple[float, ...]):
     """Powers of time that stand for what a run did before its start, decided from the run."""
 

@@ -2,9 +2,10 @@
 
 A fractional integral remembers all that was before the run: to c I^eta s it adds c/Gamma(eta) times the integral of
 (t + s)^(eta-1) over the past s, which is no finite sum. It is smooth but for a start like t^eta, so a few powers of t
-in quarters reproduce it to any noise (Caputo's own terms, which are those of a past at rest, do not). How many are
+in quarters reproduce it to any noise; Caputo's own terms, those of a past in which nothing moved, do not. How many are
 needed follows from how far the run stands above its noise, never from how well they fit: a length chosen by the fit
-would make its intervals too short.
+would make its intervals too short. The fit only decides between Caputo's terms and all of these, in favour of these
+wherever there is a doubt.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ import math
 
 import numpy as np
 
-from ftlm.base.statistics import is_rest, noise_of
+from ftlm.base.arrays import Floats
+from ftlm.base.statistics import chi_squared, is_rest, noise_of
 from ftlm.data.run import Run
 from ftlm.data.structures import History, Initial, Structure
 
@@ -30,6 +32,10 @@ LEAST, MOST = 2, 12
 SPARSEST = 16
 #: Whole powers below this stand among the quarters always, so that their list is that of any order up to 3.
 WHOLE = 3
+#: Caputo's terms are enough where a past that holds no more would leave a larger misfit than theirs in this share of
+#: runs. The usual share of 1 or 5 % would let a weak past through unseen, with intervals too short for its bias. Beside
+#: an offset, which explains a first value away from zero by itself and which a history would hide, it is less.
+DOUBT, DOUBT_BESIDE_OFFSET = 0.25, 0.02
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:
@@ -49,8 +55,10 @@ def history(run: Run, structure: Structure) -> History:
     for name in structure.outputs:
         if name in run:
             samples = run[name]
-            size = float(np.linalg.norm(samples))
-            visible = max(visible, size / max(noise_of(samples), np.finfo(np.float64).eps * size))
+            # A level that is no offset is a part of the past; one that is takes no power of its own.
+            size = float(np.linalg.norm(samples - (0.0 if structure.offset == "none" else np.mean(samples))))
+            if size:
+                visible = max(visible, size / max(noise_of(samples), np.finfo(np.float64).eps * size))
     quarters = QUARTERS + math.ceil(math.log(visible / REFERENCE) / math.log(FACTOR))
     quarters = max(LEAST, min(quarters, MOST, run.length // SPARSEST))
     highest = max((e.order.constant for e in structure.equations if not e.order.names), default=0.0)
@@ -73,3 +81,19 @@ def together(decisions: list[Initial]) -> Initial | None:
     if len(set(decisions)) < 2:
         return None
     return max(decisions, key=lambda d: (isinstance(d, tuple), d == "caputo", len(d)))
+
+
+def misfit(short: Floats, long: Floats) -> float:
+    """By how much residuals, shape (outputs, N), with few initial terms exceed those with many, in units of noise.
+
+    Where the few are enough this is distributed as chi-squared, with as many degrees as there are terms more.
+    """
+    few, many = np.sum(short**2, axis=1), np.sum(long**2, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return float(np.nansum(short.shape[1] * (few / many - 1.0)))
+
+
+def needed(structure: Structure, excess: float, terms: int) -> bool:
+    """Whether such an excess over residuals with so many terms more asks for a history beside Caputo's terms."""
+    doubt = DOUBT if structure.offset == "none" else DOUBT_BESIDE_OFFSET
+    return terms > 0 and excess > chi_squared(terms, 1.0 - doubt)

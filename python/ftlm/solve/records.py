@@ -151,7 +151,12 @@ def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool
         return made()
     filtered = filtered or structure.sensor_filter is None
     read = (structure.signals, structure.delay, structure.free_delays, structure.sensor_filter, structure.initial)
-    start = (structure.offset, structure.outputs, has_memory(structure), [e.order.constant for e in structure.equations])
+    start = (
+        structure.offset,
+        structure.outputs,
+        has_memory(structure),
+        [e.order.constant for e in structure.equations],
+    )
     return list(runs.keep(repr((read, start, m, filtered)), made))
 
 
