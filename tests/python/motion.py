@@ -96,22 +96,21 @@ def held_command(rows: int, seed: int, every: int) -> np.ndarray:
     return np.repeat(levels, every)[:rows]
 
 
-def whole_motion(plant: Plant, rows: int, step: float, seed: int, every: int = 20) -> tuple[np.ndarray, np.ndarray]:
-    """Input and clean output from rest."""
-    u = held_command(rows, seed, every)
+def response(plant: Plant, u: np.ndarray, step: float) -> np.ndarray:
+    """Clean output of a held command from rest."""
     jumps = np.diff(u, prepend=0.0)
-    answer = plant.step_response(np.arange(rows) * step)
-    # y[k] is what the jumps up to that instant have led to; the last one has not moved anything yet.
-    size = 2 * rows
-    y = np.fft.irfft(np.fft.rfft(jumps, size) * np.fft.rfft(answer, size), size)[:rows]
-    return u, y
+    answer = plant.step_response(np.arange(u.size) * step)
+    # Each row's jump has moved nothing yet at its own instant: the step response starts with 0.
+    size = 2 * u.size
+    return np.fft.irfft(np.fft.rfft(jumps, size) * np.fft.rfft(answer, size), size)[: u.size]
 
 
 def pieces(
     plant: Plant, seed: int, *, rows: int = 500, step: float = 0.05, noise: float = 0.01, every: int = 20
 ) -> tuple[ftlm.Run, ftlm.Run]:
     """First half of a motion, from rest, and its second half, in motion, with white noise on both."""
-    u, y = whole_motion(plant, 2 * rows, step, seed, every)
+    u = held_command(2 * rows, seed, every)
+    y = response(plant, u, step)
     y = y + noise * np.std(y) * np.random.default_rng([seed, 2]).standard_normal(2 * rows)
     halves = (slice(0, rows), slice(rows, 2 * rows))
     first, second = (
@@ -122,7 +121,6 @@ def pieces(
 
 
 def scores(found: ftlm.Identification, plant: Plant) -> dict[str, float]:
-    """How many standard errors each number is from the truth; signs of coefficients as the words have them."""
-    errors = found.joint.standard_errors
-    values = dict(zip(found.joint.names, found.joint.values.tolist(), strict=True))
-    return {n: (values[n] - truth) / errors[n] for n, truth in plant.truth.items()}
+    """How many standard errors each number is from the truth."""
+    values = {**found.orders, **found.coefficients}
+    return {n: (values[n] - truth) / found.standard_errors[n] for n, truth in plant.truth.items()}
