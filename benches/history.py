@@ -28,7 +28,7 @@ import motion
 
 #: Half-width of a 95 % interval in standard errors.
 NORMAL_95 = 1.959963984540054
-PROCESSES = 2
+PROCESSES = 1
 
 
 def told(names: list[str], numbers: np.ndarray, form: str) -> str:
@@ -260,8 +260,8 @@ def bases(plants: list[str], seeds: int) -> Iterator[str]:
                 price = np.median(np.array(cost), axis=0)
                 yield (
                     f"alpha {name}, noise {100 * noise:g} %, {basis} ({terms[0]} terms): misfit "
-                    f"{np.median(misfit):.2g} of the noise's deviation, bias {worst:.2g} standard errors of the worst number, standard errors "
-                    f"{price.min():.2f} to {price.max():.2f} times those from rest"
+                    f"{np.median(misfit):.2g} standard deviations of the noise, bias {worst:.2g} standard errors of the worst number, standard "
+                    f"errors {price.min():.2f} to {price.max():.2f} times those from rest"
                 )
 
 
