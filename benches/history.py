@@ -258,11 +258,10 @@ def bases(plants: list[str], seeds: int) -> Iterator[str]:
                 misfit, bias, cost, terms = zip(*(table[basis] for table in tables), strict=True)
                 worst = float(np.max(np.sqrt(np.mean(np.array(bias) ** 2, axis=0))))
                 price = np.median(np.array(cost), axis=0)
-                yield (
-                    f"alpha {name}, noise {100 * noise:g} %, {basis} ({terms[0]} terms): misfit "
-                    f"{np.median(misfit):.2g} standard deviations of the noise, bias {worst:.2g} standard errors of the worst number, standard "
-                    f"errors {price.min():.2f} to {price.max():.2f} times those from rest"
-                )
+                words = f"alpha {name}, noise {100 * noise:g} %, {basis} ({terms[0]} terms): misfit"
+                words += f" {np.median(misfit):.2g} standard deviations of the noise, bias {worst:.2g} standard errors"
+                words += f" of the worst number, standard errors {price.min():.2f} to {price.max():.2f} times"
+                yield words + " those from rest"
 
 
 def main() -> None:
