@@ -31,15 +31,17 @@ def fit_any_start(
     A fit with a history is kept unless Caputo's terms leave residuals that are as good; a fit from rest unless a
     history makes them much better. Which terms were fitted is in the result.
     """
-    options = {"threads": threads, "progress": progress}
-    joint = fit_output_error(runs, replace(structure, initial=start), **options)
+
+    def fitted(initial: Initial) -> JointFit:
+        return fit_output_error(runs, replace(structure, initial=initial), threads=threads, progress=progress)
+
+    joint = fitted(start)
     if structure.initial != "auto" or not has_memory(structure):
         return joint
     if start == "rest":
         if not _moved(joint, runs, structure):
             return joint
-        powers = together([history(run, structure) for run in runs]) or history(runs[0], structure)
-        return fit_output_error(runs, replace(structure, initial=powers), **options)
+        return fitted(together([history(run, structure) for run in runs]) or history(runs[0], structure))
     return _shorter(joint, runs, structure) if isinstance(start, History) else joint
 
 
