@@ -5,15 +5,18 @@ Truth is exact and shares no code with the estimator: residues and the integral 
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from typer.testing import CliRunner
 
 import ftlm
 import motion
 import oracles
+from ftlm import cli
 from ftlm.data.structures import History
 from ftlm.solve.motion import decided, history
 from ftlm.solve.records import prepare, record
@@ -103,6 +106,33 @@ def test_from_rest_nothing_is_estimated_of_the_past(halves):
     # What asking for it would cost.
     asked = ftlm.identify(run, ftlm.equation(WORDS, initial="history"), threads=1)
     assert all(asked.standard_errors[n] > 1.2 * e for n, e in found.standard_errors.items())
+
+
+def test_what_rounding_leaves_asks_for_no_history():
+    # Residuals without noise are the step's: of any shape, and slow terms follow them.
+    plant = motion.PLANTS["0.7"]
+    u = motion.held_command(300, 6, 20)
+    y = motion.response(plant, u, 0.05)
+    for level, initial in ((0.0, "rest"), (0.6, "caputo")):
+        run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u + 0.5 * level}, outputs={"y": y + level})
+        found = ftlm.identify(run, ftlm.equation(plant.words), threads=1)
+        assert found.settings["initial"] == initial
+        assert found.orders["alpha"] == pytest.approx(0.7, abs=1e-4)
+
+
+def test_the_command_line_asks_for_a_history(halves, tmp_path):
+    (_, run), (_, found) = halves
+    table = tmp_path / "run.csv"
+    rows = zip(run.time, run["u"], run["y"], strict=True)
+    table.write_text("t,u,y\n" + "".join(f"{t!r},{u!r},{y!r}\n" for t, u, y in np.array(list(rows)).tolist()))
+    words = ["identify", str(table), "--structure", WORDS, "--time", "t", "-u", "u", "-y", "y", "--json"]
+    told = CliRunner().invoke(cli.app, [*words, "--initial", "history"])
+    assert told.exit_code == 0, told.output
+    document = json.loads(told.stdout)
+    assert document["settings"]["initial"] == found.settings["initial"]
+    refused = CliRunner().invoke(cli.app, [*words, "--initial", "tails"])
+    assert refused.exit_code == 2
+    assert "is not auto, rest, caputo, history or exponents" in " ".join(refused.output.split())
 
 
 @pytest.mark.parametrize("offset", ["none", "constant"])

@@ -14,7 +14,7 @@ from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
-from ftlm.solve.motion import has_memory, history, misfit, needed, together
+from ftlm.solve.motion import has_memory, history, misfit, needed, root_mean_square, together
 from ftlm.solve.sampled import FIRST_REFINEMENT, measured_samples, sampled
 
 #: A run whose first samples look like rest is in motion where its residuals would ask for a history in this share of
@@ -53,8 +53,10 @@ def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure) -> Join
     except FtlmError:
         # From here it has no finite free run, so it is not enough.
         return joint
-    count = joint.samples / len(joint.noise)
-    excess = sum(count * ((few.noise[o] / joint.noise[o]) ** 2 - 1.0) for o in joint.noise if joint.noise[o] > 0)
+    outputs = structure.outputs
+    ours, theirs = (np.array([fit.noise[o] for o in outputs]) for fit in (few, joint))
+    size = np.array([np.std(np.concatenate([run[o] for run in runs])) for o in outputs])
+    excess = misfit(ours, theirs, size, joint.samples / len(outputs))
     return joint if needed(structure, excess, joint.initial_terms - few.initial_terms) else few
 
 
@@ -76,7 +78,8 @@ def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
             terms += sum(map(len, found.values())) if start != "rest" else 0
         if not all(np.all(np.isfinite(e)) for e in ends):
             return False
-        excess += misfit(*ends)
+        size = np.std([run[o] for o in structure.outputs], axis=1)
+        excess += misfit(root_mean_square(ends[0]), root_mean_square(ends[1]), size, run.length)
         spread = max([spread, *map(colour, ends[1])])
     # Noise that is coloured is followed by slow terms in any run.
     return terms > 0 and excess / spread > chi_squared(terms, 1.0 - RARE)

@@ -36,6 +36,8 @@ WHOLE = 3
 #: runs. The usual share of 1 or 5 % would let a weak past through unseen, with intervals too short for its bias. Beside
 #: an offset, which explains a first value away from zero by itself and which a history would hide, it is less.
 DOUBT, DOUBT_BESIDE_OFFSET = 0.25, 0.02
+#: Residuals below this share of an output are rounding and discretisation, of which no test says anything.
+EXACT = 3e-5
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:
@@ -83,14 +85,28 @@ def together(decisions: list[Initial]) -> Initial | None:
     return max(decisions, key=lambda d: (isinstance(d, tuple), d == "caputo", len(d)))
 
 
-def misfit(short: Floats, long: Floats) -> float:
-    """By how much residuals, shape (outputs, N), with few initial terms exceed those with many, in units of noise.
+def misfit(few: Floats, many: Floats, size: Floats, count: float) -> float:
+    """By how much residuals with few initial terms exceed those with many, in units of noise.
 
     Where the few are enough this is distributed as chi-squared, with as many degrees as there are terms more.
+
+    Parameters
+    ----------
+    few, many, size
+        Root mean square of the residuals, and deviation of what was measured, of each output.
+    count
+        Samples of each output.
     """
-    few, many = np.sum(short**2, axis=1), np.sum(long**2, axis=1)
+    seen = few > EXACT * size
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return float(np.nansum(short.shape[1] * (few / many - 1.0)))
+        return float(np.nansum(np.where(seen, count * ((few / many) ** 2 - 1.0), 0.0)))
+
+
+def root_mean_square(residuals: Floats) -> Floats:
+    """Of each row."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows: Floats = np.sqrt(np.mean(residuals**2, axis=1))
+    return rows
 
 
 def needed(structure: Structure, excess: float, terms: int) -> bool:

@@ -19,7 +19,7 @@ from ftlm.data.equations import Equation
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Offset, SensorFilter, offset_exponents
-from ftlm.solve.motion import decided, misfit, needed
+from ftlm.solve.motion import decided, misfit, needed, root_mean_square
 from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
@@ -119,7 +119,9 @@ def started(model: Solved, run: Run) -> Solved:
         # The coarse grid makes the equations unsolvable; finer ones need not.
         return long
     more = sum(map(len, theirs.values())) - sum(map(len, ours.values()))
-    return long if needed(model.structure, misfit(measured - few, measured - many), more) else short
+    size, count = np.std(measured, axis=1), measured.shape[1]
+    excess = misfit(root_mean_square(measured - few), root_mean_square(measured - many), size, count)
+    return long if needed(model.structure, excess, more) else short
 
 
 def _limit(coarse: Terms, fine: Terms) -> dict[str, dict[float, float]]:
