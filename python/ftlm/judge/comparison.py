@@ -67,7 +67,8 @@ class Comparison:
         Whether the output error is that of samples at the run's instants; False for pulse means, as the paper has them.
     offsets
         Unknown constants of the equations, one mapping a run: output -> ``"constant"`` [unit of D^alpha y] (and
-        ``"ramp"``, that a second) -> value. Estimated anew on each run; empty for a model without an offset.
+        ``"ramp"``, that a second) -> value. Estimated anew on each run; empty for a model without an offset, and for
+        an output whose run has a history beside it, which hides it.
     """
 
     output_error: dict[str, Metrics]
