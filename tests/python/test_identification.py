@@ -114,10 +114,10 @@ def test_default_m_is_what_the_runs_carry(small_run, second, structure):
 
 
 def test_runs_that_do_not_start_at_rest_get_initial_terms(small_run, structure):
-    # From t = 3 s on nothing before is known: t^0, t^1 and what D^0.6 y leaves are estimated and reported.
+    # From t = 3 s on nothing before is known: a history is estimated, of this run alone, and reported.
     piece = replace_name(small_run.slice(3.0, None), "piece")
     found = ftlm.identify([small_run, piece], structure, method="least-squares", m=256)
-    assert found.settings["initial"] == "caputo"
+    assert found.settings["initial"] == "history, 10 powers of t up to 2.25"
     assert found.coefficients == {n: pytest.approx(v, rel=0.05) for n, v in TRUTH.items()}
     assert "initial terms of y in piece (of that run alone): " in str(found)
     fixed = ftlm.identify(piece, replace(structure, initial=(0.0, 1.0)), method="least-squares", m=256)

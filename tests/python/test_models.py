@@ -429,7 +429,7 @@ def test_delays_that_are_none_are_refused(delay, message):
     assert message in str(refused.value)
 
 
-@pytest.mark.parametrize("initial", ["auto", "rest", "caputo", (0.0, 1.0), (-0.5,), ()])
+@pytest.mark.parametrize("initial", ["auto", "rest", "caputo", "history", (0.0, 1.0), (-0.5,), ()])
 def test_initial_terms(initial):
     assert ftlm.equation("D y = a y", initial=initial).initial == initial
     assert check_initial(np.array([0, 1])) == (0.0, 1.0)

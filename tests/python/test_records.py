@@ -13,6 +13,8 @@ import ftlm
 import oracles
 from ftlm import _core
 from ftlm.data.several import MOST_KEPT, as_runs
+from ftlm.data.structures import History
+from ftlm.solve.motion import history
 from ftlm.solve.records import default_m, equation_tuple, initial_tuple, prepare, record, records, structure_tuple
 
 
@@ -271,12 +273,19 @@ def test_filter_of_a_lead_is_a_filter_too():
         (np.arange(100.0) ** 2, "rest"),
         (np.sqrt(np.arange(100.0)), "rest"),
         (1 + np.arange(100.0) ** 2, "rest"),  # 1 of 2 920 (deviation): below a thousandth
-        (10 + np.arange(100.0) ** 2, "caputo"),
-        (np.cos(np.arange(100) / 10), "caputo"),
+        (10 + np.arange(100.0) ** 2, "history"),
+        (np.cos(np.arange(100) / 10), "history"),
     ],
 )
 def test_rest_is_judged_by_the_first_sample(y, initial):
-    assert record(make_run({"y": y}), ftlm.equation("D^1.5 y = a y + b u"), 99).initial == initial
+    run = make_run({"y": y})
+    found = record(run, ftlm.equation("D^1.5 y = a y + b u"), 99).initial
+    assert (found == "rest") == (initial == "rest")
+    # Whole orders need no more than whole powers, whatever was before.
+    whole = record(run, ftlm.equation("D^2 y = a y + b u"), 99).initial
+    assert whole == ("rest" if initial == "rest" else "caputo")
+    if initial == "history":
+        assert found == history(run, ftlm.equation("D^1.5 y = a y + b u"))
 
 
 def test_rest_is_judged_within_noise():
@@ -286,7 +295,7 @@ def test_rest_is_judged_within_noise():
     y[0] = 0.15
     assert record(make_run({"y": y}), structure, 99).initial == "rest"
     y[0] = 0.5
-    assert record(make_run({"y": y}), structure, 99).initial == "caputo"
+    assert isinstance(record(make_run({"y": y}), structure, 99).initial, History)
 
 
 def test_plant_a_is_driven_from_its_first_sample_and_at_rest(clean_a):
@@ -307,7 +316,10 @@ def test_one_run_that_moves_gives_all_runs_initial_terms():
     still, moving = make_run({"y": np.arange(50.0) ** 2}), make_run({"y": 5000 - np.arange(50.0) ** 2})
     structure = ftlm.equation("D^1.5 y = a y")
     assert [r.initial for r in prepare([still, still], structure, 49, power_of_two=False)] == ["rest", "rest"]
-    assert [r.initial for r in prepare([still, moving], structure, 49, power_of_two=False)] == ["caputo", "caputo"]
+    powers = history(moving, structure)
+    assert [r.initial for r in prepare([still, moving], structure, 49, power_of_two=False)] == [powers, powers]
+    whole = ftlm.equation("D^2 y = a y")
+    assert [r.initial for r in prepare([still, moving], whole, 49, power_of_two=False)] == ["caputo", "caputo"]
 
 
 def test_caputo_initial_terms_make_the_equation_error_vanish():

@@ -13,9 +13,9 @@ import pytest
 from scipy.signal import lsim
 
 import ftlm
+from ftlm.fit import history
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.uncertainty import covariance_of, deviation
-from ftlm.identification import estimate
 from ftlm.report.model_page import model_page
 
 
@@ -81,7 +81,7 @@ WORDS = "D^2 y = c D y + a y + b u + e v"
 @pytest.fixture
 def twice(monkeypatch: pytest.MonkeyPatch) -> ftlm.Identification:
     """Two terms that are the same to the runs, from a given start: an automatic one finds nothing to invert."""
-    monkeypatch.setattr(estimate, "fit_output_error", partial(fit_output_error, start=START))
+    monkeypatch.setattr(history, "fit_output_error", partial(fit_output_error, start=START))
     return ftlm.identify(driven_twice(1, 0.0), ftlm.equation(WORDS))
 
 

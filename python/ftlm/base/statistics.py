@@ -42,9 +42,24 @@ def ljung_box(correlations: Floats, count: int) -> float:
 
 
 def chi_squared_99(degrees: int) -> float:
-    """99 % quantile of chi-squared by Wilson and Hilferty, good to 0.3 % from five degrees of freedom."""
-    z = NormalDist().inv_cdf(1 - LEVEL)
+    """99 % quantile of chi-squared."""
+    return chi_squared(degrees, 1 - LEVEL)
+
+
+def chi_squared(degrees: int, share: float) -> float:
+    """Quantile of chi-squared by Wilson and Hilferty, good to 0.3 % from five degrees of freedom."""
+    z = NormalDist().inv_cdf(share)
     return degrees * (1 - 2 / (9 * degrees) + z * math.sqrt(2 / (9 * degrees))) ** 3
+
+
+def colour(series: Floats) -> float:
+    """How much more a sum of the series scatters than one of white noise of its variance: 1 or above (Bartlett)."""
+    e = series - np.mean(series)
+    power = float(e @ e)
+    lags = min(int(4 * e.size ** (1.0 / 3.0)), e.size - 1)
+    if power == 0.0 or lags < 2:
+        return 1.0
+    return max(1.0, 1.0 + 2.0 * sum((1.0 - k / lags) * float(e[k:] @ e[:-k]) / power for k in range(1, lags)))
 
 
 def is_white(series: Floats, lags: int = 25) -> bool:

@@ -16,7 +16,7 @@ from ftlm.data.language import equation
 from ftlm.data.lattice import Lattice, lattice
 from ftlm.data.run import Run
 from ftlm.data.settings import Criterion
-from ftlm.data.structures import Structure, check_initial
+from ftlm.data.structures import START_WORDS, Structure, check_initial
 from ftlm.files.load import load
 from ftlm.fit.genetic import Genetic
 
@@ -119,7 +119,7 @@ class StructureOptions:
     delay: Annotated[Texts, Option(metavar="INPUT=SECONDS", help="Delay of an input; LEAST:LARGEST is estimated.")] = (
         None
     )
-    initial: Annotated[str, Option(help="auto, rest, caputo, or exponents of t: 0,1.")] = "auto"
+    initial: Annotated[str, Option(help="auto, rest, caputo, history, or exponents of t: 0,1.")] = "auto"
     offset: Annotated[
         Literal["none", "constant", "ramp"] | None,
         Option(help="Unknown constant (and ramp) in each equation, one a run; default what the equation says."),
@@ -170,12 +170,14 @@ class StructureOptions:
         )  # fmt: skip
 
     def _initial(self) -> Any:
-        if self.initial in ("auto", "rest", "caputo"):
+        if self.initial in START_WORDS:
             return self.initial
         try:
             return tuple(float(exponent) for exponent in self.initial.split(","))
         except ValueError:
-            raise ModelError(f"--initial {self.initial!r} is not auto, rest, caputo or exponents such as 0,1") from None
+            raise ModelError(
+                f"--initial {self.initial!r} is not {', '.join(START_WORDS)} or exponents such as 0,1"
+            ) from None
 
 
 @dataclass(frozen=True)

@@ -43,8 +43,10 @@ def equation(
     delay
         Delay of inputs [s], by name, not negative: a number is known, (least, largest) is estimated by output error.
     initial
-        Initial terms: ``"auto"`` (Caputo's if the record does not start at rest), ``"rest"``, ``"caputo"``, or the
-        exponents of t to use.
+        What the run did before its start, as powers of t: ``"rest"`` (nothing), ``"caputo"`` (held still, at any
+        level), ``"history"`` (anything: powers in quarters, as many as stand out of the noise), or the exponents to
+        use. ``"auto"``: rest where the outputs start at zero, else Caputo's where orders are whole or where the run
+        asks for no more, else a history.
     sensor_filter
         Known filter that some outputs went through.
     offset

@@ -16,8 +16,17 @@ from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Term, numeric
 from ftlm.data.orders import MAX_ORDER, Order, Values, parse_values
 
-Initial: TypeAlias = Literal["auto", "rest", "caputo"] | tuple[float, ...]
+
+class History(tuple[float, ...]):
+    """Powers of time that stand for what a run did before its start, decided from the run."""
+
+    __slots__ = ()
+
+
+Initial: TypeAlias = Literal["auto", "rest", "caputo", "history"] | tuple[float, ...]
 Offset: TypeAlias = Literal["none", "constant", "ramp"]
+#: What initial terms are called.
+START_WORDS = ("auto", "rest", "caputo", "history")
 
 
 class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -63,14 +72,14 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 def check_initial(initial: str | Iterable[float]) -> Initial:
     """Refuse initial terms that are neither a known word nor exponents above -1."""
-    if isinstance(initial, str) and initial in ("auto", "rest", "caputo"):
+    if isinstance(initial, str) and initial in START_WORDS:
         return initial  # type: ignore[return-value]
     try:
         if isinstance(initial, str):
             raise TypeError
         exponents = tuple(real_number("exponent of an initial term", e) for e in initial)
     except TypeError:
-        words = "'auto', 'rest', 'caputo' or exponents of t"
+        words = f"{', '.join(map(repr, START_WORDS))} or exponents of t"
         raise ModelError(f"initial = {initial!r} is not known; use {words}") from None
     bad = next((e for e in exponents if not (math.isfinite(e) and -1 < e <= 10)), None)
     if bad is not None:
@@ -183,7 +192,8 @@ class Structure:
     def _check_offset(self) -> None:
         """Refuse an offset that is no word, or that given initial terms hold already."""
         check_offset(self.offset)
-        if isinstance(self.initial, str):
+        if isinstance(self.initial, (str, History)):
+            # Where the powers of a history hold that of the offset, they are one term.
             return
         for item in self.equations:
             for power in [] if item.order.names else offset_exponents(item.order.constant, self.offset).values():

@@ -17,7 +17,7 @@ from ftlm.base.arrays import Floats
 from ftlm.base.errors import ConvergenceError, DataError, FtlmError
 from ftlm.base.statistics import NORMAL_95, noise_of
 from ftlm.data.run import Run
-from ftlm.data.structures import Structure, delay_name
+from ftlm.data.structures import Initial, Structure, delay_name
 from ftlm.fit.extrapolation import feasible
 from ftlm.fit.grid import FINEST, Attempt, Grid
 from ftlm.fit.problem import FreeProblem
@@ -67,6 +67,8 @@ class JointFit:
         Coefficients that the coefficient law gives: sign and factors by name.
     delays
         Estimated delays [s] by input; in covariance and errors they stand last, as ``delay_`` and the input's name.
+    initial, initial_terms
+        Initial terms that were fitted, and how many coefficients they have on all runs together.
     """
 
     orders: dict[str, float]
@@ -82,6 +84,8 @@ class JointFit:
     residuals: list[dict[str, Floats]]
     products: Mapping[str, tuple[float, tuple[str, ...]]] = field(default_factory=dict)
     delays: dict[str, float] = field(default_factory=dict)
+    initial: Initial = "rest"
+    initial_terms: int = 0
 
     @property
     def choice(self) -> str:
@@ -258,5 +262,6 @@ def joint_fit(optimum: Optimum, starts: list[tuple[float, str]]) -> JointFit:
         covariance=covariance(best, grid), residuals=grid.residuals(best),
         noise={o: level / w for (o, level), w in zip(levels.items(), grid.weights, strict=True)},
         cost=float(best.outcome["cost"]), samples=len(best.outcome["residuals"]), refinement=grid.every,
-        settled=optimum.settled, converged=best.converged, starts=starts,
+        settled=optimum.settled, converged=best.converged, starts=starts, initial=problem.structure.initial,
+        initial_terms=sum(len(x) for run in best.outcome["initial"] for x in run),
     )  # fmt: skip

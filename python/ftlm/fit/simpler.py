@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from ftlm.base.errors import FtlmError
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
+from ftlm.data.structures import History
 from ftlm.fit.grid import Attempt
 from ftlm.fit.problem import FreeProblem
 
@@ -59,7 +60,7 @@ def lower_orders(problem: FreeProblem, runs: Sequence[Run]) -> list[LowerOrder]:
     if not isinstance(highest.coefficient, str) or highest.order.constant <= 0 or known:
         return []
     initial = structure.initial
-    if not isinstance(initial, str):
+    if not isinstance(initial, (str, History)):
         # A power of t that the equation of lower order integrates to would be a drive.
         initial = tuple(e for e in initial if e < highest.order.constant)
     try:

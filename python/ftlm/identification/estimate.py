@@ -14,10 +14,11 @@ import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.settings import Settings
-from ftlm.data.structures import Initial, Structure
+from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.coefficients import estimate_coefficients, step_bias
 from ftlm.fit.genetic import Genetic, genetic_search
-from ftlm.fit.joint import JointFit, fit_output_error
+from ftlm.fit.history import fit_any_start
+from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
 from ftlm.identification.judged import Task
 from ftlm.identification.warnings import broken_law, uncertain
@@ -80,6 +81,8 @@ def solved(task: Task, method: str, structure: Structure, orders: Mapping[str, f
 
 def in_words(initial: Initial) -> str:
     """Decided initial terms as settings name them."""
+    if isinstance(initial, History):
+        return f"history, {len(initial)} powers of t up to {initial[-1]:g}"
     return initial if isinstance(initial, str) else f"t^{list(initial)}"
 
 
@@ -94,8 +97,16 @@ def by_output_error(task: Task, m: int | None, threads: int, progress: Told) -> 
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
     record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False)[0]
-    problem = FreeProblem.of(replace(structure, initial=record.initial))
-    joint = fit_output_error(task.runs, problem.structure, threads=threads, progress=progress)
+    joint = fit_any_start(task.runs, structure, record.initial, threads=threads, progress=progress)
+    problem = FreeProblem.of(replace(structure, initial=joint.initial))
+    warnings = uncertain(joint, problem)
+    if record.initial == "rest" and joint.initial != "rest":
+        # The first value alone would tell a comparison otherwise.
+        structure = replace(structure, initial="history")
+        warnings.append(
+            f"{', '.join(r.name for r in task.runs)}: the first values look like rest, but the residuals of a fit from "
+            "rest ask for what was before; initial='history' was used"
+        )
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
     identified = structure.with_orders(joint.orders).with_coefficients(problem.named(coefficients))
     moved = problem.number_jacobian(orders, coefficients)
@@ -105,11 +116,11 @@ def by_output_error(task: Task, m: int | None, threads: int, progress: Told) -> 
         solved(task, "output-error", identified.with_delays(joint.delays), {**known, **joint.orders}, record.m),
         len(joint.names),
         {
-            "method": "output-error", "m": record.m, "initial": in_words(record.initial),
+            "method": "output-error", "m": record.m, "initial": in_words(joint.initial),
             "refinement": joint.refinement, "starts": len(joint.starts), "noise": joint.noise,
             "converged": joint.converged, **offset_setting(structure),
         },
-        uncertain(joint, problem), joint=joint,
+        warnings, joint=joint,
         covariance=tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None,
     )  # fmt: skip
 

@@ -94,7 +94,8 @@ def identify(
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
         friction that the model lacks; ``"ramp"``: one that drifts in proportion to time as well. One each run, in
-        ``.comparison.offsets``, estimated anew on any run that the model is judged on. Default what the structure says.
+        ``.comparison.offsets``, estimated anew on any run that the model is judged on; beside a history (a run that
+        starts in motion) it is estimated, but cannot be told from it. Default what the structure says.
 
     Returns
     -------

@@ -14,7 +14,6 @@ from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
 from ftlm.identification.judged import Judged, Task
 from ftlm.paint.heat import Landscape
-from ftlm.solve.records import prepare
 
 #: Points a side of a joint fit's landscape, and its half-width in standard errors.
 SIDE, HALF_WIDTH = 11, 4.0
@@ -111,8 +110,7 @@ class Around:
     @classmethod
     def of(cls, joint: JointFit, task: Task, names: tuple[str, str], *, refit: bool) -> Around:
         """The optimum of the last grid; the estimate is extrapolated to step 0, so it is close by."""
-        decided = prepare(task.runs, replace(task.structure, free_delays={}), None, power_of_two=False)[0].initial
-        problem = FreeProblem.of(replace(task.structure, initial=decided))
+        problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
         weights = [1.0 / joint.noise[o] for o in problem.structure.outputs]
         grid = Grid(problem, task.runs, weights, joint.refinement)
         best = _moved(grid, joint.values, REFITS)

@@ -76,7 +76,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
     if coloured:
         warnings.append(
             f"residuals of {', '.join(coloured)} are not white: the model leaves something out; "
-            "standard errors allow for it"
+            "standard errors allow for the colour, not for the bias of what is left out"
         )
     return warnings
 

@@ -22,7 +22,7 @@ from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol_html
 from ftlm.solve.free_run import compared, respond
 from ftlm.solve.records import Record, check_m, default_m, equation_tuple, initial_tuple, records
-from ftlm.solve.sampled import Sampled, measured_samples, refined
+from ftlm.solve.sampled import Sampled, initial_exponents, measured_samples, refined
 
 #: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
 NEAR_IDENTITY = 0.25
@@ -67,7 +67,8 @@ class Comparison:
         Whether the output error is that of samples at the run's instants; False for pulse means, as the paper has them.
     offsets
         Unknown constants of the equations, one mapping a run: output -> ``"constant"`` [unit of D^alpha y] (and
-        ``"ramp"``, that a second) -> value. Estimated anew on each run; empty for a model without an offset.
+        ``"ramp"``, that a second) -> value. Estimated anew on each run; empty for a model without an offset, and for
+        an output whose run has a history beside it, which hides it.
     """
 
     output_error: dict[str, Metrics]
@@ -136,6 +137,10 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         return comparison_html(self)
+
+
+#: Of an offset beside a history.
+HIDDEN = "not told apart from what the run did before its start; begin the run at rest to learn it"
 
 
 def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -> Comparison:
@@ -224,9 +229,16 @@ def _checked(model: Solved, runs: Run | Sequence[Run], m: int | None) -> tuple[R
 
 
 def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
-    """Constants of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1)."""
+    """Constants of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
+
+    None of an equation whose run has a history beside them: its powers of t hide a constant.
+    """
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
+        alone = initial_exponents(item, "caputo", model.structure.offset)
+        if isinstance(model.structure.initial, str) and not set(initial[item.output]) <= set(alone):
+            out[item.output] = {}
+            continue
         exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
         out[item.output] = {
             name: float(values[np.argmin(np.abs(exponents - power))]) * math.gamma(power + 1.0)
@@ -240,6 +252,9 @@ def offsets_in_words(comparison: Comparison) -> list[str]:
     lines = []
     for (run, _, _), offsets in zip(comparison.per_run, comparison.offsets, strict=False):
         for output, values in offsets.items():
+            if not values:
+                lines.append(f"offset in the equation of {output} in {run}: {HIDDEN}")
+                continue
             ramp = f" and {values['ramp']:.6g} t" if "ramp" in values else ""
             lines.append(
                 f"offset in the equation of {output} in {run} (estimated on that run, for it alone): "

@@ -14,13 +14,13 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import check_pulses, nearest
 from ftlm.base.errors import DataError, ModelError
-from ftlm.base.statistics import is_rest
 from ftlm.data.equations import Equation, Term
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.samples import locked
 from ftlm.data.several import Runs
 from ftlm.data.structures import Initial, Offset, Structure
+from ftlm.solve.motion import decided, has_memory, together
 
 #: The paper's number of block pulses, used where the record carries as many.
 PAPER_M = 2048
@@ -103,11 +103,6 @@ def check_m(m: int, runs: Sequence[Run], *, power_of_two: bool) -> int:
     return m
 
 
-def starts_at_rest(run: Run, structure: Structure) -> bool:
-    """Whether all outputs of a structure start at zero within their noise."""
-    return all(is_rest(run[name]) for name in structure.signals if name in run.outputs)
-
-
 def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> Record:
     """Pulse means of every signal of a structure, delays and sensor filter honoured.
 
@@ -116,9 +111,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     the sensor filter through it (equation error); a coupled free run leaves them. Refuses signals that the run lacks,
     those so small that their squares vanish, and delays of what is no input.
     """
-    initial = structure.initial
-    if initial == "auto":
-        initial = "rest" if starts_at_rest(run, structure) else "caputo"
+    initial = decided(run, structure)
     sensor = None
     if filtered and structure.sensor_filter is not None:
         sensor = sensor_series(structure, m, run.duration / m)
@@ -158,7 +151,13 @@ def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool
         return made()
     filtered = filtered or structure.sensor_filter is None
     read = (structure.signals, structure.delay, structure.free_delays, structure.sensor_filter, structure.initial)
-    return list(runs.keep(repr((read, structure.offset, m, filtered)), made))
+    start = (
+        structure.offset,
+        structure.outputs,
+        has_memory(structure),
+        [e.order.constant for e in structure.equations],
+    )
+    return list(runs.keep(repr((read, start, m, filtered)), made))
 
 
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
@@ -247,9 +246,10 @@ def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_o
     for run in runs:
         run.require_outputs([o for o in structure.outputs if o in run])
     prepared = records(runs, structure, m)
-    if {r.initial for r in prepared} == {"caputo", "rest"}:
+    common = together([r.initial for r in prepared])
+    if common is not None:
         # One rule for all runs of a fit: initial terms that a run at rest does not need are estimated as zero.
-        prepared = records(runs, replace(structure, initial="caputo"), m)
+        prepared = records(runs, replace(structure, initial=common), m)
     for item in structure.equations:
         for term in item.terms:
             if term.fixed is None and term.signal != item.output and not any(r.of(term.signal).any() for r in prepared):

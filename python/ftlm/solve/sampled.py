@@ -18,7 +18,8 @@ from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
-from ftlm.data.structures import Initial, Offset, SensorFilter, offset_exponents
+from ftlm.data.structures import History, Initial, Offset, SensorFilter, offset_exponents
+from ftlm.solve.motion import decided, misfit, needed, root_mean_square
 from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
@@ -78,6 +79,8 @@ def refined(model: Solved, run: Run, initial: Terms | None, *, tolerance: float,
     """
     own = run.length - 1
     every = FIRST_REFINEMENT
+    if initial is None:
+        model = started(model, run)
     coarse, known = _tried(model, run, every, initial)
     terms = known
     best, change = coarse, np.full(len(model.outputs), np.inf)
@@ -100,6 +103,25 @@ def refined(model: Solved, run: Run, initial: Terms | None, *, tolerance: float,
         if np.all(change <= tolerance):
             break
     return Sampled(best, terms, every, change)
+
+
+def started(model: Solved, run: Run) -> Solved:
+    """The model with its initial terms decided on a run: Caputo's where the run's samples ask for no other history."""
+    start = decided(run, model.structure)
+    long = replace(model, structure=replace(model.structure, initial=start))
+    if model.structure.initial != "auto" or not isinstance(start, History):
+        return long
+    short = replace(model, structure=replace(model.structure, initial="caputo"))
+    try:
+        measured = measured_samples(model, run, FIRST_REFINEMENT)
+        (few, ours), (many, theirs) = (sampled(each, run, FIRST_REFINEMENT, None) for each in (short, long))
+    except ModelError:
+        # The coarse grid makes the equations unsolvable; finer ones need not.
+        return long
+    more = sum(map(len, theirs.values())) - sum(map(len, ours.values()))
+    size, count = np.std(measured, axis=1), measured.shape[1]
+    excess = misfit(root_mean_square(measured - few), root_mean_square(measured - many), size, count)
+    return long if needed(model.structure, excess, more) else short
 
 
 def _limit(coarse: Terms, fine: Terms) -> dict[str, dict[float, float]]:

@@ -1,0 +1,294 @@
+"""Runs that start in motion, measured: coverage of intervals, bases for the history against each other, weak pasts.
+
+``python benches/history.py WHAT [--seeds 20] [--plants "0.7|1.7, 0.6"] [--write]`` prints tables; ``--write`` appends
+them to benches/RESULTS.md. WHAT is intervals (fits of both halves of a motion, and of the second with Caputo's terms),
+bases (the bias that each basis leaves and what it costs, by linear algebra on its own scheme) or waits (a run from
+rest, or after a wait that lets a past fade). Seeds are 0 to ``--seeds`` less one, noise is 1 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from math import ceil, gamma
+from pathlib import Path
+
+import numpy as np
+from scipy.signal import fftconvolve
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
+
+import ftlm
+import motion
+
+#: Half-width of a 95 % interval in standard errors.
+NORMAL_95 = 1.959963984540054
+PROCESSES = 1
+
+
+def told(names: list[str], numbers: np.ndarray, form: str) -> str:
+    """Numbers by name on one line."""
+    return ", ".join(f"{n} {v:{form}}" for n, v in zip(names, numbers, strict=True))
+
+
+# -------------------------------------------------------------------------------------------------- intervals
+
+
+def halves(name: str, seed: int) -> tuple[list[list[float]], list[list[float]], list[list[float]]]:
+    """z-scores, values and standard errors of the first half, the second, and the second with Caputo's terms."""
+    plant = motion.PLANTS[name]
+    first, second = motion.pieces(plant, seed)
+    z, values, errors = [], [], []
+    for run, initial in ((first, "auto"), (second, "auto"), (second, "caputo")):
+        found = ftlm.identify(run, ftlm.equation(plant.words, initial=initial), threads=1)
+        z.append(list(motion.scores(found, plant).values()))
+        numbers = {**found.orders, **found.coefficients}
+        values.append([numbers[n] for n in plant.truth])
+        errors.append([found.standard_errors[n] for n in plant.truth])
+    return z, values, errors
+
+
+def intervals(plants: list[str], seeds: int) -> Iterator[str]:
+    """Coverage from rest and in motion, and whether halves agree."""
+    pooled = []
+    with ProcessPoolExecutor(PROCESSES) as pool:
+        for name in plants:
+            z, values, errors = (np.array(x) for x in zip(*pool.map(partial(halves, name), range(seeds)), strict=True))
+            held = np.abs(z) < NORMAL_95
+            apart = np.abs(values[:, 0] - values[:, 1]) / np.hypot(errors[:, 0], errors[:, 1]) < NORMAL_95
+            pooled.append((held[:, 0].ravel(), held[:, 1].ravel(), apart.ravel()))
+            names = list(motion.PLANTS[name].truth)
+            yield (
+                f"alpha {name}, {seeds} seeds, within 95 % intervals: from rest {told(names, held[:, 0].sum(0), 'd')}; "
+                f"in motion {told(names, held[:, 1].sum(0), 'd')}; with Caputo's terms "
+                f"{told(names, held[:, 2].sum(0), 'd')}; halves agree {told(names, apart.sum(0), 'd')}; standard "
+                f"errors in motion over those from rest {told(names, np.median(errors[:, 1] / errors[:, 0], 0), '.2f')}"
+            )
+    rest, moving, agree = (100 * np.mean(np.concatenate(part)) for part in zip(*pooled, strict=True))
+    yield f"pooled: from rest {rest:.1f} %, in motion {moving:.1f} %, halves agree {agree:.1f} %"
+
+
+# ------------------------------------------------------------------------------------------------------ waits
+
+
+def after(name: str, wait: int | None, seed: int) -> tuple[list[float], str]:
+    """z-scores of a run after a motion and a wait of so many samples at u = 0; None: from rest."""
+    plant, rows, step = motion.PLANTS[name], 500, 0.05
+    lead = 0 if wait is None else rows + wait
+    u = motion.held_command(rows + lead, seed, 20)
+    u[min(rows, lead) : lead] = 0.0
+    y = motion.response(plant, u, step)[lead:]
+    y = y + 0.01 * np.std(y) * np.random.default_rng([seed, 2]).standard_normal(rows)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u[lead:]}, outputs={"y": y})
+    found = ftlm.identify(run, ftlm.equation(plant.words), threads=1)
+    return list(motion.scores(found, plant).values()), str(found.settings["initial"]).partition(",")[0]
+
+
+def waits(plants: list[str], seeds: int) -> Iterator[str]:
+    """Coverage where the past fades, and what was estimated of it."""
+    with ProcessPoolExecutor(PROCESSES) as pool:
+        for name in plants:
+            names = list(motion.PLANTS[name].truth)
+            for wait in (None, 0, 20, 100, 400, 1600, 6400):
+                z, kinds = zip(*pool.map(partial(after, name, wait), range(seeds)), strict=True)
+                held = np.sum(np.abs(np.array(z)) < NORMAL_95, axis=0)
+                when = "from rest" if wait is None else f"{wait} samples after a motion of 500"
+                chosen = ", ".join(f"{kind} {kinds.count(kind)}" for kind in sorted(set(kinds)))
+                yield f"alpha {name}, {when}, {seeds} seeds: within {told(names, held, 'd')}; initial terms: {chosen}"
+
+
+# ------------------------------------------------------------------------------------------------------ bases
+
+
+def kernel(eta: float, m: int, step: float) -> np.ndarray:
+    """I^eta on pulse means, as printed: good to 1e-9 at these lengths."""
+    powers = np.arange(m + 1.0) ** (eta + 1)
+    v = np.concatenate([[1.0], np.diff(powers, 2)])
+    return v * step**eta / gamma(eta + 2)
+
+
+def times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Product of series."""
+    return fftconvolve(a, b)[: len(b)]
+
+
+def inverse(series: np.ndarray) -> np.ndarray:
+    """1 / series by Newton's iteration."""
+    out = np.array([1.0 / series[0]])
+    while len(out) < len(series):
+        k = min(2 * len(out), len(series))
+        out = np.concatenate([out, np.zeros(k - len(out))])
+        rest = -times(series[:k], out)
+        rest[0] += 2.0
+        out = times(out, rest)
+    return out
+
+
+def powers_of_time(exponents: np.ndarray, m: int, step: float) -> list[np.ndarray]:
+    """Means of t^e."""
+    edges = np.arange(m + 1) * step
+    return [np.diff(edges ** (e + 1)) / (e + 1) / step for e in exponents]
+
+
+def quarters(last: int) -> Callable[[motion.Plant, int, float], list[np.ndarray]]:
+    """Powers of t in quarters, and t^2."""
+    exponents = np.array(sorted({*(k / 4 for k in range(last + 1)), 1.0, 2.0}))
+    return lambda _, m, step: powers_of_time(exponents, m, step)
+
+
+def caputo(plant: motion.Plant, m: int, step: float) -> list[np.ndarray]:
+    """Caputo's terms."""
+    exponents = {float(i) for i in range(ceil(plant.alpha))}
+    exponents |= {round(plant.alpha - nu + i, 9) for _, nu in plant.own for i in range(ceil(nu))}
+    return powers_of_time(np.array(sorted(exponents)), m, step)
+
+
+def decays(count: int) -> Callable[[motion.Plant, int, float], list[np.ndarray]]:
+    """Diffusive states: whole powers and exponentials, rates from half the record's to a third of a pulse's."""
+
+    def basis(plant: motion.Plant, m: int, step: float) -> list[np.ndarray]:
+        edges = np.arange(m + 1) * step
+        rates = np.geomspace(0.5 / (m * step), 0.3 / step, count)
+        return powers_of_time(np.arange(ceil(plant.alpha), dtype=float), m, step) + [
+            -np.diff(np.exp(-rate * edges)) / rate / step for rate in rates
+        ]
+
+    return basis
+
+
+def tails(plant: motion.Plant, m: int, step: float) -> list[np.ndarray]:
+    """What past pieces of the signals leave, at the true orders: their principal components are the best basis."""
+    edges, past = np.arange(m + 1) * step, np.geomspace(step, 100 * m * step, 60)
+    columns = []
+    for eta in sorted({plant.alpha - nu for _, nu in (*plant.own, *plant.inputs)}):
+        since = [np.diff((edges + s) ** (eta + 1)) / step / gamma(eta + 2) for s in past]
+        pieces = zip(since[1:], since[:-1], np.sqrt(np.diff(past)), strict=True)
+        columns += [(late - early) / root for late, early, root in pieces]
+        columns.append(since[0] - powers_of_time(np.array([eta]), m, step)[0] / gamma(eta + 1))
+    return columns
+
+
+BASES = {
+    "Caputo's terms": (caputo, 0),
+    "0, 1/4, 1/2, 3/4, 1, 2": (quarters(4), 0),
+    "quarters to 1.5, 2": (quarters(6), 0),
+    "quarters to 2": (quarters(8), 0),
+    "quarters to 2.5": (quarters(10), 0),
+    "4 exponentials": (decays(4), 0),
+    "6 exponentials": (decays(6), 0),
+    "8 exponentials": (decays(8), 0),
+    "4 principal tails": (tails, 4),
+    "6 principal tails": (tails, 6),
+    "8 principal tails": (tails, 8),
+}
+
+
+def left(plant: motion.Plant, seed: int, noise: float) -> dict[str, tuple[float, np.ndarray, np.ndarray, int]]:
+    """Of each basis: misfit over noise, bias and cost of each number in standard errors, and how many terms it has."""
+    rows, over, step = 500, 4, 0.05
+    m, fine = rows * over, step / over
+    u = np.repeat(motion.held_command(2 * rows, seed, 20), over)
+    truth = np.array([plant.alpha, *(c for c, _ in plant.own), *(b for b, _ in plant.inputs), *(
+        nu for _, nu in plant.own if nu)])  # fmt: skip
+
+    def system(numbers: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
+        orders = iter(numbers[1 + len(plant.own) + len(plant.inputs) :])
+        own = [(c, next(orders) if nu else 0.0) for c, (_, nu) in zip(numbers[1:], plant.own, strict=False)]
+        after_own = numbers[1 + len(plant.own) :]
+        divisor = -sum(c * kernel(numbers[0] - nu, length, fine) for c, nu in own)
+        divisor[0] += 1.0
+        drive = [b * kernel(numbers[0] - nu, length, fine) for b, (_, nu) in zip(after_own, plant.inputs, strict=False)]
+        return inverse(divisor), np.sum(drive, axis=0)
+
+    def samples(means: np.ndarray) -> np.ndarray:
+        return 0.5 * (means[over - 1 : -1 : over] + means[over::over])
+
+    def slopes(past: np.ndarray) -> np.ndarray:
+        columns = []
+        for i in range(len(truth)):
+            ends = []
+            for sign in (1e-4, -1e-4):
+                moved = truth.copy()
+                moved[i] += sign
+                solved, drive = system(moved, m)
+                ends.append(times(solved, times(drive, u[m:]) + past))
+            columns.append(samples(ends[0] - ends[1]) / 2e-4)
+        return np.array(columns).T
+
+    solved, drive = system(truth, 2 * m)
+    y = times(solved, times(drive, u))[m:]
+    sigma = noise * np.std(y)
+    solved, drive = solved[:m], drive[:m]
+    rest = samples(y - times(solved, times(drive, u[m:])))
+    alone = slopes(np.zeros(m))
+    errors = np.sqrt(np.diag(np.linalg.inv(alone.T @ alone)))
+    out = {}
+    for name, (made, kept) in BASES.items():
+        basis = made(plant, m, fine)
+        if kept:
+            seen = np.array([samples(times(solved, b)) for b in basis]).T
+            _, sizes, rows_of = np.linalg.svd(seen, full_matrices=False)
+            basis = [sum(v * b for v, b in zip(rows_of[i] / sizes[i], basis, strict=True)) for i in range(kept)]
+        columns = np.array([samples(times(solved, b)) for b in basis]).T
+        size = np.linalg.norm(columns, axis=0)
+        spanned, _ = np.linalg.qr(columns / size)
+        x = np.linalg.lstsq(columns / size, rest, rcond=1e-13)[0] / size
+        sensitive = slopes(sum(v * b for v, b in zip(x, basis, strict=True)))
+        sensitive -= spanned @ (spanned.T @ sensitive)
+        missed = rest - spanned @ (spanned.T @ rest)
+        covariance = np.linalg.inv(sensitive.T @ sensitive)
+        found = np.sqrt(np.diag(covariance))
+        bias = covariance @ (sensitive.T @ missed) / (sigma * found)
+        out[name] = (float(np.linalg.norm(missed) / sigma), bias, found / errors, len(basis))
+    return out
+
+
+def bases(plants: list[str], seeds: int) -> Iterator[str]:
+    """What each basis leaves of the second half of a motion, and what it costs, to first order.
+
+    Misfit and bias are proportional to the signal over the noise: at 0.1 % they are ten times these.
+    """
+    for name in plants:
+        with ProcessPoolExecutor(PROCESSES) as pool:
+            tables = list(pool.map(partial(left, motion.PLANTS[name], noise=0.01), range(seeds)))
+        for basis in BASES:
+            misfit, bias, cost, terms = zip(*(table[basis] for table in tables), strict=True)
+            worst = float(np.max(np.sqrt(np.mean(np.array(bias) ** 2, axis=0))))
+            price = np.median(np.array(cost), axis=0)
+            yield (
+                f"alpha {name}, {basis} ({terms[0]} terms): misfit {np.median(misfit):.2g} standard deviations of the "
+                f"noise, bias {worst:.2g} standard errors of the worst number, standard errors {price.min():.2f} to "
+                f"{price.max():.2f} times those from rest"
+            )
+
+
+def main() -> None:
+    """Measure and print; append with ``--write``."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("intervals", "bases", "waits"))
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--plants", default="|".join(motion.PLANTS))
+    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    arguments = parser.parse_args()
+    measured = {"intervals": intervals, "bases": bases, "waits": waits}[arguments.what]
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    given = [f'"{a}"' if "|" in a or " " in a else a for a in sys.argv[1:] if a != "--write"]
+    command = " ".join(["python benches/history.py", *given])
+    lines = [f"`{command}`, commit {commit.stdout.strip()}, {platform.machine()}:", ""]
+    print(lines[0])
+    for row in measured(arguments.plants.split("|"), arguments.seeds):
+        lines.append(f"- {row}")
+        print(lines[-1], flush=True)
+    if arguments.write:
+        results = Path(__file__).with_name("RESULTS.md")
+        with results.open("a", encoding="utf-8") as file:
+            file.write("\n" + "\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

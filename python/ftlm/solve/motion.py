@@ -1,0 +1,115 @@
+"""How a run starts: at rest, or in motion, with powers of time for what it did before.
+
+A fractional integral remembers all that was before the run: to c I^eta s it adds c/Gamma(eta) times the integral of
+(t + s)^(eta-1) over the past s, which is no finite sum. It is smooth but for a start like t^eta, so a few powers of t
+in quarters reproduce it to any noise; Caputo's own terms, those of a past in which nothing moved, do not. How many are
+needed follows from how far the run stands above its noise, never from how well they fit: a length chosen by the fit
+would make its intervals too short. The fit only decides between Caputo's terms and all of these, in favour of these
+wherever there is a doubt.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+from ftlm.base.statistics import chi_squared, is_rest, noise_of
+from ftlm.data.run import Run
+from ftlm.data.structures import History, Initial, Structure
+
+#: Distance between the powers of time.
+QUARTER = 0.25
+#: Highest power, in quarters, that a signal REFERENCE times the deviation of its noise's mean needs: biases stay below
+#: a tenth of a standard error (benches/RESULTS.md).
+REFERENCE, QUARTERS = 2500.0, 6
+#: One quarter more lets this factor less of the past through.
+FACTOR = 2.5
+#: Fewest and most quarters.
+LEAST, MOST = 2, 12
+#: Samples a run has for each quarter at least.
+SPARSEST = 16
+#: Whole powers below this stand among the quarters always, so that their list is that of any order up to 3.
+WHOLE = 3
+#: Caputo's terms are enough where a past that holds no more would leave a larger misfit than theirs in this share of
+#: runs. The usual share of 1 or 5 % would let a weak past through unseen, with intervals too short for its bias. Beside
+#: an offset, which explains a first value away from zero by itself and which a history would hide, it is less.
+DOUBT, DOUBT_BESIDE_OFFSET = 0.25, 0.02
+#: Residuals below this share of an output are rounding and discretisation, of which no test says anything.
+EXACT = 3e-5
+
+
+def starts_at_rest(run: Run, structure: Structure) -> bool:
+    """Whether all outputs of a structure start at zero within their noise."""
+    return all(is_rest(run[name]) for name in structure.signals if name in run.outputs)
+
+
+def has_memory(structure: Structure) -> bool:
+    """Whether an order of a structure is free or no whole number: then what was before the run is no finite sum."""
+    orders = [o for e in structure.equations for o in (e.order, *(t.order for t in e.terms))]
+    return any(o.names or o.constant != round(o.constant) for o in orders)
+
+
+def history(run: Run, structure: Structure) -> History:
+    """Powers of time for what the run did before its start, as many as its outputs' noise lets through."""
+    visible = 1.0
+    for name in structure.outputs:
+        if name in run:
+            samples = run[name]
+            # A level that is no offset is a part of the past; one that is takes no power of its own.
+            size = float(np.linalg.norm(samples - (0.0 if structure.offset == "none" else np.mean(samples))))
+            if size:
+                visible = max(visible, size / max(noise_of(samples), np.finfo(np.float64).eps * size))
+    quarters = QUARTERS + math.ceil(math.log(visible / REFERENCE) / math.log(FACTOR))
+    quarters = max(LEAST, min(quarters, MOST, run.length // SPARSEST))
+    highest = max((e.order.constant for e in structure.equations if not e.order.names), default=0.0)
+    whole = range(max(WHOLE, math.ceil(highest)))
+    return History(sorted({*(QUARTER * k for k in range(quarters + 1)), *map(float, whole)}))
+
+
+def decided(run: Run, structure: Structure) -> Initial:
+    """The initial terms of a structure on a run, where it leaves them open."""
+    initial = structure.initial
+    if initial == "auto":
+        if starts_at_rest(run, structure):
+            return "rest"
+        initial = "history" if has_memory(structure) else "caputo"
+    return history(run, structure) if initial == "history" else initial
+
+
+def together(decisions: list[Initial]) -> Initial | None:
+    """One decision for runs of one fit, or None where they agree: the longest; a run at rest finds zeros for it."""
+    if len(set(decisions)) < 2:
+        return None
+    return max(decisions, key=lambda d: (isinstance(d, tuple), d == "caputo", len(d)))
+
+
+def misfit(few: Floats, many: Floats, size: Floats, count: float) -> float:
+    """By how much residuals with few initial terms exceed those with many, in units of noise.
+
+    Where the few are enough this is distributed as chi-squared, with as many degrees as there are terms more.
+
+    Parameters
+    ----------
+    few, many, size
+        Root mean square of the residuals, and deviation of what was measured, of each output.
+    count
+        Samples of each output.
+    """
+    seen = few > EXACT * size
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        return float(np.nansum(np.where(seen, count * ((few / many) ** 2 - 1.0), 0.0)))
+
+
+def root_mean_square(residuals: Floats) -> Floats:
+    """Of each row."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        rows: Floats = np.sqrt(np.mean(residuals**2, axis=1))
+    return rows
+
+
+def needed(structure: Structure, excess: float, terms: int) -> bool:
+    """Whether such an excess over residuals with so many terms more asks for a history beside Caputo's terms."""
+    doubt = DOUBT if structure.offset == "none" else DOUBT_BESIDE_OFFSET
+    return terms > 0 and excess > chi_squared(terms, 1.0 - doubt)
