@@ -20,6 +20,7 @@ from ftlm.fit.genetic import Genetic, genetic_search
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.identification.judged import Task
+from ftlm.identification.local import errors_with_orders
 from ftlm.identification.warnings import broken_law, uncertain
 from ftlm.judge.comparison import compare_means
 from ftlm.model.model import Model
@@ -131,6 +132,10 @@ def by_lattice(
         m = min(MOST_PULSES, *(run.length - 1 for run in task.runs))
     at_orders = structure.with_orders(orders)
     fit = estimate_coefficients(task.runs, at_orders, settings, m)
+    errors: Mapping[str, float] = fit.errors
+    if orders and fit.errors:
+        # At orders that are themselves estimates, those of the coefficients alone are too sure.
+        errors = errors_with_orders(task.runs, structure, {**orders, **fit.values}) or {}
     model = solved(task, method, at_orders.with_coefficients(fit.values), orders, fit.m, **settings.to_dict())
     edges = [(n, v) for search in searches.values() for n, v in search.edges.items()]
     return Fit(
@@ -143,7 +148,7 @@ def by_lattice(
             *fit.warnings, *step_bias(task.runs, at_orders, settings, fit), *broken_law(model),
             *(f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in edges),
         ],
-        searches, fit.errors,
+        searches, errors,
     )  # fmt: skip
 
 
