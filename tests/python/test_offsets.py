@@ -222,7 +222,7 @@ def test_words_say_an_offset_and_are_printed_back():
         (lambda: ftlm.equation("D y = -a y + c + c0"), "stands there twice"),
         (lambda: ftlm.equation("D x = a x + c; D y = b y"), "the equation of x has an offset, that of y has none"),
         (lambda: ftlm.equation("D y = -a y + c", offset="none"), "has an offset, but offset='none'"),
-        (lambda: ftlm.equation("D y = -a y", offset="auto"), "use 'none', 'constant' or 'ramp'"),
+        (lambda: ftlm.equation("D y = -a y", offset="some"), "use 'none', 'constant', 'ramp' or 'auto'"),
         (lambda: ftlm.equation("D^0.8 y = -a y + c", initial=(0.0, 0.8)), "leave 0.8 out of initial"),
         (lambda: ftlm.equation("D^0.8 y = -a y", initial=(1.8,), offset="ramp"), "leave 1.8 out of initial"),
     ],

@@ -210,9 +210,9 @@ def unasked_offset(test: OffsetTest | None, outputs: Sequence[str]) -> list[str]
     if test is None or not test.exceeds(UNASKED, size=VISIBLE):
         return []
     return [
-        f"an unknown constant in the equation of {', '.join(outputs)} explains {100 * min(test.share, 1):.2g} % of what "
-        f"the model misses ({test.figures}): a sensor's zero, a load, a voltage at rest; use offset='constant', or "
-        "offset='auto'"
+        f"an unknown constant in the equation of {', '.join(outputs)} explains {100 * min(test.share, 1):.2g} % of "
+        f"what the model misses ({test.figures}): a sensor's zero, a load, a voltage at rest; use offset='constant' "
+        "or offset='auto'"
     ]
 
 

@@ -56,9 +56,7 @@ class FeedbackTest:
         return {**shown, "found": self.found, "instant": self.instant, "decided": self.decided}
 
 
-def past_columns(
-    signal: Floats, first: int, reach: int, *, dense: int = DENSE, wider: float = WIDER
-) -> list[Floats]:
+def past_columns(signal: Floats, first: int, reach: int, *, dense: int = DENSE, wider: float = WIDER) -> list[Floats]:
     """Samples of a signal from ``first`` to ``dense`` rows back, then means of ever longer blocks up to ``reach``.
 
     What is before the first row counts as the first value, so a reach may be as long as the signal and no longer.
@@ -110,8 +108,8 @@ def _statistic(
     before, ahead, residuals, rows = [], [], [], 0
     sizes = [e.size for e in white if e.size > DENSE + AHEAD[-1]]
     reach = min(sizes, default=0) // 2
-    for run, (e, u) in enumerate(zip(white, signal, strict=True)):
-        e, u = e[: MOST_ROWS - rows], u[: MOST_ROWS - rows]
+    for run, (every, driving) in enumerate(zip(white, signal, strict=True)):
+        e, u = every[: MOST_ROWS - rows], driving[: MOST_ROWS - rows]
         inner = slice(DENSE, e.size - AHEAD[-1])
         if e.size <= max(DENSE + AHEAD[-1], reach):
             continue
