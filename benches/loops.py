@@ -134,8 +134,8 @@ def cell(seeds: int) -> Iterator[str]:
         words = ", ".join(f"{n} {last.joint_values[n]:.5g} ± {last.standard_errors[n]:.2g}" for n in truth)
         yield (
             f"cell, {hold}, 50 000 rows, 1 % noise, {seeds} seeds: mean z "
-            f"{', '.join(f'{v:.2f}' for v in z.mean(axis=0))}, covered {100 * np.mean(np.abs(z) < 1.96):.0f} %; the last "
-            f"{words} (truth {', '.join(f'{v:.5g}' for v in truth.values())}); "
+            f"{', '.join(f'{v:.2f}' for v in z.mean(axis=0))}, covered {100 * np.mean(np.abs(z) < 1.96):.0f} %; the "
+            f"last {words} (truth {', '.join(f'{v:.5g}' for v in truth.values())}); "
             f"{np.mean([e[1] for e in ended]):.1f} s a fit"
         )
 

@@ -17,6 +17,7 @@ KINDS = {
     "open, coloured": (0.9, 0.1, 0.0, 0.0, 25),
     "closed, white": (0.0, 0.1, 1.0, 0.0, 25),
     "closed, coloured": (0.9, 0.1, 1.0, 0.0, 25),
+    "closed, coloured, biased": (0.9, 0.5, 3.0, 2.0, 40),
     "closed, coloured, strong": (0.9, 0.5, 3.0, 0.0, 200),
     "closed, coloured, integral": (0.9, 1.0, 2.0, 1.0, 150),
 }

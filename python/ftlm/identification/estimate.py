@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -13,10 +13,12 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
+from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Initial, Structure
 from ftlm.fit.coefficients import estimate_coefficients, step_bias
 from ftlm.fit.genetic import Genetic, genetic_search
+from ftlm.fit.instrument import instrumented
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.identification.judged import Task
@@ -89,14 +91,18 @@ def offset_setting(structure: Structure) -> dict[str, str]:
     return {} if structure.offset == "none" else {"offset": structure.offset}
 
 
-def by_output_error(task: Task, m: int | None, threads: int, progress: Told) -> Fit:
-    """Orders and coefficients together by joint output error."""
+def by_output_error(
+    task: Task, m: int | None, threads: int, progress: Told, answers: Sequence[Run] | None = None
+) -> Fit:
+    """Orders and coefficients together by joint output error; answers of the inputs to a reference are instruments."""
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
     record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False)[0]
     problem = FreeProblem.of(replace(structure, initial=record.initial))
-    joint = fit_output_error(task.runs, problem.structure, threads=threads, progress=progress)
+    joint = fit_output_error(answers or task.runs, problem.structure, threads=threads, progress=progress)
+    if answers is not None:
+        joint = instrumented(joint, problem, task.runs, answers)
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
     identified = structure.with_orders(joint.orders).with_coefficients(problem.named(coefficients))
     moved = problem.number_jacobian(orders, coefficients)

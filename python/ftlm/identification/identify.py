@@ -102,9 +102,9 @@ def identify(
         once with the constant and, where none is asked for, once without. Default what the structure says. Where it
         says none and a constant would explain much, a warning does.
     reference
-        Name of a signal of the runs that drives a closed loop from outside, such as its set point. Estimates then come
-        from the part of every input that follows the reference, which noise that the loop feeds back is no part of. Of
-        ``"output-error"`` and ``"instrumental-variables"``.
+        Name of a signal of the runs that drives a closed loop from outside, such as its set point: the instrument of
+        ``"output-error"``. Residuals are then made orthogonal to what the part of every input that follows the
+        reference does, which noise that the loop feeds back is no part of.
 
     Returns
     -------
@@ -150,19 +150,19 @@ def identify(
             "offset='auto' may need two searches, and a store keeps those of one; use offset='none' or "
             "offset='constant' with store="
         )
-    used, weak = (tuple(several), []) if reference is None else driven_by(several, structure, reference)
+    answers, weak = (None, []) if reference is None else driven_by(several, structure, reference)
 
     def estimate(asked: Structure) -> Fit:
-        task = Task(tuple(used), asked, lattice)
+        task = Task(tuple(several), asked, lattice)
         if method == "output-error":
-            return by_output_error(task, m, settings.threads, progress)
+            return by_output_error(task, m, settings.threads, progress, answers)
         if method == "genetic":
             return by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress)
         return by_lattice(task, settings, m, progress, store, executor)
 
     fit = with_decided_offset(several, structure, estimate)
     if reference is not None:
-        fit = by_reference(fit, reference, tuple(several), weak)
+        fit = by_reference(fit, reference, weak)
     return judged(fit)
 
 

@@ -14,7 +14,6 @@ from ftlm.base.errors import DataError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.identification.estimate import Fit
-from ftlm.identification.judged import Task
 from ftlm.judge.feedback import past_columns
 from ftlm.judge.whitening import autoregression, is_constant
 
@@ -31,10 +30,9 @@ WEAK = 10.0
 def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tuple[list[Run], list[str]]:
     """Runs whose inputs are what a reference explains of them, and what to beware of.
 
-    Two stages (Van den Hof and Schrama, An indirect method for transfer function estimation from closed loop data,
-    Automatica 29, 1993, 1523-1527): the controller and the loop are one linear law from reference to input, fitted by
-    least squares over all runs. What noise puts into an input is not in its answer to the reference, so a fit to that
-    answer has no bias from it.
+    The controller and the loop are one linear law from reference to input, fitted by least squares over all runs, as in
+    the first of two stages (Van den Hof and Schrama, An indirect method for transfer function estimation from closed
+    loop data, Automatica 29, 1993, 1523-1527). What noise puts into an input is not in its answer to the reference.
 
     Raises
     ------
@@ -81,9 +79,9 @@ def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tupl
         found = strength(answers[name], np.split(measured - fits[best], ends), laws[best].shape[1])
         if found < WEAK:
             warnings.append(
-                f"{reference} says little of {name} beside the noise in it (F = {found:.2g}, {WEAK:g} are needed): a weak "
-                "instrument, with which estimates are biased and their intervals too narrow; move the reference more, or "
-                "longer"
+                f"{reference} says little of {name} beside the noise in it (F = {found:.2g}, {WEAK:g} are needed): a "
+                "weak instrument, with which estimates are biased and their intervals too narrow; move the reference "
+                "more, or longer"
             )
     return [_answering(run, k, answers) for k, run in enumerate(runs)], warnings
 
@@ -117,11 +115,8 @@ def _answering(run: Run, number: int, answers: dict[str, list[Floats]]) -> Run:
     )  # fmt: skip
 
 
-def by_reference(fit: Fit, reference: str, runs: tuple[Run, ...], warnings: Sequence[str]) -> Fit:
-    """A fit to the answers to a reference as one of the runs as they were measured, on which it is judged."""
-    # What noise puts into the inputs stays in these residuals, and is coloured; intervals count it.
+def by_reference(fit: Fit, reference: str, warnings: Sequence[str]) -> Fit:
+    """A fit with a reference as instrument, told as one."""
+    # The noise of a loop is coloured, and no sign of what the model leaves out; intervals count it.
     own = [w for w in fit.warnings if "are not white" not in w]
-    return replace(
-        fit, task=Task(runs, fit.task.structure, fit.task.lattice), warnings=[*own, *warnings],
-        settings={**fit.settings, "reference": reference},
-    )  # fmt: skip
+    return replace(fit, warnings=[*own, *warnings], settings={**fit.settings, "reference": reference})

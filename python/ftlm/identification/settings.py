@@ -28,7 +28,9 @@ def settings_in_words(settings: Mapping[str, Any]) -> str:
     words += f", initial terms: {settings['initial']}"
     words += f", offset: {settings['offset']}, one a run" if "offset" in settings else ""
     words += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
-    return words + (f", inputs as far as they follow {settings['reference']}" if "reference" in settings else "")
+    return words + (
+        f", instrument: what of the inputs follows {settings['reference']}" if "reference" in settings else ""
+    )
 
 
 def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[Cell]]:
@@ -52,7 +54,7 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
     if "offset_test" in settings:
         rows.append(["offset found by test", settings["offset_test"]])
     if "reference" in settings:
-        rows.append(["reference", f"{settings['reference']}; estimated from what of the inputs follows it"])
+        rows.append(["reference", f"{settings['reference']}; instrument: what of the inputs follows it"])
     if searched:
         rows.append(["orders ranked by", f"{settings['criterion']}, {NORMS.get(settings['norm'], settings['norm'])}"])
     return rows

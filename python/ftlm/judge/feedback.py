@@ -88,7 +88,8 @@ def feedback_test(
     signal
         The input, through the same filter.
     others
-        Other inputs, whose past may explain the residuals.
+        Other inputs, whose past may explain the residuals. Their values of the same sample stay out: where one answers
+        at once, it makes whatever drives it look like an answer.
     direct
         Whether the model has direct feed-through from this input, so that its value of the same sample is no answer.
     """
@@ -115,7 +116,7 @@ def _statistic(
             continue
         columns = past_columns(u, 1 - first, reach)
         for other in others:
-            columns += past_columns(other[run][: e.size], 0, reach, dense=10, wider=2.0)
+            columns += past_columns(other[run][: e.size], 1, reach, dense=10, wider=2.0)
         before.append([*(c[inner] for c in columns), np.ones(e.size - AHEAD[-1] - DENSE)])
         ahead.append([u[DENSE + k : e.size - AHEAD[-1] + k] for k in range(first, AHEAD[-1] + 1)])
         residuals.append(e[inner])

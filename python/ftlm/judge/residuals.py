@@ -117,8 +117,8 @@ class OutputResiduals:
     inputs
         Cross-correlations with each input, both through the filter that makes the residuals white.
     loops
-        By input of the runs, whether LATER inputs tell something of a residual that earlier ones do not: a closed loop,
-        not a missing term.
+        By input that its equation reads, whether LATER inputs tell something of a residual that earlier ones do not: a
+        closed loop, not a missing term.
     """
 
     residuals: list[Floats]
@@ -290,7 +290,7 @@ def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Resi
     chapter 11). The filter is causal, so an input that follows the residuals stays later than they are. The variance of
     one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), taken no smaller than for
     white residuals; the verdict is the largest correlation at lags >= 0 against the band that holds for all of them
-    together with 99 % (Šidák). Loops: residuals regressed on past and future of each input of the run, both through the
+    together with 99 % (Šidák). Loops: residuals regressed on past and future of each input, both through the
     same filter; an input that was made beforehand cannot know the noise, however wrong the model (Sims, Money, income,
     and causality, American Economic Review 62, 1972, 540-552). Where an input answers within a sample, lag 0 is not
     judged. A limit above 1 decides nothing, nor does an input that does not move. Both tests are of
@@ -334,7 +334,7 @@ def tested_residuals(model: Solved, runs: Runs, free: Sequence[Sampled], *, lags
         name = item.output
         deviation = math.sqrt(float(np.mean([np.var(run[name]) for run in runs])))
         direct = {t.signal for t in item.terms if t.order.constant >= item.order.constant - GRAIN}
-        commands = {n: n in direct for n in inputs if n in runs[0].inputs}
+        commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
         outputs[name] = _tested(residuals[name], signals, lags, deviation, commands)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
