@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import mpmath
 import numpy as np
 import pytest
 from scipy.signal import dlsim, lsim, lti
 
 import ftlm
+import loops
 from ftlm.fit.joint import JointFit, fit_output_error
 
 STEP = 0.1
@@ -61,3 +63,38 @@ def test_the_truth_lies_within_three_standard_errors(words, system, truth, inter
     assert np.max(np.abs(z)) < 3.0
     # A bias of half an error, or errors of half the size, would show.
     assert 0.4 < np.sqrt(np.mean(z**2)) < 1.6
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_a_cell_with_a_constant_phase_element_feeds_through(hold: str) -> None:
+    # 5 Ohm at once, a diffusive rest of order 0.78; the truth follows from its spectrum of relaxations.
+    scored = []
+    for seed in range(4):
+        found = ftlm.identify(loops.cell_run(800, 0.02, hold, seed, noise=0.01), loops.CELL_STRUCTURE)
+        scored.append([(found.joint_values[n] - v) / found.standard_errors[n] for n, v in loops.CELL.items()])
+        assert found.standard_errors["d"] < 0.02
+    assert np.max(np.abs(scored)) < 3.5
+    assert np.mean(np.abs(scored) < 1.96) >= 0.8
+
+
+@pytest.mark.parametrize("hold", ["zoh", "foh"])
+def test_a_cell_without_noise_is_itself(hold: str) -> None:
+    found = ftlm.identify(loops.cell_run(400, 0.05, hold, 1, noise=0.0), loops.CELL_STRUCTURE)
+    for name, value in loops.CELL.items():
+        assert found.joint_values[name] == pytest.approx(value, rel=2e-4)
+
+
+def test_the_relaxation_of_the_cell_is_the_series_of_mittag_leffler() -> None:
+    t = np.array([0.01, 0.4, 3.0, 9.0])
+    with mpmath.workdps(40):
+        for alpha, rate in ((0.78, 1 / 3), (1.7, 4.0)):
+            for integral, second in ((False, 1), (True, 2)):
+                exact = [
+                    float(x ** (second - 1) * mpmath.nsum(
+                        lambda k, x=x, alpha=alpha, rate=rate, second=second: (-rate * mpmath.mpf(x) ** alpha) ** k
+                        / mpmath.gamma(alpha * k + second), [0, mpmath.inf]))
+                    for x in map(float, t[:3])
+                ]  # fmt: skip
+                np.testing.assert_allclose(
+                    loops.relaxation(t[:3], alpha, rate, integral=integral), exact, rtol=1e-9, atol=1e-12
+                )

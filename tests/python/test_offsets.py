@@ -12,9 +12,11 @@ from scipy.signal import lfilter, lsim
 from typer.testing import CliRunner
 
 import ftlm
+import loops
 import oracles
 from ftlm import cli
 from ftlm.fit.streaming import Streaming
+from ftlm.identification.local import offset_test
 from measured import DATA, needs_data
 
 WORDS = "D^0.8 y = -a y + b u + c"
@@ -222,7 +224,7 @@ def test_words_say_an_offset_and_are_printed_back():
         (lambda: ftlm.equation("D y = -a y + c + c0"), "stands there twice"),
         (lambda: ftlm.equation("D x = a x + c; D y = b y"), "the equation of x has an offset, that of y has none"),
         (lambda: ftlm.equation("D y = -a y + c", offset="none"), "has an offset, but offset='none'"),
-        (lambda: ftlm.equation("D y = -a y", offset="auto"), "use 'none', 'constant' or 'ramp'"),
+        (lambda: ftlm.equation("D y = -a y", offset="some"), "use 'none', 'constant', 'ramp' or 'auto'"),
         (lambda: ftlm.equation("D^0.8 y = -a y + c", initial=(0.0, 0.8)), "leave 0.8 out of initial"),
         (lambda: ftlm.equation("D^0.8 y = -a y", initial=(1.8,), offset="ramp"), "leave 1.8 out of initial"),
     ],
@@ -314,3 +316,151 @@ def test_the_hub_of_the_arm_runs_free_with_an_offset_of_the_current():
     assert without.fit_percent["theta11"] < 70
     assert found.fit_percent["theta11"] > 85
     assert found.information.bic < without.information.bic - 1000
+
+
+# ------------------------------------------------------------------------------------------------ found by its test
+
+
+def test_auto_estimates_an_offset_where_the_runs_ask_for_one_and_says_so(tmp_path):
+    for kind, constant in (("motor", 5.0), ("battery", 3.7)):
+        run, structure, truth = loops.offset_run(kind, constant, 1)
+        found = ftlm.identify(run, structure, offset="auto")
+        assert found.model.structure.offset == "constant"
+        assert found.settings["offset_test"].startswith("constant, since the runs ask for one (chi-squared")
+        for name, value in truth.items():
+            low, high = found.intervals[name]
+            # Three standard errors: 95 % would fail one number in twenty.
+            assert abs(found.joint_values[name] - value) < 3 * (high - low) / 3.92
+        assert "offset found by test: constant, since the runs ask for one" in str(found)
+        # Estimated anew on the run that the model is judged on, and said.
+        other, _, _ = loops.offset_run(kind, -2.0, 2)
+        checked = found.validate(other)
+        zero = checked.offsets[0][run.outputs[0]]["constant"] / found.coefficients["a"]
+        assert zero == pytest.approx(-2.0, rel=0.1)
+        assert checked.fit_percent[run.outputs[0]] > 95
+        assert "estimated on that run, for it alone" in str(checked)
+    run.to_csv(tmp_path / "cell.csv")
+    words = ["identify", str(tmp_path / "cell.csv"), "--structure", "D^alpha v = -a v + b i", "--offset", "auto"]
+    said = CliRunner().invoke(cli.app, [*words, "--json", "--report", str(tmp_path / "r.html")])
+    assert said.exit_code == 0, said.output
+    told = json.loads(said.stdout)
+    assert told["settings"]["offset"] == "constant"
+    assert told["settings"]["offset_test"].startswith("constant")
+    assert "since the runs ask for one" in (tmp_path / "r.html").read_text()
+
+
+def test_auto_leaves_a_record_without_an_offset_as_it_was():
+    run, structure, _ = loops.offset_run("motor", 0.0, 3)
+    plain, found = ftlm.identify(run, structure), ftlm.identify(run, structure, offset="auto")
+    assert found.settings["offset_test"].startswith("none, since the runs ask for none (chi-squared")
+    assert found.comparison.offsets == ()
+    assert found.joint_values == plain.joint_values
+    assert found.standard_errors == plain.standard_errors
+
+
+@pytest.mark.parametrize("kind", ["motor", "coloured"])
+def test_the_test_for_an_offset_keeps_its_level(kind):
+    # At the true numbers, 150 seeds: 1 % is 1.5; at most 6 with a probability of 99.9 %. The oracle of its size: where
+    # noise is white, chi-squared of one degree has the mean 1.
+    found = []
+    for seed in range(150):
+        run, structure, truth = loops.offset_run(kind, 0.0, seed)
+        found.append(offset_test([run], replace(structure, initial="rest"), truth, every=2))
+    assert sum(t.exceeds() for t in found) <= 6
+    assert {t.degrees for t in found} == {1}
+    assert np.mean([t.statistic for t in found]) == pytest.approx(1.0, abs=0.35)
+
+
+def test_the_test_for_an_offset_is_that_of_dense_regression():
+    # The oracle: sensitivities of the free run by differences, noise of known white colour.
+    run, truth = fractional_run(2, 0.02, noise=0.05), {"a": 0.7, "b": 1.4}
+    structure = ftlm.equation("D^0.8 y = -a y + b u", initial="rest")
+    found = offset_test([run], structure, truth, every=4)
+    steps = 4 * (run.length - 1)
+    duration = run.duration
+
+    def free(a: float, b: float, c: float) -> np.ndarray:
+        driven = oracles.pulse_means(run["u"], steps, "zoh")
+        y = oracles.free_run([(-a, 0.0)], [(b, 0.0, driven), (1.0, 0.0, np.full(steps, c))], 0.8, steps, duration)
+        return (1.5 * y[3::4] - 0.5 * y[2::4])[:-1]
+
+    at, small = free(0.7, 1.4, 0.0), 1e-5
+    others = np.stack([free(0.7 + small, 1.4, 0.0) - at, free(0.7, 1.4 + small, 0.0) - at], axis=1)
+    column, missed = free(0.7, 1.4, 1.0) - at, run["y"][1:-1] - at
+    column = column - others @ np.linalg.lstsq(others, column, rcond=None)[0]
+    size = column @ missed / (column @ column)
+    rest = missed - size * column
+    expected = (column @ missed) ** 2 / (column @ column) / (rest @ rest / (rest.size - 3))
+    assert found.statistic == pytest.approx(expected, rel=0.05)
+
+
+def test_an_offset_that_nobody_asked_for_is_spoken_of():
+    run, structure, _ = loops.offset_run("battery", 3.7, 0)
+    (said,) = [w for w in ftlm.identify(run, structure).warnings if "unknown constant" in w]
+    assert "in the equation of v explains" in said
+    assert "use offset='constant' or offset='auto'" in said
+    bare, structure, _ = loops.offset_run("battery", 0.0, 0)
+    assert not [w for w in ftlm.identify(bare, structure).warnings if "unknown constant" in w]
+    for method in ("least-squares", "instrumental-variables"):
+        found = ftlm.identify(run, structure.with_orders({"alpha": 0.8}), method=method, offset="auto")
+        assert found.coefficients["a"] == pytest.approx(0.2, rel=0.15)
+        assert found.settings["offset"] == "constant"
+
+
+def test_auto_says_where_an_offset_cannot_be_told():
+    # An input that never changes does what an offset does, and so does a given initial term of its power.
+    t = 0.1 * np.arange(200)
+    y = -np.expm1(-t) + 0.01 * np.random.default_rng(0).standard_normal(200)
+    still = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.ones(200)}, outputs={"y": y})
+    found = ftlm.identify(still, ftlm.equation("D y = -a y + b u", initial="rest"), offset="auto")
+    assert found.settings["offset_test"].startswith("none: u is constant on every run")
+    ramp = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.sin(t)}, outputs={"y": 1.0 - np.cos(t) + 0.3 * t + 0.5})
+    found = ftlm.identify(ramp, ftlm.equation("D y = b u", initial=(0.0, 1.0)), offset="auto")
+    assert "cannot be told apart" in found.settings["offset_test"]
+    assert found.coefficients["b"] == pytest.approx(1.0, rel=1e-2)
+    with pytest.raises(ftlm.ModelError, match=r"offset='auto' lets ftlm\.identify decide"):
+        ftlm.search_orders(still, ftlm.equation("D^alpha y = -a y + b u", offset="auto"))
+    with pytest.raises(ftlm.ModelError, match=r"offset='auto' lets ftlm\.identify decide"):
+        ftlm.Model(ftlm.equation("D y = -2 y + 3 u", offset="auto"))
+    with pytest.raises(ftlm.ModelError, match="a store keeps those of one"):
+        ftlm.identify(
+            still, ftlm.equation("D^alpha y = -a y + b u"), method="least-squares", offset="auto", store="never"
+        )
+
+
+# ------------------------------------------------------------------------------------------------ the hub of the arm
+
+
+@needs_data
+@pytest.mark.parametrize(("name", "within"), [("psf", (1.1, 19.5)), ("lqr", None)])
+def test_the_offset_of_the_hub_ends_in_the_global_optimum(name, within):
+    # The oracle: with d given, the state-space free run is linear in everything else, so a scan of d alone finds it.
+    run = ftlm.load(
+        DATA / f"two_link_{name}" / f"{name}.csv", time="t_s", inputs={"I1": "Im1_meas_A"},
+        outputs={"theta11": "th11_deg", "theta12": "th12_deg"}, units={"theta11": "deg", "theta12": "deg"},
+    )  # fmt: skip
+    run = run if within is None else run.slice(*within)
+    step = 4 * run.step
+    thin = ftlm.Run.from_arrays(
+        step=step, inputs={"I1": run["I1"][::4]}, outputs={n: run[n][::4] for n in ("theta11", "theta12")}
+    )
+    y, drives = thin["theta11"], [thin["I1"], thin["theta12"], np.ones(thin.length)]
+    clock = np.arange(thin.length) * step
+    best = np.inf
+    for d in np.geomspace(0.05, 3000.0, 80):
+        decay = np.exp(-d * step)
+        columns = [np.ones(thin.length), np.exp(-d * clock)]
+        for drive in drives:
+            # Held over each step: exact for D^2 x = -d D x + drive.
+            gain = (1 - decay) / d
+            rate = lfilter([0.0, gain], [1.0, -decay], drive)
+            moved = gain * rate + (step - gain) / d * drive
+            columns.append(np.cumsum(np.concatenate([[0.0], moved[:-1]])))
+        basis = np.stack(columns, axis=1)
+        basis /= np.linalg.norm(basis, axis=0)
+        best = min(best, np.linalg.norm(y - basis @ np.linalg.lstsq(basis, y, rcond=1e-12)[0]))
+    reached = 100 * (1 - best / np.linalg.norm(y - y.mean()))
+    structure = ftlm.equation("D^2 theta11 = -d D theta11 + b I1 + k theta12 + c")
+    found = ftlm.identify(thin, structure)
+    assert found.fit_percent["theta11"] == pytest.approx(reached, abs=0.3)
+    assert reached == pytest.approx({"psf": 76.4, "lqr": 87.9}[name], abs=0.3)

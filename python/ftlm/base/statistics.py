@@ -41,15 +41,18 @@ def ljung_box(correlations: Floats, count: int) -> float:
     return count * (count + 2) * float(np.sum(correlations**2 / (count - np.arange(1, correlations.size + 1))))
 
 
-def chi_squared_99(degrees: int) -> float:
-    """99 % quantile of chi-squared."""
-    return chi_squared(degrees, 1 - LEVEL)
+def chi_squared(degrees: int, level: float) -> float:
+    """Value that chi-squared exceeds with the probability ``level``, by Wilson and Hilferty.
 
-
-def chi_squared(degrees: int, share: float) -> float:
-    """Quantile of chi-squared by Wilson and Hilferty, good to 0.3 % from five degrees of freedom."""
-    z = NormalDist().inv_cdf(share)
+    Good to 0.3 % from five degrees of freedom, to 1 % from one.
+    """
+    z = NormalDist().inv_cdf(1 - level)
     return degrees * (1 - 2 / (9 * degrees) + z * math.sqrt(2 / (9 * degrees))) ** 3
+
+
+def chi_squared_99(degrees: int) -> float:
+    """99 % quantile of chi-squared; see :func:`chi_squared`."""
+    return chi_squared(degrees, LEVEL)
 
 
 def colour(series: Floats) -> float:

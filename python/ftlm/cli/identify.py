@@ -50,6 +50,9 @@ def identify(
     method: Annotated[Method, Option(help="Estimator.")] = "output-error",
     reading: ReadingOptions, shape: StructureOptions, search: SearchOptions, genetic: GeneticOptions,
     threads: Threads = None,
+    reference: Annotated[
+        Text, Option(metavar="SIGNAL", help="What drives a closed loop from outside; also name it with -u.")
+    ] = None,
     store: Annotated[
         Text, Option(metavar="FILE", help="Keep finished order searches there; the same command goes on.")
     ] = None,
@@ -68,6 +71,7 @@ def identify(
         result = estimation.identify(
             runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
             genetic=genetic.settings(method), threads=threads, progress=progress, store=store,
+            reference=reference,
         )  # fmt: skip
     if out is not None:
         result.model.save(out, force=force)

@@ -121,7 +121,7 @@ class StructureOptions:
     )
     initial: Annotated[str, Option(help="auto, rest, caputo, history, or exponents of t: 0,1.")] = "auto"
     offset: Annotated[
-        Literal["none", "constant", "ramp"] | None,
+        Literal["none", "constant", "ramp", "auto"] | None,
         Option(help="Unknown constant (and ramp) in each equation, one a run; default what the equation says."),
     ] = None
 

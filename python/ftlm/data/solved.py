@@ -11,7 +11,7 @@ import msgspec
 from ftlm.base.checks import check_pulses
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
-from ftlm.data.structures import Structure
+from ftlm.data.structures import Structure, check_decided
 
 
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -60,6 +60,7 @@ class Solved:
     def __post_init__(self) -> None:
         if self.m is not None:
             check_pulses(self.m)
+        check_decided(self.structure.offset)
         if self.structure.free_delays:
             late = ", ".join(self.structure.free_delays)
             raise ModelError(f"the delay of {late} is still free; identify it first, or set it by with_delays")

@@ -24,7 +24,7 @@ class History(tuple[float, ...]):
 
 
 Initial: TypeAlias = Literal["auto", "rest", "caputo", "history"] | tuple[float, ...]
-Offset: TypeAlias = Literal["none", "constant", "ramp"]
+Offset: TypeAlias = Literal["none", "constant", "ramp", "auto"]
 #: What initial terms are called.
 START_WORDS = ("auto", "rest", "caputo", "history")
 
@@ -89,9 +89,18 @@ def check_initial(initial: str | Iterable[float]) -> Initial:
 
 def check_offset(offset: str) -> Offset:
     """Refuse an offset that is no known word."""
-    if offset in ("none", "constant", "ramp"):
+    if offset in ("none", "constant", "ramp", "auto"):
         return offset  # type: ignore[return-value]
-    raise ModelError(f"offset = {offset!r} is not known; use 'none', 'constant' or 'ramp'")
+    raise ModelError(f"offset = {offset!r} is not known; use 'none', 'constant', 'ramp' or 'auto'")
+
+
+def check_decided(offset: str) -> None:
+    """Refuse an offset that nothing has decided yet."""
+    if offset == "auto":
+        raise ModelError(
+            "offset='auto' lets ftlm.identify decide from the runs whether an equation has one; here use offset='none' "
+            "or offset='constant'"
+        )
 
 
 @dataclass(frozen=True)
@@ -145,7 +154,8 @@ class Structure:
         Where its orders lie, if its maker knows; no part of what it says, so never compared nor written.
     offset
         ``"constant"``: each equation has an unknown constant on its right-hand side, ``"ramp"``: a constant and a
-        constant times t; one each run, estimated as initial terms are and never carried to another run.
+        constant times t; one each run, estimated as initial terms are and never carried to another run. ``"auto"``:
+        identification decides between none and a constant.
     """
 
     equations: tuple[Equation, ...]
@@ -366,7 +376,8 @@ class Structure:
         """What an offset adds to an equation in words; nothing without one."""
         taken = {*self.coefficient_names, *self.order_names, *self.signals}
         name = next(n for n in ("c", *(f"c{k}" for k in range(len(taken) + 1))) if n not in taken)
-        return {"none": "", "constant": f" + {name}", "ramp": f" + ({name} + ramp t)"}[self.offset]
+        asked = f" + ({name} if the runs ask for it)"
+        return {"none": "", "constant": f" + {name}", "ramp": f" + ({name} + ramp t)", "auto": asked}[self.offset]
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(str(self))}</pre>"
@@ -379,7 +390,7 @@ def delay_name(signal: str) -> str:
 
 def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
     """Powers of t that an offset is once its equation is integrated, by what they are: c t^alpha / Gamma(alpha + 1)."""
-    names = {"none": (), "constant": ("constant",), "ramp": ("constant", "ramp")}[offset]
+    names = {"none": (), "auto": (), "constant": ("constant",), "ramp": ("constant", "ramp")}[offset]
     return {name: round(alpha + i, 9) for i, name in enumerate(names)}
 
 

@@ -83,4 +83,4 @@ def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
         excess += misfit(root_mean_square(ends[0]), root_mean_square(ends[1]), size, run.length)
         spread = max([spread, *map(colour, ends[1])])
     # Noise that is coloured is followed by slow terms in any run.
-    return terms > 0 and excess / spread > chi_squared(terms, 1.0 - RARE)
+    return terms > 0 and excess / spread > chi_squared(terms, RARE)

@@ -44,7 +44,7 @@ def covariance_of(jacobian: Floats, series: list[Floats], squares: float) -> Flo
     if all(map(is_white, series)):
         middle = squares / max(count - parameters, 1) * (inverse @ inverse.T)
     else:
-        middle = _long_run((inverse @ rows[seen])[:, :count], series)
+        middle = long_run((inverse @ rows[seen])[:, :count], series)
     result: Floats = middle / np.outer(np.where(spread > 0, spread, 1.0), np.where(spread > 0, spread, 1.0))
     result[unseen, :] = result[:, unseen] = np.nan
     result[unseen, unseen] = np.inf
@@ -59,8 +59,8 @@ def deviation(slopes: Floats, spread: Floats) -> Floats:
     return np.where((slopes[:, unseen] != 0).any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _long_run(jacobian: Floats, series: list[Floats]) -> Floats:
-    """Covariance of the scores with Bartlett weights: the middle of the sandwich (doi:10.2307/1913610)."""
+def long_run(jacobian: Floats, series: list[Floats]) -> Floats:
+    """Covariance of sums of scores with Bartlett weights: the middle of the sandwich (doi:10.2307/1913610)."""
     total: Floats = np.zeros((jacobian.shape[0], jacobian.shape[0]))
     at = 0
     for residuals in series:

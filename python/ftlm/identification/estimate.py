@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
@@ -13,14 +13,17 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
+from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.coefficients import estimate_coefficients, step_bias
 from ftlm.fit.genetic import Genetic, genetic_search
 from ftlm.fit.history import fit_any_start
+from ftlm.fit.instrument import instrumented
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
 from ftlm.identification.judged import Task
+from ftlm.identification.local import errors_with_orders
 from ftlm.identification.warnings import broken_law, uncertain
 from ftlm.judge.comparison import compare_means
 from ftlm.model.model import Model
@@ -91,14 +94,18 @@ def offset_setting(structure: Structure) -> dict[str, str]:
     return {} if structure.offset == "none" else {"offset": structure.offset}
 
 
-def by_output_error(task: Task, m: int | None, threads: int, progress: Told) -> Fit:
-    """Orders and coefficients together by joint output error."""
+def by_output_error(
+    task: Task, m: int | None, threads: int, progress: Told, answers: Sequence[Run] | None = None
+) -> Fit:
+    """Orders and coefficients together by joint output error; answers of the inputs to a reference are instruments."""
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
     record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False)[0]
-    joint = fit_any_start(task.runs, structure, record.initial, threads=threads, progress=progress)
+    joint = fit_any_start(answers or task.runs, structure, record.initial, threads=threads, progress=progress)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
+    if answers is not None:
+        joint = instrumented(joint, problem, task.runs, answers)
     warnings = uncertain(joint, problem)
     if record.initial == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
@@ -142,6 +149,10 @@ def by_lattice(
         m = min(MOST_PULSES, *(run.length - 1 for run in task.runs))
     at_orders = structure.with_orders(orders)
     fit = estimate_coefficients(task.runs, at_orders, settings, m)
+    errors: Mapping[str, float] = fit.errors
+    if orders and fit.errors:
+        # At orders that are themselves estimates, those of the coefficients alone are too sure.
+        errors = errors_with_orders(task.runs, structure, {**orders, **fit.values}) or {}
     model = solved(task, method, at_orders.with_coefficients(fit.values), orders, fit.m, **settings.to_dict())
     edges = [(n, v) for search in searches.values() for n, v in search.edges.items()]
     return Fit(
@@ -154,7 +165,7 @@ def by_lattice(
             *fit.warnings, *step_bias(task.runs, at_orders, settings, fit), *broken_law(model),
             *(f"order {n} = {v:g} is on the edge of its interval; widen it" for n, v in edges),
         ],
-        searches, fit.errors,
+        searches, errors,
     )  # fmt: skip
 
 

@@ -18,6 +18,8 @@ from ftlm.data.structures import Structure, check_offset
 from ftlm.fit.genetic import Genetic
 from ftlm.identification.estimate import Fit, by_genetic_algorithm, by_lattice, by_output_error
 from ftlm.identification.judged import Task
+from ftlm.identification.offsets import with_decided_offset
+from ftlm.identification.reference import by_reference, driven_by
 from ftlm.identification.result import Identification
 from ftlm.identification.warnings import discretisation, growing, unexcited
 from ftlm.judge.comparison import Comparison, compared_samples, free_runs
@@ -50,7 +52,8 @@ def identify(
     progress: Callable[[int, int], None] | None = None,
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
-    offset: Literal["none", "constant", "ramp"] | None = None,
+    offset: Literal["none", "constant", "ramp", "auto"] | None = None,
+    reference: str | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
@@ -95,7 +98,14 @@ def identify(
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
         friction that the model lacks; ``"ramp"``: one that drifts in proportion to time as well. One each run, in
         ``.comparison.offsets``, estimated anew on any run that the model is judged on; beside a history (a run that
-        starts in motion) it is estimated, but cannot be told from it. Default what the structure says.
+        starts in motion) it is estimated, but cannot be told from it. ``"auto"``: a constant where the
+        runs ask for one at 99 %, none where they do not, with the statistic in ``.settings["offset_test"]``; it fits
+        once with the constant and, where none is asked for, once without. Default what the structure says. Where it
+        says none and a constant would explain much, a warning does.
+    reference
+        Name of a signal of the runs that drives a closed loop from outside, such as its set point: the instrument of
+        ``"output-error"``. Residuals are then made orthogonal to what the part of every input that follows the
+        reference does, which noise that the loop feeds back is no part of.
 
     Returns
     -------
@@ -105,11 +115,11 @@ def identify(
     Raises
     ------
     DataError
-        Runs that do not fit the structure, or a constant output; a store of other searches, in use, damaged, or that
-        cannot be written.
+        Runs that do not fit the structure, or a constant output; a reference that is not there or does not move; a
+        store of other searches, in use, damaged, or that cannot be written.
     ModelError
         A method that is not known, an option that it does not use, a lattice without or with too many candidates,
-        settings out of range, a store or an executor without an order search.
+        settings out of range, a store or an executor without an order search, a store with ``offset="auto"``.
     ConvergenceError
         Regressors that cannot be told apart at the given orders, or an executor that has lost its workers.
     """
@@ -129,19 +139,32 @@ def identify(
         "prior_covariance": prior_covariance, "rows": rows, "keep": keep,
     }  # fmt: skip
     words = {n: value for n, value in words.items() if value is not None}
-    others = {"lattice": lattice, "genetic": genetic, "store": store, "executor": executor}
+    others = {"lattice": lattice, "genetic": genetic, "store": store, "executor": executor, "reference": reference}
     given = [*(n for n, value in others.items() if value is not None), *words]
     estimator = "least-squares" if method in ("output-error", "genetic") else method
     settings = Settings.check(coefficients=estimator, threads=threads, **words)
     check_used(method, given, free=bool(structure.order_names))
-    task = Task(tuple(several), structure, lattice)
-    if method == "output-error":
-        return judged(by_output_error(task, m, settings.threads, progress))
-    if method == "genetic":
-        return judged(by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress))
     if executor is not None and threads is None:
         settings = replace(settings, threads=1)
-    return judged(by_lattice(task, settings, m, progress, store, executor))
+    if structure.offset == "auto" and store is not None:
+        raise ModelError(
+            "offset='auto' may need two searches, and a store keeps those of one; use offset='none' or "
+            "offset='constant' with store="
+        )
+    answers, weak = (None, []) if reference is None else driven_by(several, structure, reference)
+
+    def estimate(asked: Structure) -> Fit:
+        task = Task(tuple(several), asked, lattice)
+        if method == "output-error":
+            return by_output_error(task, m, settings.threads, progress, answers)
+        if method == "genetic":
+            return by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress)
+        return by_lattice(task, settings, m, progress, store, executor)
+
+    fit = with_decided_offset(several, structure, estimate)
+    if reference is not None:
+        fit = by_reference(fit, reference, weak)
+    return judged(fit)
 
 
 def judged(fit: Fit) -> Identification:
@@ -170,9 +193,12 @@ def judged(fit: Fit) -> Identification:
 
 def _residual_warnings(fit: Fit, tests: Residuals) -> list[str]:
     """Failed tests; of a joint fit it is said already that residuals are coloured, and what that means."""
+    if "reference" in fit.settings:
+        # The loop is known, and its noise is no part of what the model was estimated from.
+        tests = replace(tests, outputs={n: replace(o, loops={}) for n, o in tests.outputs.items()})
     if fit.joint is None:
         return residual_warnings(tests)
-    return [w for w in residual_warnings(tests, floor=ROUNDING) if "not white" not in w]
+    return [w for w in residual_warnings(tests, floor=ROUNDING) if "residuals are not white (" not in w]
 
 
 def _estimate(

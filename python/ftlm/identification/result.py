@@ -177,7 +177,9 @@ class Identification(Judged):
         if self.residuals is not None:
             white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in self.residuals.white.items())
             free = ", ".join(f"{o} {w}" for o, w in self.residuals.independence.items())
-            lines.append(f"residuals white: {white}; independent of the inputs: {free} (99 %)")
+            around = [f"{u} around {o}" for o, r in self.residuals.outputs.items() for u in r.feedback]
+            loop = f"; closed loop of {', '.join(around)}" if around else ""
+            lines.append(f"residuals white: {white}; independent of the inputs: {free}{loop} (99 %)")
         if self.information is not None:
             lines.append(str(self.information))
         for name, search in self.searches.items():

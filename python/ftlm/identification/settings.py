@@ -25,8 +25,12 @@ def settings_in_words(settings: Mapping[str, Any]) -> str:
     if "innovation_length" in settings:
         words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
         words += f", {settings['rows']} rows"
-    offset = f", offset: {settings['offset']}, one a run" if "offset" in settings else ""
-    return f"{words}, initial terms: {settings['initial']}{offset}"
+    words += f", initial terms: {settings['initial']}"
+    words += f", offset: {settings['offset']}, one a run" if "offset" in settings else ""
+    words += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
+    return words + (
+        f", instrument: what of the inputs follows {settings['reference']}" if "reference" in settings else ""
+    )
 
 
 def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[Cell]]:
@@ -47,6 +51,10 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
     rows.append(["initial terms", INITIAL.get(str(settings["initial"]), str(settings["initial"]))])
     if "offset" in settings:
         rows.append(["offset of each equation", f"{settings['offset']}, estimated for each run"])
+    if "offset_test" in settings:
+        rows.append(["offset found by test", settings["offset_test"]])
+    if "reference" in settings:
+        rows.append(["reference", f"{settings['reference']}; instrument: what of the inputs follows it"])
     if searched:
         rows.append(["orders ranked by", f"{settings['criterion']}, {NORMS.get(settings['norm'], settings['norm'])}"])
     return rows

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from statistics import NormalDist
 from typing import Any
 
@@ -21,12 +21,15 @@ from ftlm.data.run import Run
 from ftlm.data.several import Runs, as_runs
 from ftlm.data.solved import Solved, check_solved
 from ftlm.judge.comparison import free_runs
+from ftlm.judge.feedback import FeedbackTest, feedback_test
 from ftlm.judge.metrics import finite
 from ftlm.judge.whitening import autoregression, is_constant, whitened
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, symbol_html
 from ftlm.solve.sampled import Sampled, measured_samples
 
+#: Orders closer than this are one order.
+GRAIN = 1e-9
 #: Residuals below this share of the output's deviation are discretisation or quantisation, not a missing term.
 NEGLIGIBLE = 1e-3
 
@@ -51,6 +54,8 @@ class CorrelationTest:
     decided
         Whether the test could fail at all. A correlation never exceeds 1: where its limit does, or where the input does
         not move, nothing is shown, and the test has neither passed nor failed.
+    first
+        Least lag that is judged: 1 where an input answers the output within the sample, 0 else.
     """
 
     lags: NDArray[np.int64]
@@ -60,6 +65,7 @@ class CorrelationTest:
     limit: float
     passed: bool
     decided: bool = True
+    first: int = 0
 
     @property
     def failed(self) -> bool:
@@ -79,7 +85,7 @@ class CorrelationTest:
     @property
     def largest(self) -> tuple[int, float]:
         """Lag and value of the largest correlation that the statistic judges."""
-        judged = np.where((self.lags >= 0) & (self.values != 1.0), np.abs(self.values), -1.0)
+        judged = np.where((self.lags >= self.first) & (self.values != 1.0), np.abs(self.values), -1.0)
         at = int(np.argmax(judged))
         return int(self.lags[at]), float(self.values[at])
 
@@ -110,9 +116,9 @@ class OutputResiduals:
         Autocorrelations.
     inputs
         Cross-correlations with each input, both through the filter that makes the residuals white.
-    feedback
-        Inputs whose LATER values the residuals correlate with while they do not follow earlier ones: a sign of a closed
-        loop, not of a missing term.
+    loops
+        By input that its equation reads, whether LATER inputs tell something of a residual that earlier ones do not: a
+        closed loop, not a missing term.
     """
 
     residuals: list[Floats]
@@ -120,7 +126,12 @@ class OutputResiduals:
     nr: float
     whiteness: CorrelationTest
     inputs: dict[str, CorrelationTest]
-    feedback: tuple[str, ...]
+    loops: dict[str, FeedbackTest] = field(default_factory=dict)
+
+    @property
+    def feedback(self) -> tuple[str, ...]:
+        """Inputs that answer this output: the runs were made in a closed loop."""
+        return tuple(name for name, test in self.loops.items() if test.found)
 
     @property
     def judged(self) -> dict[str, CorrelationTest]:
@@ -135,6 +146,7 @@ class OutputResiduals:
             "whiteness": self.whiteness.to_dict(),
             "inputs": {n: t.to_dict() for n, t in self.inputs.items()},
             "feedback": list(self.feedback),
+            "loops": {n: t.to_dict() for n, t in self.loops.items()},
         }
 
 
@@ -278,7 +290,10 @@ def resid(model: Solved, runs: Run | Sequence[Run], *, lags: int = LAGS) -> Resi
     chapter 11). The filter is causal, so an input that follows the residuals stays later than they are. The variance of
     one correlation of independent signals is Bartlett's Σρₑ(τ)ρᵤ(τ)/N (doi:10.2307/2983611), taken no smaller than for
     white residuals; the verdict is the largest correlation at lags >= 0 against the band that holds for all of them
-    together with 99 % (Šidák). A limit above 1 decides nothing, nor does an input that does not move. Both tests are of
+    together with 99 % (Šidák). Loops: residuals regressed on past and future of each input, both through the
+    same filter; an input that was made beforehand cannot know the noise, however wrong the model (Sims, Money, income,
+    and causality, American Economic Review 62, 1972, 540-552). Where an input answers within a sample, lag 0 is not
+    judged. A limit above 1 decides nothing, nor does an input that does not move. Both tests are of
     the free run: an equation error that passes proves nothing.
     """
     check_solved(model)
@@ -315,30 +330,46 @@ def tested_residuals(model: Solved, runs: Runs, free: Sequence[Sampled], *, lags
     inputs = list(dict.fromkeys([*runs[0].inputs, *read]))
     signals = {n: [np.ascontiguousarray(run[n][1:-1]) for run in runs] for n in inputs}
     outputs = {}
-    for name in model.outputs:
+    for item in model.equations:
+        name = item.output
         deviation = math.sqrt(float(np.mean([np.var(run[name]) for run in runs])))
-        outputs[name] = _tested(residuals[name], signals, lags, deviation)
+        direct = {t.signal for t in item.terms if t.order.constant >= item.order.constant - GRAIN}
+        commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
+        outputs[name] = _tested(residuals[name], signals, lags, deviation, commands)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
 
 
-def _tested(series: list[Floats], signals: Mapping[str, list[Floats]], lags: int, deviation: float) -> OutputResiduals:
-    """Both tests of one output's residuals; all fail where these are not finite."""
+def _tested(
+    series: list[Floats], signals: Mapping[str, list[Floats]], lags: int, deviation: float, commands: Mapping[str, bool]
+) -> OutputResiduals:
+    """Both tests of one output's residuals, and signs of a loop; all fail where these are not finite.
+
+    Commands are the inputs of the runs, each with whether the model has direct feed-through from it.
+    """
     everything = np.concatenate(series)
     with np.errstate(over="ignore", invalid="ignore"):
         rms = float(np.sqrt(np.mean(everything**2)))
     nr = rms / deviation if deviation > 0 else math.inf
     if not math.isfinite(rms):
         lost, across = _lost(np.arange(lags + 1)), _lost(np.arange(-lags, lags + 1))
-        return OutputResiduals(series, math.inf, math.inf, lost, dict.fromkeys(signals, across), ())
+        return OutputResiduals(series, math.inf, math.inf, lost, dict.fromkeys(signals, across))
     whiteness = _whiteness(series, everything.size, lags)
     # Through this filter the residuals are white, and the inputs lose what they share with them by chance alone.
     colour = autoregression(series, lags)
     white = whitened(series, colour)
-    inputs = {name: _independence(white, values, colour, lags) for name, values in signals.items()}
-    before = {name: float(np.max(np.abs(test.values[:lags]))) for name, test in inputs.items()}
-    feedback = tuple(name for name, test in inputs.items() if test.passed and before[name] > test.limit)
-    return OutputResiduals(series, rms, nr, whiteness, inputs, feedback)
+    through = {n: whitened(v, colour) for n, v in signals.items() if not is_constant(v)}
+    loops = {
+        name: feedback_test(white, through[name], [v for n, v in through.items() if n != name], direct=direct)
+        for name, direct in commands.items()
+        if name in through
+    }
+    inputs = {}
+    for name, values in signals.items():
+        # What answers within the sample is no sign of what the model lacks.
+        at_once = name in loops and loops[name].found and not commands[name]
+        inputs[name] = _independence(white, values, colour, lags, first=int(at_once))
+    return OutputResiduals(series, rms, nr, whiteness, inputs, loops)
 
 
 def _lost(lags: NDArray[np.int64]) -> CorrelationTest:
@@ -354,16 +385,19 @@ def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
     return CorrelationTest(np.arange(lags + 1), own, band, statistic, limit, passed=statistic <= limit)
 
 
-def _independence(white: list[Floats], signal: list[Floats], colour: Floats, lags: int) -> CorrelationTest:
-    """Largest correlation at lags from 0 on against the band that holds for all of them together."""
+def _independence(
+    white: list[Floats], signal: list[Floats], colour: Floats, lags: int, *, first: int
+) -> CorrelationTest:
+    """Largest correlation at lags from ``first`` on against the band that holds for all of them together."""
     around = np.arange(-lags, lags + 1)
     if is_constant(signal):
         return CorrelationTest(around, np.zeros(around.size), math.nan, 0.0, math.nan, passed=False, decided=False)
     cross, variance, _ = _core.correlation(white, whitened(signal, colour), lags)
-    spread, largest = math.sqrt(variance), float(np.max(np.abs(cross[lags:])))
-    limit = NormalDist().inv_cdf(1 - (1 - (1 - LEVEL) ** (1 / (lags + 1))) / 2) * spread
+    spread, largest = math.sqrt(variance), float(np.max(np.abs(cross[lags + first :])))
+    limit = NormalDist().inv_cdf(1 - (1 - (1 - LEVEL) ** (1 / (lags + 1 - first))) / 2) * spread
     decided = limit < 1.0
-    return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, decided and largest <= limit, decided)
+    passed = decided and largest <= limit
+    return CorrelationTest(around, cross, NORMAL_99 * spread, largest, limit, passed, decided, first)
 
 
 def residual_sentences(tests: Residuals) -> list[str]:
@@ -391,18 +425,32 @@ def residual_sentences(tests: Residuals) -> list[str]:
                     f"{name}: residuals still follow {signal} (correlation {value:.2g} at lag {lag}, 99 % limit "
                     f"{test.limit:.2g}): not all of what {signal} does is in the model"
                 )
-        if output.feedback:
-            words.append(
-                f"{name}: residuals come before {', '.join(output.feedback)} and not after: the run was made in a "
-                "closed loop, or the input is correlated with itself"
-            )
+        words += [loop_sentence(name, signal, output) for signal in output.feedback]
     return words
 
 
+def loop_sentence(name: str, signal: str, output: OutputResiduals) -> str:
+    """What a closed loop found in residuals means for what was estimated."""
+    test = output.loops[signal]
+    how = f"{signal} answers what {name} did before" if not test.instant else f"{signal} answers {name} within a sample"
+    or_else = "" if not test.instant else f" (or {signal} feeds through to {name} directly: then add that term)"
+    found = f"{name}: {how} (statistic {test.statistic:.3g}, 99 % limit {test.limit:.3g}): a closed loop{or_else}"
+    if output.whiteness.passed:
+        return f"{found}; with white residuals output error has no bias from it, equation-error methods have"
+    return (
+        f"{found}, and residuals are not white: the noise that comes back with {signal} biases estimates, which their "
+        "intervals do not know; record what drives the loop and name it with reference=, or open the loop"
+    )
+
+
 def residual_warnings(tests: Residuals, *, floor: float = NEGLIGIBLE) -> list[str]:
-    """Failed residual tests in words, without those of outputs that are explained to within ``floor`` of their size."""
+    """Failed residual tests in words, without those of outputs that are explained to within ``floor`` of their size.
+
+    A closed loop counts where residuals are not white: only then does it bias the output error.
+    """
     kept = {name: output for name, output in tests.outputs.items() if not output.nr <= floor}
-    return [w for w in residual_sentences(replace(tests, outputs=kept)) if "closed loop" not in w]
+    harmless = {n: replace(output, loops={}) if output.whiteness.passed else output for n, output in kept.items()}
+    return residual_sentences(replace(tests, outputs=harmless))
 
 
 def residual_table(tests: Residuals, *, title: str = "Residual tests") -> Table:

@@ -112,4 +112,4 @@ def root_mean_square(residuals: Floats) -> Floats:
 def needed(structure: Structure, excess: float, terms: int) -> bool:
     """Whether such an excess over residuals with so many terms more asks for a history beside Caputo's terms."""
     doubt = DOUBT if structure.offset == "none" else DOUBT_BESIDE_OFFSET
-    return terms > 0 and excess > chi_squared(terms, 1.0 - doubt)
+    return terms > 0 and excess > chi_squared(terms, doubt)

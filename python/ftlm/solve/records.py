@@ -19,7 +19,7 @@ from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.samples import locked
 from ftlm.data.several import Runs
-from ftlm.data.structures import Initial, Offset, Structure
+from ftlm.data.structures import Initial, Offset, Structure, check_decided
 from ftlm.solve.motion import decided, has_memory, together
 
 #: The paper's number of block pulses, used where the record carries as many.
@@ -242,6 +242,7 @@ def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
 
 def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_of_two: bool) -> list[Record]:
     """Make the records of runs for an estimator on the equation error, refusing what it cannot be given."""
+    check_decided(structure.offset)
     m = check_m(default_m(runs, power_of_two=power_of_two) if m is None else m, runs, power_of_two=power_of_two)
     for run in runs:
         run.require_outputs([o for o in structure.outputs if o in run])

@@ -1,0 +1,236 @@
+"""The output error around a point: what an offset would explain there, and what free orders add to intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ftlm import _core
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import FtlmError
+from ftlm.base.statistics import LEVEL, chi_squared
+from ftlm.data.equations import Term
+from ftlm.data.orders import Order
+from ftlm.data.run import Run
+from ftlm.data.structures import Initial, Structure
+from ftlm.fit.grid import Attempt, Grid
+from ftlm.fit.problem import FreeProblem
+from ftlm.fit.uncertainty import covariance
+from ftlm.judge.whitening import autoregression
+from ftlm.solve.motion import decided, together
+
+#: Pulses a sample interval where the fit does not say how many it needed.
+EVERY = 2
+#: Lags of the autoregression that stands for the colour of residuals.
+LAGS = 25
+#: Share of what an offset does that other unknowns must leave for it to be told from them.
+TOLD_APART = 1e-6
+#: What explains less of an output than this share of its deviation is rounding and discretisation; than that, nobody
+#: would miss it.
+ROUNDING = 3e-5
+VISIBLE = 1e-3
+#: Share of records without an offset in which one is spoken of that nobody asked for.
+UNASKED = 1e-4
+#: Evaluations from the lattice's point to the optimum between its points.
+EVALUATIONS = 40
+
+
+@dataclass(frozen=True)
+class OffsetTest:
+    """Whether unknown constants in the equations explain more than noise does.
+
+    Parameters
+    ----------
+    statistic
+        Squared sizes of the constants in units of their variances under the colour of the residuals; chi-squared where
+        there is no offset.
+    degrees
+        How many constants the runs tell, over all equations and runs; 0 where they tell none from the other unknowns.
+    share
+        Share of the residuals' sum of squares that the constants explain.
+    size
+        What they explain as a share of the outputs' deviations, root mean square: far below 1, it is rounding.
+    """
+
+    statistic: float
+    degrees: int
+    share: float
+    size: float
+
+    def exceeds(self, level: float = LEVEL, *, size: float = ROUNDING) -> bool:
+        """Whether a record without an offset comes to this with a probability below ``level``, rounding set aside."""
+        return self.degrees > 0 and self.size > size and self.statistic > chi_squared(self.degrees, level)
+
+    @property
+    def figures(self) -> str:
+        """The statistic and its 99 % limit in words."""
+        return f"chi-squared {self.statistic:.4g} of {self.degrees}, 99 % limit {chi_squared(self.degrees, LEVEL):.4g}"
+
+    @property
+    def decision(self) -> str:
+        """What ``offset="auto"`` makes of it, in words."""
+        if not self.degrees:
+            return "none: these runs do not tell one from the other unknowns"
+        if self.exceeds():
+            return f"constant, since the runs ask for one ({self.figures})"
+        return f"none, since the runs ask for none ({self.figures})"
+
+
+def decided_initial(runs: Sequence[Run], structure: Structure) -> Initial:
+    """Initial terms of a fit of all runs together."""
+    starts = [decided(run, structure) for run in runs]
+    return together(starts) or starts[0]
+
+
+def at_point(
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
+) -> tuple[Grid, Attempt]:
+    """The output error at given numbers, each output weighing as its residuals ask for."""
+    problem = FreeProblem.of(replace(structure, initial=decided_initial(runs, structure)))
+    orders, coefficients, delays = problem.split([values[n] for n in problem.names])
+    start = Attempt(orders, coefficients, "given", {}, delays)
+    grid = Grid(problem, runs, [1.0] * len(structure.outputs), every=every)
+    levels = grid.levels(grid.descend(start, 1, plain=True))
+    grid = replace(grid, weights=[1.0 / max(level, 1e-300) for level in levels.values()])
+    return grid, grid.descend(start, 1, plain=True)
+
+
+def offset_test(
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = EVERY
+) -> OffsetTest | None:
+    """Test for an unknown constant in each equation on each run, at given numbers; None where it cannot be computed.
+
+    What an input of ones would do joins the sensitivities of everything that is free, initial terms projected out, with
+    a coefficient of 0. It is a score test made insensitive to errors of the other numbers (Neyman's C(alpha)), so that
+    any consistent estimate will do. Its variance is that of residuals of their own colour, an autoregression.
+    """
+    taken = {*structure.signals, *structure.coefficient_names, *structure.order_names, *runs[0].signals}
+    one = next(n for n in ("one", *(f"one{k}" for k in range(len(taken) + 1))) if n not in taken)
+    names = [f"{one}_{k}" for k in range(len(structure.equations))]
+    equations = tuple(
+        replace(e, terms=(*e.terms, Term(one, Order(), n))) for e, n in zip(structure.equations, names, strict=True)
+    )
+    extended = replace(structure, equations=equations, offset="none")
+    try:
+        grid, here = at_point([_with_ones(run, one) for run in runs], extended, {**values, **dict.fromkeys(names, 0.0)},
+                              every)  # fmt: skip
+    except FtlmError:
+        # No finite free run on this grid: the result says so elsewhere.
+        return None
+    first = len(grid.problem.orders) + grid.problem.coefficients.index(names[0])
+    rows = np.asarray(here.outcome["jacobian"])
+    others = np.delete(rows, range(first, first + len(names)), axis=0)
+    residuals = np.asarray(here.outcome["residuals"])
+    blocks = _blocks(grid)
+    columns = []
+    for row in rows[first : first + len(names)]:
+        for start, stop in ((own[0][0], own[-1][1]) for own in blocks):
+            column = np.zeros(residuals.size)
+            column[start:stop] = row[start:stop]
+            columns.append(column)
+    before = np.stack(columns, axis=1)
+    sizes = np.linalg.norm(before, axis=0)
+    left = before / np.where(sizes > 0, sizes, 1.0)
+    basis = _orthonormal(others.T) if others.size else np.zeros((residuals.size, 0))
+    for _ in range(2):
+        left = left - basis @ (basis.T @ left)
+    directions, spread, _ = np.linalg.svd(left, full_matrices=False)
+    told = directions[:, spread > TOLD_APART]
+    count = told.shape[1]
+    total = float(residuals @ residuals)
+    if count == 0 or not total > 0:
+        return OffsetTest(0.0, 0, 0.0, 0.0)
+    along = told.T @ residuals
+    spread = _coloured(told, residuals - told @ along, blocks, residuals.size - basis.shape[1] - count)
+    statistic = float(along @ np.linalg.pinv(spread) @ along)
+    explained = told @ along
+    sizes = [float(np.std(run[o])) for run in runs for o in structure.outputs]
+    weights = [w for _ in runs for w in grid.weights]
+    places = [place for own in blocks for place in own]
+    size = max(
+        math.sqrt(float(np.mean(explained[a:b] ** 2))) / (w * s) if w * s > 0 else 0.0
+        for (a, b), w, s in zip(places, weights, sizes, strict=True)
+    )
+    return OffsetTest(statistic, count, float(along @ along) / total, size)
+
+
+def _with_ones(run: Run, name: str) -> Run:
+    return Run.from_arrays(
+        step=run.step, inputs={**{n: run[n] for n in run.inputs}, name: np.ones(run.length)},
+        outputs={n: run[n] for n in run.outputs}, intersample=run.intersample, name=run.name,
+    )  # fmt: skip
+
+
+def _blocks(grid: Grid) -> list[list[tuple[int, int]]]:
+    """First and last place of the residuals of every output, by run."""
+    blocks, at = [], 0
+    for run in grid.runs:
+        own = []
+        for _ in grid.problem.structure.outputs:
+            own.append((at, at + run.length - 2))
+            at += run.length - 2
+        blocks.append(own)
+    return blocks
+
+
+def _orthonormal(columns: Floats) -> Floats:
+    sizes = np.linalg.norm(columns, axis=0)
+    directions, spread, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
+    kept: Floats = directions[:, spread > 1e-12 * spread[0]]
+    return kept
+
+
+def _coloured(directions: Floats, noise: Floats, blocks: list[list[tuple[int, int]]], degrees: int) -> Floats:
+    """Covariance of what directions see of noise, each output's an autoregression over all runs."""
+    total: Floats = np.zeros((directions.shape[1], directions.shape[1]))
+    scale = noise.size / max(degrees, 1)
+    for output in range(len(blocks[0])):
+        places = [slice(*own[output]) for own in blocks]
+        series = [noise[p] for p in places]
+        filtered = autoregression(series, LAGS)
+        errors = np.concatenate([np.convolve(e, filtered, "valid") for e in series])
+        power = float(np.mean(errors**2)) * scale
+        for place in places:
+            size = place.stop - place.start
+            divisor = np.zeros(size)
+            divisor[: min(filtered.size, size)] = filtered[:size]
+            # Noise is what 1/A makes of white noise; its transpose runs through the directions backwards.
+            turned = [_core.series_divide(np.ascontiguousarray(d[place][::-1]), divisor) for d in directions.T]
+            stacked = np.stack(turned)
+            total += power * (stacked @ stacked.T)
+    return total
+
+
+def unasked_offset(test: OffsetTest | None, outputs: Sequence[str]) -> list[str]:
+    """Say so where an offset that nobody asked for explains what a model misses."""
+    if test is None or not test.exceeds(UNASKED, size=VISIBLE):
+        return []
+    return [
+        f"an unknown constant in the equation of {', '.join(outputs)} explains {100 * min(test.share, 1):.2g} % of "
+        f"what the model misses ({test.figures}): a sensor's zero, a load, a voltage at rest; use offset='constant' "
+        "or offset='auto'"
+    ]
+
+
+def errors_with_orders(
+    runs: Sequence[Run], structure: Structure, values: Mapping[str, float], *, every: int = EVERY
+) -> dict[str, float] | None:
+    """Standard errors of orders and coefficients found on a lattice; None where they cannot be computed.
+
+    Instruments refined at the optimum make instrumental variables as precise as the output error, so the errors are
+    those of the output error with all orders free, robust to colour, at the optimum between the lattice's points; the
+    way there is what the lattice is off, and counts as an error as well.
+    """
+    try:
+        grid, here = at_point(runs, replace(structure, coefficient_law=()), values, every)
+        there = grid.descend(here, EVALUATIONS, plain=True)
+        spread = np.diag(covariance(there, grid))
+    except FtlmError:
+        return None
+    given = np.array([values[n] for n in grid.problem.names])
+    with np.errstate(invalid="ignore"):
+        errors = np.sqrt(spread + (there.values - given) ** 2)
+    return {n: e if math.isfinite(e) else math.inf for n, e in zip(grid.problem.names, errors.tolist(), strict=True)}

@@ -1,0 +1,160 @@
+"""Whether an input answers an output: what Sims's regression on past and future inputs finds in the residuals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+from ftlm.base.statistics import chi_squared
+from ftlm.judge.metrics import finite
+
+#: Future samples of the input that are looked at: an answer within a few samples hides among many.
+AHEAD = (5, 25)
+#: Share of open loops that one of the two regressions is allowed to call closed.
+LEVEL = 0.01
+#: Past samples that stand by themselves; those before are averaged over ever longer blocks, each wider by this factor.
+DENSE = 25
+WIDER = 1.5
+#: Rows that are looked at: more of them tell the same.
+MOST_ROWS = 50_000
+#: Share of a column that the columns before it must leave.
+SPANNED = 1e-6
+
+
+@dataclass(frozen=True)
+class FeedbackTest:
+    """Whether later inputs tell something of a residual that earlier inputs do not.
+
+    Parameters
+    ----------
+    statistic, limit
+        Sum of squares that later inputs explain in units of the residual's variance, and the value that one open loop
+        in a hundred exceeds.
+    instant
+        Whether only the input of the same sample does: a controller that answers at once, or direct feed-through.
+    decided
+        Whether there were samples enough, and an input that moves.
+    """
+
+    statistic: float
+    limit: float
+    instant: bool
+    decided: bool = True
+
+    @property
+    def found(self) -> bool:
+        """Whether the input answers the output."""
+        return self.decided and self.statistic > self.limit
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        shown = {"statistic": finite(self.statistic), "limit": finite(self.limit)}
+        return {**shown, "found": self.found, "instant": self.instant, "decided": self.decided}
+
+
+def past_columns(signal: Floats, first: int, reach: int, *, dense: int = DENSE, wider: float = WIDER) -> list[Floats]:
+    """Samples of a signal from ``first`` to ``dense`` rows back, then means of ever longer blocks up to ``reach``.
+
+    What is before the first row counts as the first value, so a reach may be as long as the signal and no longer.
+    """
+    count = signal.size
+    padded = np.concatenate([np.full(count, signal[0]), signal])
+    sums = np.concatenate([[0.0], np.cumsum(padded - signal[0])])
+    columns = [padded[count - lag : 2 * count - lag] - signal[0] for lag in range(first, min(dense, reach) + 1)]
+    start, width = dense + 1, max(2, dense // 4)
+    while start + width <= reach:
+        end = np.arange(count, 2 * count) - start + 1
+        columns.append((sums[end] - sums[end - width]) / width)
+        start, width = start + width, int(width * wider) + 1
+    return columns
+
+
+def feedback_test(
+    white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]], *, direct: bool
+) -> FeedbackTest:
+    """Regress residuals on past and future of an input: without feedback the future adds nothing (Sims, 1972).
+
+    An input that is made beforehand cannot know the noise, however wrong the model is: what a model leaves out follows
+    the past of the input, of which long memory is taken in.
+
+    Parameters
+    ----------
+    white
+        Residuals, a run each, through the filter that makes them white.
+    signal
+        The input, through the same filter.
+    others
+        Other inputs, whose past may explain the residuals. Their values of the same sample stay out: where one answers
+        at once, it makes whatever drives it look like an answer.
+    direct
+        Whether the model has direct feed-through from this input, so that its value of the same sample is no answer.
+    """
+    at_once = _statistic(white, signal, others, 1 if direct else 0)
+    if at_once is None:
+        return FeedbackTest(0.0, np.inf, instant=False, decided=False)
+    later = at_once if direct else _statistic(white, signal, others, 1)
+    if later is not None and later[0] > later[1]:
+        return FeedbackTest(*later, instant=False)
+    return FeedbackTest(*at_once, instant=at_once[0] > at_once[1])
+
+
+def _statistic(
+    white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]], first: int
+) -> tuple[float, float] | None:
+    """What inputs from ``first`` samples ahead on explain, and its limit, of the horizon that explains most."""
+    before, ahead, residuals, rows = [], [], [], 0
+    sizes = [e.size for e in white if e.size > DENSE + AHEAD[-1]]
+    reach = min(sizes, default=0) // 2
+    for run, (every, driving) in enumerate(zip(white, signal, strict=True)):
+        e, u = every[: MOST_ROWS - rows], driving[: MOST_ROWS - rows]
+        inner = slice(DENSE, e.size - AHEAD[-1])
+        if e.size <= max(DENSE + AHEAD[-1], reach):
+            continue
+        columns = past_columns(u, 1 - first, reach)
+        for other in others:
+            columns += past_columns(other[run][: e.size], 1, reach, dense=10, wider=2.0)
+        before.append([*(c[inner] for c in columns), np.ones(e.size - AHEAD[-1] - DENSE)])
+        ahead.append([u[DENSE + k : e.size - AHEAD[-1] + k] for k in range(first, AHEAD[-1] + 1)])
+        residuals.append(e[inner])
+        rows += e.size
+        if rows >= MOST_ROWS:
+            break
+    if not residuals:
+        return None
+    past, future = (np.concatenate([np.stack(part, axis=1) for part in parts]) for parts in (before, ahead))
+    target = np.concatenate(residuals)
+    if target.size < 2 * (past.shape[1] + future.shape[1]):
+        return None
+    basis = _basis(past)
+    left = target - basis @ (basis.T @ target)
+    own = np.linalg.norm(future, axis=0)
+    future = future - basis @ (basis.T @ future)
+    future = future - basis @ (basis.T @ future)
+    new = np.linalg.norm(future, axis=0) > SPANNED * np.where(own > 0, own, 1.0)
+    worst: tuple[float, float] | None = None
+    for horizon in AHEAD:
+        kept = future[:, : horizon + 1 - first][:, new[: horizon + 1 - first]]
+        if not kept.size:
+            continue
+        seen = _basis(kept)
+        explained, total = float(np.sum((seen.T @ left) ** 2)), float(left @ left)
+        degrees = target.size - basis.shape[1] - seen.shape[1]
+        rest = (total - explained) / degrees
+        if not rest > 0:
+            continue
+        found = explained / rest, chi_squared(seen.shape[1], LEVEL / len(AHEAD))
+        if worst is None or found[0] / found[1] > worst[0] / worst[1]:
+            worst = found
+    return worst
+
+
+def _basis(columns: Floats) -> Floats:
+    """An orthonormal basis of columns; what is left of one below a millionth of it is rounding."""
+    sizes = np.linalg.norm(columns, axis=0)
+    directions, spread, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
+    kept: Floats = directions[:, spread > SPANNED * spread[0]]
+    return kept
