@@ -29,7 +29,7 @@ Failures = tuple[tuple[Natural, bool], ...]
 Part = tuple[tuple[Row, ...], Counts, Failures]
 #: Round, candidates followed, end and length of the batch, its limit.
 Place = tuple[Natural, Natural, Natural, Natural, float]
-#: Where to go on with a stretch that is half done, with the digest of the visiting order, and whether it was begun anew.
+#: Where to go on with a stretch half done, with the digest of the visiting order, and whether it was begun anew.
 Checkpoint = tuple[tuple[Natural, Natural, Natural, Natural, float, Natural], bool, Part]
 #: Equation, first candidate, the one behind the last, limit.
 Span = tuple[int, int, int, float]
