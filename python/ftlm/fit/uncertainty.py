@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.statistics import is_white
+from ftlm.base.colour import colour_covariances, coloured
+from ftlm.base.statistics import is_white, robust_deviation
+from ftlm.data.readings import read
 from ftlm.fit.grid import Attempt, Grid
+from ftlm.fit.robust import BEND
 
 #: Lags of the residuals' autocovariance that the robust covariance takes in, as a power of the sample count.
 LAG_POWER = 1.0 / 3.0
@@ -16,19 +19,41 @@ def covariance(attempt: Attempt, grid: Grid) -> Floats:
     """Covariance of the parameters: classical where residuals are white, robust to their colour where not.
 
     Nothing is truncated: a parameter that takes part in a direction which the runs do not see has an infinite variance.
+    Under a robust loss it is that of an M-estimator: residuals count as far as the loss lets them, over the share of
+    them that moves with the parameters (Huber & Ronchetti, doi:10.1002/9780470434697, §7.6).
     """
     series = [residuals for part in grid.residuals(attempt) for residuals in part.values()]
-    return covariance_of(np.asarray(attempt.outcome["jacobian"]), series, 2.0 * float(attempt.outcome["cost"]))
+    jacobian = np.asarray(attempt.outcome["jacobian"])
+    if grid.shares is not None:
+        shares = grid.every_share
+        jacobian = jacobian / np.where(shares > 0, shares, 1.0)
+        series = _bent(series, jacobian.shape[0])
+    return covariance_of(jacobian, series, sum(float(np.nansum(e**2)) for e in series))
+
+
+def _bent(series: list[Floats], parameters: int) -> list[Floats]:
+    """Residuals as Huber's loss lets them count, so that squares of these have its covariance."""
+    level = robust_deviation(read(np.concatenate(series))) or 1.0
+    bent = [np.clip(e, -BEND * level, BEND * level) for e in series]
+    known = [~np.isnan(e) for e in series]
+    count = sum(int(k.sum()) for k in known)
+    moving = sum(int(np.sum(np.abs(e[k]) < BEND * level)) for e, k in zip(series, known, strict=True)) / max(count, 1)
+    moving = max(moving, 1.0 / max(count, 1))
+    # Huber's correction for few samples.
+    few = 1.0 + parameters / max(count, 1) * (1.0 - moving) / moving
+    return [e * few / moving for e in bent]
 
 
 def covariance_of(jacobian: Floats, series: list[Floats], squares: float) -> Floats:
-    """Covariance from a Jacobian (a row a parameter), residuals by run and output, and the sum of their squares.
+    """Covariance from a Jacobian (a row a parameter), residuals by run and output (NaN where nothing was read),
+    and the sum of their squares.
 
     By the singular values of the Jacobian, rows scaled to one length: a product with itself would hide half of the
     digits. Singular values below rounding are zero, and the directions that belong to them unseen. Covariances with a
     parameter of infinite variance are not numbers.
     """
     parameters, count = jacobian.shape
+    known = sum(read(e).size for e in series)
     spread = np.linalg.norm(jacobian, axis=1)
     scaled = jacobian / np.where(spread > 0, spread, 1.0)[:, None]
     if count < parameters:
@@ -42,9 +67,10 @@ def covariance_of(jacobian: Floats, series: list[Floats], squares: float) -> Flo
     # Least-squares answers to unit residuals: the factors of the bread, so that no product of it is ever formed.
     inverse = directions[:, seen] / sizes[seen]
     if all(map(is_white, series)):
-        middle = squares / max(count - parameters, 1) * (inverse @ inverse.T)
+        middle = squares / max(known - parameters, 1) * (inverse @ inverse.T)
     else:
-        middle = _long_run((inverse @ rows[seen])[:, :count], series)
+        answers = (inverse @ rows[seen])[:, :count]
+        middle = _wider(_of_colour(answers, series), _long_run(answers, series))
     result: Floats = middle / np.outer(np.where(spread > 0, spread, 1.0), np.where(spread > 0, spread, 1.0))
     result[unseen, :] = result[:, unseen] = np.nan
     result[unseen, unseen] = np.inf
@@ -59,12 +85,43 @@ def deviation(slopes: Floats, spread: Floats) -> Floats:
     return np.where((slopes[:, unseen] != 0).any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
+def _of_colour(answers: Floats, series: list[Floats]) -> Floats:
+    """Covariance of least-squares answers to noise whose colour is that of an autoregression of the residuals.
+
+    What the answers are to does not depend on the noise, so its autocovariances say all. An autoregression tells them
+    from few numbers, where sums over lags lose the slow part of a colour such as 0.9 a sample.
+    """
+    total: Floats = np.zeros((answers.shape[0], answers.shape[0]))
+    at = 0
+    for residuals in series:
+        rows = answers[:, at : at + residuals.size]
+        at += residuals.size
+        known = read(residuals).size
+        if known == 0:
+            continue
+        through, power = coloured([residuals], int(4 * known**LAG_POWER))
+        # The fit has taken its share of the noise.
+        covariances = colour_covariances(through, power, residuals.size) * known / max(known - answers.shape[0], 1)
+        size = 1 << (2 * residuals.size).bit_length()
+        circle = np.concatenate([covariances, np.zeros(size - 2 * residuals.size + 1), covariances[:0:-1]])
+        weighted = np.fft.irfft(np.fft.rfft(rows, size) * np.fft.rfft(circle), size)[:, : residuals.size]
+        total += weighted @ rows.T
+    return 0.5 * (total + total.T)
+
+
+def _wider(one: Floats, other: Floats) -> Floats:
+    """A covariance, widened where another one knows a larger variance."""
+    ratio = np.diag(other) / np.maximum(np.diag(one), np.finfo(np.float64).tiny)
+    stretch = np.sqrt(np.maximum(ratio, 1.0))
+    return np.asarray(one * np.outer(stretch, stretch))
+
+
 def _long_run(jacobian: Floats, series: list[Floats]) -> Floats:
     """Covariance of the scores with Bartlett weights: the middle of the sandwich (doi:10.2307/1913610)."""
     total: Floats = np.zeros((jacobian.shape[0], jacobian.shape[0]))
     at = 0
     for residuals in series:
-        scores = jacobian[:, at : at + residuals.size] * residuals
+        scores = jacobian[:, at : at + residuals.size] * np.nan_to_num(residuals)
         at += residuals.size
         lags = int(4 * residuals.size**LAG_POWER)
         total += scores @ scores.T

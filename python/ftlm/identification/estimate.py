@@ -13,14 +13,14 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
-from ftlm.data.settings import Settings
+from ftlm.data.settings import Loss, Settings
 from ftlm.data.structures import Initial, Structure
 from ftlm.fit.coefficients import estimate_coefficients, step_bias
 from ftlm.fit.genetic import Genetic, genetic_search
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.identification.judged import Task
-from ftlm.identification.warnings import broken_law, uncertain
+from ftlm.identification.warnings import broken_law, irregular, uncertain
 from ftlm.judge.comparison import compare_means
 from ftlm.model.model import Model
 from ftlm.search.job import run_job
@@ -88,14 +88,19 @@ def offset_setting(structure: Structure) -> dict[str, str]:
     return {} if structure.offset == "none" else {"offset": structure.offset}
 
 
-def by_output_error(task: Task, m: int | None, threads: int, progress: Told) -> Fit:
+def loss_setting(joint: JointFit) -> dict[str, Any]:
+    """The loss, where it is another one than squares, and what it did."""
+    return {} if joint.robust is None else {"loss": "huber", **asdict(joint.robust)}
+
+
+def by_output_error(task: Task, m: int | None, threads: int, progress: Told, loss: Loss = "squares") -> Fit:
     """Orders and coefficients together by joint output error."""
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
-    record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False)[0]
+    record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False, gaps=True)[0]
     problem = FreeProblem.of(replace(structure, initial=record.initial))
-    joint = fit_output_error(task.runs, problem.structure, threads=threads, progress=progress)
+    joint = fit_output_error(task.runs, problem.structure, threads=threads, progress=progress, loss=loss)
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
     identified = structure.with_orders(joint.orders).with_coefficients(problem.named(coefficients))
     moved = problem.number_jacobian(orders, coefficients)
@@ -107,9 +112,9 @@ def by_output_error(task: Task, m: int | None, threads: int, progress: Told) -> 
         {
             "method": "output-error", "m": record.m, "initial": in_words(record.initial),
             "refinement": joint.refinement, "starts": len(joint.starts), "noise": joint.noise,
-            "converged": joint.converged, **offset_setting(structure),
+            "converged": joint.converged, **offset_setting(structure), **loss_setting(joint),
         },
-        uncertain(joint, problem), joint=joint,
+        [*uncertain(joint, problem), *irregular(task.runs, joint, problem)], joint=joint,
         covariance=tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None,
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.lattice import Lattice, check_lattice, check_lattice_names
 from ftlm.data.run import Run
-from ftlm.data.settings import METHODS, Settings, check_used
+from ftlm.data.settings import LOSSES, METHODS, Loss, Settings, check_used
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Estimate
 from ftlm.data.structures import Structure, check_offset
@@ -19,15 +19,12 @@ from ftlm.fit.genetic import Genetic
 from ftlm.identification.estimate import Fit, by_genetic_algorithm, by_lattice, by_output_error
 from ftlm.identification.judged import Task
 from ftlm.identification.result import Identification
-from ftlm.identification.warnings import discretisation, growing, unexcited
+from ftlm.identification.warnings import ROUNDING, discretisation, growing, unexcited
 from ftlm.judge.comparison import Comparison, compared_samples, free_runs
 from ftlm.judge.criteria import InformationCriteria, information_criteria
 from ftlm.judge.metrics import finite
 from ftlm.judge.residuals import LAGS, Residuals, residual_warnings, tested_residuals
 from ftlm.solve.records import default_m
-
-#: Residuals of an output-error fit below this share of the output are rounding and discretisation.
-ROUNDING = 3e-5
 
 
 def identify(
@@ -51,6 +48,7 @@ def identify(
     store: str | os.PathLike[str] | None = None,
     executor: Executor | None = None,
     offset: Literal["none", "constant", "ramp"] | None = None,
+    loss: Loss | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
@@ -95,6 +93,10 @@ def identify(
         ``"constant"``: an unknown constant on the right-hand side of each equation, such as a sensor's zero, a load or
         friction that the model lacks; ``"ramp"``: one that drifts in proportion to time as well. One each run, in
         ``.comparison.offsets``, estimated anew on any run that the model is judged on. Default what the structure says.
+    loss
+        Of output error: ``"squares"`` (default), or ``"huber"``, which counts residuals beyond 1.345 of the usual ones by
+        their size, so that outliers decide nothing; without any it has 95 % of the precision. Figures stay those of all
+        samples.
 
     Returns
     -------
@@ -128,14 +130,16 @@ def identify(
         "prior_covariance": prior_covariance, "rows": rows, "keep": keep,
     }  # fmt: skip
     words = {n: value for n, value in words.items() if value is not None}
-    others = {"lattice": lattice, "genetic": genetic, "store": store, "executor": executor}
+    if loss is not None and loss not in LOSSES:
+        raise ModelError(f"loss = {loss!r} is not known; use {' or '.join(map(repr, LOSSES))}")
+    others = {"loss": loss, "lattice": lattice, "genetic": genetic, "store": store, "executor": executor}
     given = [*(n for n, value in others.items() if value is not None), *words]
     estimator = "least-squares" if method in ("output-error", "genetic") else method
     settings = Settings.check(coefficients=estimator, threads=threads, **words)
     check_used(method, given, free=bool(structure.order_names))
     task = Task(tuple(several), structure, lattice)
     if method == "output-error":
-        return judged(by_output_error(task, m, settings.threads, progress))
+        return judged(by_output_error(task, m, settings.threads, progress, loss or "squares"))
     if method == "genetic":
         return judged(by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress))
     if executor is not None and threads is None:

@@ -18,7 +18,8 @@ from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
-from ftlm.data.structures import Initial, Offset, SensorFilter, offset_exponents
+from ftlm.data.structures import Initial, Offset, SensorFilter, Structure, offset_exponents
+from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
 from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
@@ -39,7 +40,8 @@ class Sampled:
     Parameters
     ----------
     outputs
-        Shape (outputs, N), measured through the sensor filter where they are; not finite where the run diverges.
+        Shape (outputs, N), measured through the sensor filter where they are; not finite where the run diverges. At the
+        rows of the run, or of its readings within its grid.
     initial
         Coefficients of the initial terms, by output and exponent.
     refinement
@@ -65,7 +67,9 @@ def initial_exponents(item: Equation, initial: Initial, offset: Offset) -> list[
     return sorted(found)
 
 
-def refined(model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int = MAX_M) -> Sampled:
+def refined(
+    model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int = MAX_M, on_grid: bool = False
+) -> Sampled:
     """Samples on grids refined, and extrapolated in the step, until they stand still or the pulses run out.
 
     Parameters
@@ -75,17 +79,22 @@ def refined(model: Solved, run: Run, initial: Terms | None, *, tolerance: float,
         outputs, each weighted by its own deviation.
     tolerance
         Change, as a share of each output's largest value, at which refinement ends.
+    on_grid
+        Whether the instants are those of the run's grid although its rows have times of their own.
     """
     own = run.length - 1
     every = FIRST_REFINEMENT
-    coarse, known = _tried(model, run, every, initial)
+    times = None
+    if has_own_times(run, model.structure):
+        times = run.time if on_grid else compared_times(run, model.structure)
+    coarse, known = _tried(model, run, every, initial, times)
     terms = known
     best, change = coarse, np.full(len(model.outputs), np.inf)
     extrapolated: Floats | None = None
     lost = 0
     while 2 * every * own <= largest_m and lost < 2:
         every *= 2
-        fine, found = _tried(model, run, every, initial, last=lost == 1)
+        fine, found = _tried(model, run, every, initial, times, last=lost == 1)
         # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
         lost = 0 if np.all(np.isfinite(fine)) else lost + 1
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
@@ -108,44 +117,54 @@ def _limit(coarse: Terms, fine: Terms) -> dict[str, dict[float, float]]:
 
 
 def _tried(
-    model: Solved, run: Run, every: int, initial: Terms | None, *, last: bool = False
+    model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Samples on one grid; no numbers where it happens to make the equations unsolvable, unless it is the last try."""
     try:
-        return sampled(model, run, every, initial)
+        return sampled(model, run, every, initial, times)
     except ModelError:
         # An own coefficient c meets 1 = c h^alpha / gamma(alpha + 2) on one step, not on two.
         if last:
             raise
-        return np.full((len(model.outputs), run.length), np.nan), {o: {} for o in model.outputs}
+        count = run.length if times is None else times.size
+        return np.full((len(model.outputs), count), np.nan), {o: {} for o in model.outputs}
 
 
-def sampled(model: Solved, run: Run, every: int, initial: Terms | None) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Samples on ``every`` pulses a sample interval, shape (outputs, N), and initial terms; they may not be finite."""
+def sampled(
+    model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None = None
+) -> tuple[Floats, dict[str, dict[float, float]]]:
+    """Samples on ``every`` pulses a sample interval, shape (outputs, N), and initial terms; they may not be finite.
+
+    At the instants of the grid, or at times of their own [s].
+    """
     coupled = model.structure.coupling == "simulated"
     rec = record(run, model.structure, (run.length - 1) * every, filtered=not coupled)
     still = replace(rec, means=np.zeros_like(rec.means))
+    at = None if times is None else Instants.of(run, rec, model.structure, times)
     if initial is not None:
         kept = {o: dict(initial.get(o, {})) for o in model.outputs}
-        return _read(model, run, rec, every, _responses(model, rec, kept), kept), kept
+        return _read(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
     names = [(e.output, power) for e in model.equations for power in initial_exponents(e, rec.initial, rec.offset)]
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
-    driven = _read(model, run, rec, every, _responses(model, rec, none), none)
+    driven = _read(model, run, rec, every, _responses(model, rec, none), none, at)
     if not names or not np.all(np.isfinite(driven)):
         return driven, none
     columns = []
     for output, power in names:
         unit = {**none, output: {power: 1.0}}
-        columns.append(_read(model, None, still, every, _responses(model, still, unit), unit))
+        columns.append(_read(model, None, still, every, _responses(model, still, unit), unit, at))
     return _fitted(model, measured_samples(model, run, every, rec), driven, names, columns)
 
 
 def measured_samples(model: Solved, run: Run, every: int, rec: Record | None = None) -> Floats:
-    """What the outputs are compared with, shape (outputs, N): as measured, or filtered where the equation is."""
+    """What the outputs are compared with, shape (outputs, N): as measured, or filtered where the equation is.
+
+    NaN where an output was not read.
+    """
     sensor = model.structure.sensor_filter
     filtered = sensor is not None and model.structure.coupling != "simulated"
     if not filtered or sensor is None or set(model.outputs) <= set(sensor.outputs):
-        return np.stack([run[name] for name in model.outputs])
+        return np.stack([compared_values(run, model.structure, name) for name in model.outputs])
     rec = rec or record(run, model.structure, (run.length - 1) * every)
     return np.stack([run[n] if n in sensor.outputs else _core.point_samples(rec.of(n))[::every] for n in model.outputs])
 
@@ -154,8 +173,11 @@ def _fitted(
     model: Solved, measured: Floats, driven: Floats, names: Sequence[tuple[str, float]], columns: Sequence[Floats]
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Initial terms that bring the run closest to what was measured, by least squares, and the run with them."""
-    deviation = np.std(measured, axis=1, keepdims=True)
-    weight = 1.0 / np.where(deviation > 0, deviation, 1.0)
+    deviation = np.nanstd(measured, axis=1, keepdims=True)
+    # What was not read weighs nothing.
+    unread = np.isnan(measured)
+    weight = np.where(unread, 0.0, 1.0 / np.where(deviation > 0, deviation, 1.0))
+    measured = np.where(unread, 0.0, measured)
     with np.errstate(over="ignore", invalid="ignore"):
         basis = np.stack([(weight * c).ravel() for c in columns], axis=1)
         sizes = np.linalg.norm(basis, axis=0)
@@ -182,15 +204,19 @@ def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
     return np.concatenate([_core.respond(rec.core(), [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
 
 
-def _read(model: Solved, run: Run | None, rec: Record, every: int, means: Floats, terms: Terms) -> Floats:
+def _read(
+    model: Solved, run: Run | None, rec: Record, every: int, means: Floats, terms: Terms, at: Instants | None
+) -> Floats:
     """Samples at the instants from pulse means: what integrates from the left, what feeds through as it is there.
 
     The last two pulses before each instant are extended to it: no jump of a held input lies in them, so the
-    extrapolation crosses none of the kinks t^alpha that jumps leave.
+    extrapolation crosses none of the kinks t^alpha that jumps leave. At times of their own, among which jumps lie
+    anywhere, samples follow from the pulses around them and the kinks that these do not show.
     """
     names, structure = model.outputs, model.structure
     coupled = structure.coupling == "simulated"
-    system, drive, now = np.eye(len(names)), np.zeros_like(means), np.zeros((len(names), rec.m // every + 1))
+    count = rec.m // every + 1 if at is None else at.times.size
+    system, drive, now = np.eye(len(names)), np.zeros_like(means), np.zeros((len(names), count))
     start = np.zeros(len(names))
     for i, item in enumerate(model.equations):
         start[i] = terms[item.output].get(0.0, 0.0)
@@ -202,7 +228,7 @@ def _read(model: Solved, run: Run | None, rec: Record, every: int, means: Floats
                 system[i, names.index(term.signal)] -= factor
             elif run is not None:
                 drive[i] += factor * rec.of(term.signal)
-                now[i] += factor * _at_instants(run, rec, structure.delay.get(term.signal, 0.0), term.signal, every)
+                now[i] += factor * _at_instants(run, rec, structure, term.signal, every, at)
     through = np.linalg.inv(system)
     drive, now, start = through @ drive, through @ now, through @ start
     with np.errstate(invalid="ignore", over="ignore"):
@@ -214,8 +240,36 @@ def _read(model: Solved, run: Run | None, rec: Record, every: int, means: Floats
                 if name in structure.sensor_filter.outputs and np.all(np.isfinite(means[i])):
                     gain[i] = high_frequency_gain(structure.sensor_filter)
                     rest[i] = _core.series_multiply(series, means[i], rec.m) - gain[i] * drive[i]
+        if at is not None:
+            kinks = through @ _kinks(model, run, at, terms)
+            kinks[gain != 1.0] = 0.0
+            # At the very start nothing has been integrated yet.
+            begun = np.where(at.times > 0.0, _finite_readings(rest, at) + kinks, (gain * start)[:, None])
+            return np.asarray(begun + gain[:, None] * now)
         later = 1.5 * rest[:, every - 1 :: every] - 0.5 * rest[:, every - 2 :: every]
         return np.concatenate([(gain * start)[:, None], later], axis=1) + gain[:, None] * now
+
+
+def _finite_readings(rest: Floats, at: Instants) -> Floats:
+    """Readings of what is smooth; not finite from where a run leaves the range of numbers."""
+    return _core.read_at(np.ascontiguousarray(rest), at.places)
+
+
+def _kinks(model: Solved, run: Run | None, at: Instants, terms: Terms) -> Floats:
+    """What the pulses do not show of the kinks at the times: of jumps of inputs, and of initial terms at the start."""
+    names, coupled = model.outputs, model.structure.coupling == "simulated"
+    out = np.zeros((len(names), at.times.size))
+    for i, item in enumerate(model.equations):
+        for power, value in terms[item.output].items():
+            if value and power != round(power):
+                jump = (np.zeros(1), np.array([value * math.gamma(power + 1.0)]))
+                out[i] += _core.corners(at.record.m, at.places, jump, power, at.record.step)
+        for term in item.terms if run is not None else ():
+            order = item.order.constant - term.order.constant
+            known = None if coupled and term.signal in names else at.corners(term.signal, order)
+            if known is not None and abs(order) > GRAIN:
+                out[i] += float(term.fixed or 0.0) * known
+    return out
 
 
 def high_frequency_gain(sensor: SensorFilter) -> float:
@@ -225,9 +279,14 @@ def high_frequency_gain(sensor: SensorFilter) -> float:
     return top / bottom
 
 
-def _at_instants(run: Run, rec: Record, delay: float, name: str, every: int) -> Floats:
+def _at_instants(
+    run: Run, rec: Record, structure: Structure, name: str, every: int, at: Instants | None
+) -> Floats:  # fmt: skip
     """Values of a signal just after the instants."""
-    filtered = rec.sensor is not None
+    if at is not None:
+        values = at.values(name)
+        return _core.read_at(rec.of(name)[None], at.places)[0] if values is None else values
+    delay, filtered = structure.delay.get(name, 0.0), rec.sensor is not None
     if not delay and not filtered:
         return run[name]
     means = rec.of(name)
