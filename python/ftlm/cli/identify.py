@@ -49,6 +49,10 @@ def identify(
     *, files: Files, structure: StructureText,
     method: Annotated[Method, Option(help="Estimator.")] = "output-error",
     reading: ReadingOptions, shape: StructureOptions, search: SearchOptions, genetic: GeneticOptions,
+    loss: Annotated[
+        Literal["squares", "huber"] | None,
+        Option(help="Of output error: huber, so that outliers decide nothing; default squares."),
+    ] = None,
     threads: Threads = None,
     store: Annotated[
         Text, Option(metavar="FILE", help="Keep finished order searches there; the same command goes on.")
@@ -67,7 +71,7 @@ def identify(
     with resumable(store, "the same command"), Progress("searching orders", quiet=as_json) as progress:
         result = estimation.identify(
             runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
-            genetic=genetic.settings(method), threads=threads, progress=progress, store=store,
+            genetic=genetic.settings(method), threads=threads, progress=progress, store=store, loss=loss,
         )  # fmt: skip
     if out is not None:
         result.model.save(out, force=force)
