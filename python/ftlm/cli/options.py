@@ -59,7 +59,9 @@ class ReadingOptions:
     sliced: Annotated[Text, Option("--slice", metavar="FROM:TO", help="Seconds since the first row.")] = None
     resample: Annotated[
         Number,
-        Option(metavar="STEP", help="Put irregular rows on this step [s]; output error compares when outputs were read."),
+        Option(
+            metavar="STEP", help="Put irregular rows on this step [s]; output error compares when outputs were read."
+        ),
     ] = None
     missing: Annotated[
         Literal["refuse", "weight", "hold"] | None,

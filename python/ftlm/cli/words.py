@@ -15,7 +15,7 @@ OPTIONS = {
     "units": "--unit", "columns": "--columns", "intersample": "--intersample", "inputs": "-u", "outputs": "-y",
     "coupling": "--coupling", "initial": "--initial", "laws": "--laws", "input_order": "--input-order",
     "friction": "--friction", "cross_stage": "--cross-stage", "tolerance": "--tolerance", "lags": "--lags",
-    "delay": "--delay", "force": "--force",
+    "delay": "--delay", "force": "--force", "loss": "--loss", "missing": "--missing",
 }  # fmt: skip
 #: ``force=True (--force)``, where the option stands beside the argument already.
 _BESIDE = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import listed, nearest
 from ftlm.base.errors import DataError
-from ftlm.data.readings import Readings, bridged, unread
+from ftlm.data.readings import Readings, bridged, read, unread
 from ftlm.data.samples import Intersample, grid_of, is_constant, locked
 
 
@@ -92,11 +92,12 @@ class Measured:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What was done to the data and what is odd about them, in words."""
+        there = {name: read(self._data[name]) for name in self.outputs}
         constant = tuple(
-            f"output {name!r} is constant ({float(self._data[name][~unread(self._data[name])][0])!r} in all {self.length} rows): nothing can be "
-            "identified from it"
-            for name in self.outputs
-            if not unread(self._data[name]).all() and is_constant(self._data[name])
+            f"output {name!r} is constant ({float(values[0])!r} in all {values.size} rows): nothing can be identified "
+            "from it"
+            for name, values in there.items()
+            if values.size and is_constant(values)
         )
         return self.facts + constant
 

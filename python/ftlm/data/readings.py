@@ -14,8 +14,8 @@ from ftlm.base.errors import DataError
 from ftlm.data.samples import FEWEST_ROWS, HELD, Intersample, Pieces, grid_of
 
 #: What becomes of rows and cells that are not there.
-MISSING = ("refuse", "weight", "hold")
 Missing = Literal["refuse", "weight", "hold"]
+MISSING: tuple[Missing, ...] = ("refuse", "weight", "hold")
 #: Rows lie on a grid with holes where each is within this share of a step of a place on it.
 ON_GRID = 0.02
 #: A row within this share of the duration of a grid's end is there.
@@ -24,9 +24,9 @@ _THERE = 1e-12
 
 def checked_missing(given: object) -> Missing:
     """Return what to do about what is missing, and refuse words that say nothing."""
-    for known in ("refuse", "weight", "hold"):
+    for known in MISSING:
         if given == known:
-            return known  # type: ignore[return-value]
+            return known
     raise DataError(
         f"missing={given!r} is unknown; use 'refuse', 'weight' (outputs that were not read weigh nothing) or 'hold' "
         "(inputs hold their last value besides)"

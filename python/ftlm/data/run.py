@@ -453,8 +453,8 @@ class Run(Measured):
             there = read(values)
             if there.size == 0:
                 raise DataError(
-                    f"output {name!r} of run {self.name!r}: none of its {values.size} rows holds a value; use a part of "
-                    "the record in which it was read"
+                    f"output {name!r} of run {self.name!r}: none of its {values.size} rows holds a value; use a part "
+                    "of the record in which it was read"
                 )
             if is_constant(values):
                 thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(there[0])!r}"
@@ -485,7 +485,8 @@ class Run(Measured):
 
         The first line is a comment, ``# ftlm-run 1`` and a JSON object that holds name, step, start, inputs, outputs,
         units, intersample and warnings, and `about` where a rig made the run; then come a header ``t_s,…`` and the
-        rows, ``nan`` where an output was not read. `readings` stay behind: what is written is the grid. The file is written beside its place and renamed, so a reader never sees half of it.
+        rows, ``nan`` where an output was not read. `readings` stay behind: what is written is the grid. The file is
+        written beside its place and renamed, so a reader never sees half of it.
 
         Parameters
         ----------

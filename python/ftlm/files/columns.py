@@ -21,7 +21,7 @@ _MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
 
 @dataclass(frozen=True)
 class Column:
-    """One column of numbers, or the reason why it is not one; `blank` where that is empty cells alone, which are NaN."""
+    """One column of numbers, or the reason why it is not one; `blank` where that is empty cells alone (NaN)."""
 
     variable: str
     name: str

@@ -67,7 +67,7 @@ def experiment(
 def _at_own_times(
     run: Run, structure: Structure, rec: Record, weights: Sequence[float], decimation: int, shares: Floats | None
 ) -> tuple[Any, ...]:
-    """The same of a run whose rows have times of their own; its very first sample shows where the run starts, no more."""
+    """The same of a run whose rows have times of their own; the very first sample shows only where it starts."""
     times = compared_times(run, structure)
     kept = np.flatnonzero(times > 0.0)[::decimation]
     at = Instants.of(run, rec, structure, times[kept])
@@ -203,7 +203,7 @@ class Grid:
         return second if second.outcome["cost"] <= first.outcome["cost"] else first
 
     def residuals(self, attempt: Attempt) -> list[dict[str, Floats]]:
-        """Residuals of an attempt over the noise, by run and output, whatever their shares; NaN where nothing was read."""
+        """Residuals of an attempt over the noise by run and output, whatever their shares; NaN where none was read."""
         residuals = np.asarray(attempt.outcome["residuals"])
         parts, at = [], 0
         for shares, count in self._counts:

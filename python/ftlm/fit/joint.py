@@ -196,7 +196,9 @@ def fit_output_error(
         weighed = weighed.finer
     best = weighed.descend(winner(contenders, replace(alike, every=weighed.every)), LAST_LAP)
     best, weighed = with_settled_weights(best, weighed, loss)
-    return joint_fit(refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True), starts)
+    return joint_fit(
+        refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True), starts
+    )
 
 
 def first_noise(runs: Sequence[Run], structure: Structure, output: str, size: float) -> float:
@@ -218,7 +220,7 @@ def winner(contenders: Sequence[Attempt], near: Grid) -> Attempt:
 
 
 def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -> tuple[Attempt, Grid]:
-    """Descend on a grid until the weights are those of the residuals, pooled over runs, and under a robust loss theirs."""
+    """Descend on a grid until the weights are those of the residuals, pooled over runs, and so are robust shares."""
     last = (ROBUST_ROUNDS if loss == "huber" else ROUNDS) - 1
     for turn in range(last + 1):
         attempt = grid.descend(attempt, LAST_LAP, plain=True)

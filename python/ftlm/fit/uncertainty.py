@@ -45,8 +45,9 @@ def _bent(series: list[Floats], parameters: int) -> list[Floats]:
 
 
 def covariance_of(jacobian: Floats, series: list[Floats], squares: float) -> Floats:
-    """Covariance from a Jacobian (a row a parameter), residuals by run and output (NaN where nothing was read),
-    and the sum of their squares.
+    """Covariance from a Jacobian (a row a parameter), residuals by run and output, and the sum of their squares.
+
+    Residuals are NaN where nothing was read.
 
     By the singular values of the Jacobian, rows scaled to one length: a product with itself would hide half of the
     digits. Singular values below rounding are zero, and the directions that belong to them unseen. Covariances with a

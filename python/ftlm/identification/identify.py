@@ -94,9 +94,9 @@ def identify(
         friction that the model lacks; ``"ramp"``: one that drifts in proportion to time as well. One each run, in
         ``.comparison.offsets``, estimated anew on any run that the model is judged on. Default what the structure says.
     loss
-        Of output error: ``"squares"`` (default), or ``"huber"``, which counts residuals beyond 1.345 of the usual ones by
-        their size, so that outliers decide nothing; without any it has 95 % of the precision. Figures stay those of all
-        samples.
+        Of output error: ``"squares"`` (default), or ``"huber"``, which counts residuals beyond 1.345 of the usual ones
+        by their size, so that outliers decide nothing; without any it has 95 % of the precision. Figures stay those of
+        all samples.
 
     Returns
     -------

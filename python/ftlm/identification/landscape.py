@@ -111,7 +111,9 @@ class Around:
     @classmethod
     def of(cls, joint: JointFit, task: Task, names: tuple[str, str], *, refit: bool) -> Around:
         """The optimum of the last grid; the estimate is extrapolated to step 0, so it is close by."""
-        decided = prepare(task.runs, replace(task.structure, free_delays={}), None, power_of_two=False, gaps=True)[0].initial
+        decided = prepare(task.runs, replace(task.structure, free_delays={}), None, power_of_two=False, gaps=True)[
+            0
+        ].initial
         problem = FreeProblem.of(replace(task.structure, initial=decided))
         weights = [1.0 / joint.noise[o] for o in problem.structure.outputs]
         grid = Grid(problem, task.runs, weights, joint.refinement, shares=joint.shares)

@@ -34,8 +34,8 @@ def settings_in_words(settings: Mapping[str, Any]) -> str:
 def robust_in_words(settings: Mapping[str, Any]) -> str:
     """What a robust loss did."""
     return (
-        f"{settings['lowered']} of {settings['samples']} residuals down-weighted, {settings['outliers']} of them beyond "
-        "five deviations"
+        f"{settings['lowered']} of {settings['samples']} residuals down-weighted, {settings['outliers']} of them "
+        "beyond five deviations"
     )
 
 

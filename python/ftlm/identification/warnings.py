@@ -94,20 +94,22 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
 
 
 def irregular(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[str]:
-    """Say what in the samples themselves harms the figures: outliers, quantisation, times that could not be honoured."""
+    """Say what in the samples harms the figures: outliers, quantisation, times that could not be honoured."""
     warnings = []
     for output in problem.structure.outputs:
         size = math.sqrt(float(np.mean([np.nanvar(run[output]) for run in runs])))
         noise = joint.noise[output]
         if noise <= ROUNDING * size:
             continue
-        warnings += [w for w in (_outliers(runs, joint, output), _quantised(runs, problem.structure, output, noise)) if w]
+        warnings += [
+            w for w in (_outliers(runs, joint, output), _quantised(runs, problem.structure, output, noise)) if w
+        ]
     kept = [run.name for run in runs if run.readings is not None and not has_own_times(run, problem.structure)]
     if kept:
         warnings.append(
             f"{', '.join(kept)}: outputs were read at times of their own, but a free delay, or a sensor filter with "
-            "coupling='measured', needs them on a grid: straight lines were drawn between them, and the intervals do not "
-            "know what that costs"
+            "coupling='measured', needs them on a grid: straight lines were drawn between them, and the intervals do "
+            "not know what that costs"
         )
     return warnings
 
@@ -141,8 +143,9 @@ def _quantised(runs: Sequence[Run], structure: Structure, output: str, noise: fl
         return None
     step, run = max(coarse, key=lambda pair: pair[0])
     return (
-        f"{output} is quantised in steps of {step:.3g} in {run.name}, and its residuals are {noise:.3g}: rounding, which "
-        "repeats where the signal does and is no noise; intervals do not allow for it; use a finer converter or scale"
+        f"{output} is quantised in steps of {step:.3g} in {run.name}, and its residuals are {noise:.3g}: rounding, "
+        "which repeats where the signal does and is no noise; intervals do not allow for it; use a finer converter or "
+        "scale"
     )
 
 

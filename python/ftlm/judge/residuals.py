@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import whole_number
+from ftlm.base.colour import autoregression, is_constant, whitened
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.statistics import LEVEL, NORMAL_99, autocovariances, chi_squared_99, ljung_box, whiteness
 from ftlm.data.readings import bridged
@@ -23,7 +24,6 @@ from ftlm.data.several import Runs, as_runs
 from ftlm.data.solved import Solved, check_solved
 from ftlm.judge.comparison import free_runs
 from ftlm.judge.metrics import finite
-from ftlm.base.colour import autoregression, is_constant, whitened
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, symbol_html
 from ftlm.solve.instants import compared_values

@@ -114,9 +114,7 @@ def simulate(
     largest_m = min(largest_m, MAX_M)
     if own > largest_m:
         raise ModelError(f"run {run.name!r} has {own} intervals, more than {largest_m}; slice it")
-    free = refined(
-        model, _completed(run, model), initial or {}, tolerance=tolerance, largest_m=largest_m, on_grid=True
-    )
+    free = refined(model, _completed(run, model), initial or {}, tolerance=tolerance, largest_m=largest_m, on_grid=True)
     for name, samples in zip(model.outputs, free.outputs, strict=True):
         if not np.all(np.isfinite(samples)):
             at = int(np.argmax(~np.isfinite(samples))) * run.step

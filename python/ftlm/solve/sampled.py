@@ -27,6 +27,8 @@ from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_ser
 FIRST_REFINEMENT = 2
 #: Orders closer than this are one order.
 GRAIN = 1e-9
+#: Orders of integration from which on a kink is as smooth as pulses follow.
+SMOOTH = 2.0
 #: Share of a response of an initial term that others must leave for it to be told from them.
 SPANNED = 1e-10
 
@@ -256,7 +258,10 @@ def _finite_readings(rest: Floats, at: Instants) -> Floats:
 
 
 def _kinks(model: Solved, run: Run | None, at: Instants, terms: Terms) -> Floats:
-    """What the pulses do not show of the kinks at the times: of jumps of inputs, and of initial terms at the start."""
+    """What the pulses do not show of the kinks at the times: of jumps of inputs, and of initial terms at the start.
+
+    Jumps by themselves, and once through the output's own terms, as the joint fit has them.
+    """
     names, coupled = model.outputs, model.structure.coupling == "simulated"
     out = np.zeros((len(names), at.times.size))
     for i, item in enumerate(model.equations):
@@ -264,11 +269,17 @@ def _kinks(model: Solved, run: Run | None, at: Instants, terms: Terms) -> Floats
             if value and power != round(power):
                 jump = (np.zeros(1), np.array([value * math.gamma(power + 1.0)]))
                 out[i] += _core.corners(at.record.m, at.places, jump, power, at.record.step)
+        own = [t for t in item.terms if t.signal == item.output]
         for term in item.terms if run is not None else ():
-            order = item.order.constant - term.order.constant
-            known = None if coupled and term.signal in names else at.corners(term.signal, order)
-            if known is not None and abs(order) > GRAIN:
-                out[i] += float(term.fixed or 0.0) * known
+            if term.signal == item.output or (coupled and term.signal in names):
+                continue
+            for path in ([term], *([term, other] for other in own)):
+                order = sum(item.order.constant - t.order.constant for t in path)
+                if order <= GRAIN or (len(path) > 1 and order >= SMOOTH):
+                    continue
+                known = at.corners(term.signal, order)
+                if known is not None:
+                    out[i] += math.prod(float(t.fixed or 0.0) for t in path) * known
     return out
 
 

@@ -1,7 +1,7 @@
 //! What samples at times of their own see of the corners that jumps of held inputs leave, and their pulse means do not.
 //!
-//! The leading corner of an output is that of the terms that drive its equation: Σ c I^{α−ν} s. What its own terms make of
-//! it is smoother by their orders, and falls with the step.
+//! The leading corners of an output are those of the terms that drive its equation, Σ c I^{α−ν} s, and what its own terms
+//! make of these, once. Made twice they are smoother still, and what is left falls with the step.
 
 use super::experiment::{Experiment, OwnTimes};
 use super::feedthrough::{Direct, AT_ONCE};
@@ -11,11 +11,14 @@ use crate::equation::Structure;
 /// Corners are smooth in an order: the error of a central difference is 1e−10.
 const SHIFT: f64 = 1e-5;
 
-/// A term whose signal jumps near samples: its order of integration, what the samples lack for a coefficient of 1, and
-/// the derivative of that with respect to the order.
+/// Orders of integration from which on a corner is as smooth as the pulses around a sample follow.
+const SMOOTH: f64 = 2.0;
+
+/// A term whose signal jumps near samples, by itself or through a term of the output's own: what the samples lack for
+/// coefficients of 1, and the derivative of that with respect to the order of integration.
 struct Corner {
     equation: usize,
-    term: usize,
+    terms: Vec<usize>,
     values: Vec<f64>,
     slopes: Vec<f64>,
 }
@@ -32,18 +35,27 @@ impl Corners {
         let step = experiment.record.step();
         let mut all = Vec::new();
         for (equation, structure) in structures.iter().enumerate() {
+            let integration = |term: usize| structure.order - structure.terms[term].order;
+            let own: Vec<usize> = (0..structure.terms.len())
+                .filter(|&k| model.unknown(equation, structure.terms[k].signal) == Some(equation))
+                .collect();
             for (term, driver) in structure.terms.iter().enumerate() {
-                let eta = structure.order - driver.order;
                 let Some(Some(near)) = jumps.get(driver.signal) else { continue };
-                // What feeds through at once is counted as that.
-                if eta < AT_ONCE || model.unknown(equation, driver.signal).is_some() {
+                if model.unknown(equation, driver.signal).is_some() {
                     continue;
                 }
-                let shift = SHIFT.min(0.5 * eta);
-                let (up, down) =
-                    (readings.corners(near, eta + shift, step), readings.corners(near, eta - shift, step));
-                let slopes = up.iter().zip(&down).map(|(u, d)| (u - d) / (2.0 * shift)).collect();
-                all.push(Corner { equation, term, values: readings.corners(near, eta, step), slopes });
+                for terms in std::iter::once(vec![term]).chain(own.iter().map(|&k| vec![term, k])) {
+                    let eta: f64 = terms.iter().map(|&k| integration(k)).sum();
+                    // What feeds through at once is counted as that.
+                    if eta < AT_ONCE || (terms.len() > 1 && eta >= SMOOTH) {
+                        continue;
+                    }
+                    let shift = SHIFT.min(0.5 * eta);
+                    let (up, down) =
+                        (readings.corners(near, eta + shift, step), readings.corners(near, eta - shift, step));
+                    let slopes = up.iter().zip(&down).map(|(u, d)| (u - d) / (2.0 * shift)).collect();
+                    all.push(Corner { equation, terms, values: readings.corners(near, eta, step), slopes });
+                }
             }
         }
         Some(Self { all })
@@ -87,7 +99,10 @@ impl Corners {
         point: &Point,
         direct: Option<&Direct>,
     ) -> Vec<f64> {
-        let weight = |c: &Corner| (model.equations[c.equation].terms[c.term].2.at(&point.coefficients), 0.0);
+        let weight = |c: &Corner| {
+            let terms = &model.equations[c.equation].terms;
+            (c.terms.iter().map(|&k| terms[k].2.at(&point.coefficients)).product(), 0.0)
+        };
         self.driven(model, experiment, direct, weight)
     }
 
@@ -103,13 +118,19 @@ impl Corners {
     ) {
         let weight = |c: &Corner| {
             let equation = &model.equations[c.equation];
-            let (_, order, monomial) = &equation.terms[c.term];
+            let value = |k: usize| equation.terms[k].2.at(&point.coefficients);
             match parameter.checked_sub(point.orders.len()) {
                 None => {
                     let of = |weights: &[f64]| weights.get(parameter).copied().unwrap_or(0.0);
-                    (0.0, monomial.at(&point.coefficients) * (of(&equation.order.weights) - of(&order.weights)))
+                    let turned = |k: &usize| of(&equation.order.weights) - of(&equation.terms[*k].1.weights);
+                    let product: f64 = c.terms.iter().map(|&k| value(k)).product();
+                    (0.0, product * c.terms.iter().map(turned).sum::<f64>())
                 }
-                Some(j) => (monomial.slope(&point.coefficients, j), 0.0),
+                Some(j) => {
+                    let one = |k: usize| equation.terms[k].2.slope(&point.coefficients, j);
+                    let others = |k: usize| c.terms.iter().filter(|&&l| l != k).map(|&l| value(l)).product::<f64>();
+                    (c.terms.iter().map(|&k| one(k) * others(k)).sum(), 0.0)
+                }
             }
         };
         let moved = self.driven(model, experiment, direct, weight);
