@@ -64,7 +64,12 @@ impl Readings {
         check_finite("times of readings", &places)?;
         if let Some(&value) = places.iter().find(|&&p| !(0.0..=m as f64).contains(&p)) {
             let remedy = "leave out what was read before or after the inputs are known".into();
-            return Err(Error::OutOfRange { name: "time of a reading".into(), value, range: format!("[0, {m}]"), remedy });
+            return Err(Error::OutOfRange {
+                name: "time of a reading".into(),
+                value,
+                range: format!("[0, {m}]"),
+                remedy,
+            });
         }
         let half = STENCIL / 2;
         let first: Vec<usize> =
@@ -150,7 +155,8 @@ fn stencil(x: f64) -> [f64; STENCIL] {
     let slope = |m: usize| -> f64 {
         let others: Vec<f64> = (0..=STENCIL).filter(|&j| j != m).map(|j| j as f64).collect();
         let below: f64 = others.iter().map(|j| m as f64 - j).product();
-        let skipping = |i: usize| others.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| x - v).product::<f64>();
+        let skipping =
+            |i: usize| others.iter().enumerate().filter(|(j, _)| *j != i).map(|(_, v)| x - v).product::<f64>();
         (0..others.len()).map(skipping).sum::<f64>() / below
     };
     let mut weights = [0.0; STENCIL];

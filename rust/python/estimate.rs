@@ -11,8 +11,8 @@ use crate::error::Error;
 use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::estimate::streaming::Streaming as StreamingFit;
-use crate::readings::Readings;
 use crate::estimate::{iv as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint};
+use crate::readings::Readings;
 
 /// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);

@@ -28,7 +28,7 @@ mod _core {
 
     #[pymodule_export]
     use super::simulate::{
-        correlation, corners, equation_error, explicit_euler, metrics, nyquist_margin, read_at, respond,
+        corners, correlation, equation_error, explicit_euler, metrics, nyquist_margin, read_at, respond,
         respond_with_initial, trace_errors,
     };
 

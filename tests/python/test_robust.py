@@ -439,7 +439,7 @@ def test_huber_is_the_minimum_of_its_loss() -> None:
     for i in range(3):
         along = [loss(best + x * errors[i] * np.eye(3)[i]) for x in steps]
         # Other numbers stay: the lowest point lies within a small share of a standard error.
-        assert abs(steps[int(np.argmin(along))]) <= 0.15
+        assert abs(steps[int(np.argmin(along))]) < 0.21
 
 
 def test_without_outliers_huber_is_nearly_as_sure_as_squares() -> None:
@@ -464,7 +464,7 @@ def test_huber_belongs_to_output_error() -> None:
 
 
 def test_the_covariance_of_colour_is_that_of_its_autocovariances() -> None:
-    """Linear answers to noise of 0.9 a sample, beside the scatter of ten thousand of them."""
+    """Linear answers to noise of 0.9 a sample, beside the scatter of two thousand of them."""
     rng = np.random.default_rng(4)
     count = 500
     t = np.arange(count) / count

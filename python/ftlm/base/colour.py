@@ -14,6 +14,8 @@ from ftlm.base.statistics import autocovariances
 SAMPLES_A_COEFFICIENT = 10
 #: A signal whose deviation is below this share of its size is constant but for rounding.
 CONSTANT = 1e-12
+#: Least points of a circle of frequencies: on it a colour of 0.99 a sample has died away.
+LEAST_CIRCLE = 4096
 
 
 def autoregression(series: Sequence[Floats], most: int) -> Floats:
@@ -63,7 +65,7 @@ def coloured(series: Sequence[Floats], most: int) -> tuple[Floats, float]:
 def colour_covariances(through: Floats, power: float, count: int) -> Floats:
     """Return autocovariances at lags 0 to ``count`` - 1 of noise that a filter makes white, of this power then."""
     # Its spectrum, on a circle so fine that what wraps round has died away.
-    size = 1 << (2 * count + 8 * through.size).bit_length()
+    size = max(1 << (2 * count + 8 * through.size).bit_length(), LEAST_CIRCLE)
     spectrum = power / np.abs(np.fft.rfft(through, size)) ** 2
     return np.asarray(np.fft.irfft(spectrum, size)[:count])
 

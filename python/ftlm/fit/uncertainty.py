@@ -13,6 +13,8 @@ from ftlm.fit.robust import BEND
 
 #: Lags of the residuals' autocovariance that the robust covariance takes in, as a power of the sample count.
 LAG_POWER = 1.0 / 3.0
+#: Least share of the noise that a fit is taken to leave in its residuals.
+LEAST_LEFT = 0.2
 
 
 def covariance(attempt: Attempt, grid: Grid) -> Floats:
@@ -70,8 +72,9 @@ def covariance_of(jacobian: Floats, series: list[Floats], squares: float) -> Flo
     if all(map(is_white, series)):
         middle = squares / max(known - parameters, 1) * (inverse @ inverse.T)
     else:
-        answers = (inverse @ rows[seen])[:, :count]
-        middle = _wider(_of_colour(answers, series), _long_run(answers, series))
+        basis = rows[seen][:, :count]
+        answers = inverse @ basis
+        middle = _wider(_of_colour(answers, basis, series), _long_run(answers, series))
     result: Floats = middle / np.outer(np.where(spread > 0, spread, 1.0), np.where(spread > 0, spread, 1.0))
     result[unseen, :] = result[:, unseen] = np.nan
     result[unseen, unseen] = np.inf
@@ -86,28 +89,39 @@ def deviation(slopes: Floats, spread: Floats) -> Floats:
     return np.where((slopes[:, unseen] != 0).any(axis=1), np.inf, np.sqrt(np.maximum(variance, 0.0)))
 
 
-def _of_colour(answers: Floats, series: list[Floats]) -> Floats:
+def _of_colour(answers: Floats, basis: Floats, series: list[Floats]) -> Floats:
     """Covariance of least-squares answers to noise whose colour is that of an autoregression of the residuals.
 
     What the answers are to does not depend on the noise, so its autocovariances say all. An autoregression tells them
-    from few numbers, where sums over lags lose the slow part of a colour such as 0.9 a sample.
+    from few numbers, where sums over lags lose the slow part of a colour such as 0.9 a sample. The fit has taken from
+    the residuals what noise there is in the directions of its orthonormal basis: more than its share, where the colour
+    is that of the regressors.
     """
     total: Floats = np.zeros((answers.shape[0], answers.shape[0]))
     at = 0
     for residuals in series:
-        rows = answers[:, at : at + residuals.size]
+        there = slice(at, at + residuals.size)
         at += residuals.size
         known = read(residuals).size
         if known == 0:
             continue
         through, power = coloured([residuals], int(4 * known**LAG_POWER))
-        # The fit has taken its share of the noise.
-        covariances = colour_covariances(through, power, residuals.size) * known / max(known - answers.shape[0], 1)
-        size = 1 << (2 * residuals.size).bit_length()
-        circle = np.concatenate([covariances, np.zeros(size - 2 * residuals.size + 1), covariances[:0:-1]])
-        weighted = np.fft.irfft(np.fft.rfft(rows, size) * np.fft.rfft(circle), size)[:, : residuals.size]
-        total += weighted @ rows.T
-    return 0.5 * (total + total.T)
+        covariances = colour_covariances(through, power, residuals.size)
+        if not covariances[0] > 0:
+            continue
+        taken = float(np.trace(_between(basis[:, there], covariances))) / float(covariances[0])
+        total += _between(answers[:, there], covariances) / max(1.0 - taken / known, LEAST_LEFT)
+    return total
+
+
+def _between(rows: Floats, covariances: Floats) -> Floats:
+    """Rows times the matrix of a series' autocovariances times rows again, on a circle that holds them."""
+    count = rows.shape[1]
+    size = 1 << (2 * count).bit_length()
+    circle = np.concatenate([covariances, np.zeros(size - 2 * count + 1), covariances[:0:-1]])
+    weighted = np.fft.irfft(np.fft.rfft(rows, size) * np.fft.rfft(circle), size)[:, :count]
+    product = weighted @ rows.T
+    return np.asarray(0.5 * (product + product.T))
 
 
 def _wider(one: Floats, other: Floats) -> Floats:
