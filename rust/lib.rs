@@ -2,7 +2,7 @@
 //!
 //! The modules in the order in which a measurement passes them:
 //!
-//! 1. [`means`]: point samples become means over block pulses;
+//! 1. [`means`]: point samples become means over block pulses; [`readings`]: and means samples at times of their own;
 //! 2. [`kernels`], [`fractional`], [`series`], [`haar`], [`operational`]: fractional integrals as truncated power series
 //!    in the one-step delay, and the operational matrices of the literature beside them ([`fft`] and [`dense`] serve
 //!    them);
@@ -46,6 +46,7 @@
 
 pub mod error;
 pub mod means;
+pub mod readings;
 
 pub mod fractional;
 pub mod haar;

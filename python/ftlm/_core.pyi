@@ -20,6 +20,7 @@ __all__ = [
     "__version__",
     "block_pulse_kernel",
     "block_pulse_matrix",
+    "corners",
     "correlation",
     "delayed",
     "equation_error",
@@ -44,6 +45,7 @@ __all__ = [
     "point_samples",
     "portable",
     "pulse_means",
+    "read_at",
     "respond",
     "respond_with_initial",
     "search",
@@ -79,7 +81,10 @@ _LawEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine]]]
 _Monomial: TypeAlias = tuple[float, Sequence[tuple[int, int]]]
 #: (output, alpha, [(signal, order, coefficient), ...])
 _FreeEquation: TypeAlias = tuple[int, _Affine, Sequence[tuple[int, _Affine, _Monomial]]]
-#: (record, pulses a sample interval, samples of each output as rows, filter of simulated outputs, weights of outputs)
+#: (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between)
+_OwnTimes: TypeAlias = tuple[_Floats, Sequence[tuple[_Floats, _Floats] | None]]
+#: (record, pulses a sample interval, samples of each output as rows, filter of simulated outputs, weights of outputs,
+#: (values at the samples, whether it holds) of each signal, shares of the compared samples, times of their own)
 _Experiment: TypeAlias = tuple[
     _Record,
     int,
@@ -87,6 +92,8 @@ _Experiment: TypeAlias = tuple[
     tuple[_Floats, Sequence[bool]] | None,
     Sequence[float],
     Sequence[tuple[_Floats | None, bool]],
+    _Floats | None,
+    _OwnTimes | None,
 ]
 _Progress: TypeAlias = Callable[[int, int, int], object]
 
@@ -229,6 +236,8 @@ def explicit_euler(signals: _Floats, step: float, model: Sequence[_Equation], in
 def trace_errors(run: _Record, equation: _Structure, inputs: Sequence[bool], trace: _Floats) -> _Vector: ...
 def nyquist_margin(own_terms: Sequence[tuple[float, float]], step: float) -> float: ...
 def correlation(x: Sequence[_Floats], y: Sequence[_Floats], lags: int) -> tuple[_Vector, float, int]: ...
+def read_at(means: _Floats, places: _Floats) -> _Matrix: ...
+def corners(m: int, places: _Floats, jumps: tuple[_Floats, _Floats], order: float, step: float) -> _Vector: ...
 def metrics(measured: _Floats, residuals: _Floats) -> tuple[float, float, float, float]: ...
 
 # ------------------------------------------------------------------------------------------------------------ searches

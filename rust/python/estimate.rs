@@ -12,6 +12,7 @@ use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::estimate::streaming::Streaming as StreamingFit;
 use crate::estimate::{iv as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint};
+use crate::readings::Readings;
 
 /// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);
@@ -105,8 +106,12 @@ type AffineArg = (f64, Vec<f64>);
 type MonomialArg = (f64, Vec<(usize, i32)>);
 /// (output, alpha, [(signal, order, coefficient), …]).
 type FreeEquationArg = (usize, AffineArg, Vec<(usize, AffineArg, MonomialArg)>);
+/// (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between).
+type OwnTimesArg<'py> =
+    (PyReadonlyArray1<'py, f64>, Vec<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
 /// (record, pulses a sample interval, samples of each output, filter of simulated outputs, weight of each output,
-/// (values at the samples, whether it holds) of each signal).
+/// (values at the samples, whether it holds) of each signal, shares of the compared samples of each output, times of
+/// their own).
 type ExperimentArg<'py> = (
     RecordArg<'py>,
     usize,
@@ -114,6 +119,8 @@ type ExperimentArg<'py> = (
     Option<(PyReadonlyArray1<'py, f64>, Vec<bool>)>,
     Vec<f64>,
     Vec<(Option<PyReadonlyArray1<'py, f64>>, bool)>,
+    Option<PyReadonlyArray2<'py, f64>>,
+    Option<OwnTimesArg<'py>>,
 );
 
 fn affine((constant, weights): AffineArg) -> AffineOrder {
@@ -121,7 +128,24 @@ fn affine((constant, weights): AffineArg) -> AffineOrder {
 }
 
 fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
-    let experiment = joint::Experiment::new(record(&argument.0)?, argument.1, rows(&argument.2), argument.4.clone())?;
+    let (record, samples, weights) = (record(&argument.0)?, rows(&argument.2), argument.4.clone());
+    let experiment = match &argument.7 {
+        None => joint::Experiment::new(record, argument.1, samples, weights)?,
+        Some((places, jumps)) => {
+            let readings = Readings::new(vector("times of readings", places)?, record.m())?;
+            let jumps = (jumps.iter())
+                .map(|near| {
+                    let Some((places, sizes)) = near else { return Ok(None) };
+                    Ok(Some(readings.jumps(&vector("times of jumps", places)?, &vector("jumps", sizes)?)))
+                })
+                .collect::<PyResult<Vec<_>>>()?;
+            joint::Experiment::with_own_times(record, samples, weights, joint::OwnTimes { readings, jumps })?
+        }
+    };
+    let experiment = match &argument.6 {
+        None => experiment,
+        Some(shares) => experiment.with_shares(rows(shares))?,
+    };
     let instants = (argument.5.iter())
         .map(|(values, held)| {
             let values = values.as_ref().map(|v| vector("signal at the samples", v)).transpose()?;

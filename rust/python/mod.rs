@@ -28,8 +28,8 @@ mod _core {
 
     #[pymodule_export]
     use super::simulate::{
-        correlation, equation_error, explicit_euler, metrics, nyquist_margin, respond, respond_with_initial,
-        trace_errors,
+        corners, correlation, equation_error, explicit_euler, metrics, nyquist_margin, read_at, respond,
+        respond_with_initial, trace_errors,
     };
 
     #[pymodule_export]

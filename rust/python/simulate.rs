@@ -7,6 +7,7 @@ use super::arrays::{
     equations, initial, record, rows, stacked, structure, vector, EquationArg, InitialArg, RecordArg, StructureArg,
 };
 use super::errors::detached;
+use crate::readings::Readings;
 use crate::simulate::{self, OutputFilter};
 
 #[pyfunction]
@@ -121,4 +122,39 @@ pub fn correlation<'py>(
     let y = y.iter().map(|a| vector("y", a)).collect::<PyResult<Vec<_>>>()?;
     let found = detached(py, || crate::metrics::correlation(&x, &y, lags))?;
     Ok((PyArray1::from_vec(py, found.values), found.variance, found.window))
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn read_at<'py>(
+    py: Python<'py>,
+    means: PyReadonlyArray2<'py, f64>,
+    places: PyReadonlyArray1<'py, f64>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let (means, places) = (rows(&means), vector("times of readings", &places)?);
+    let m = means.first().map_or(0, Vec::len);
+    let read = detached(py, || {
+        let readings = Readings::new(places, m)?;
+        Ok(means.iter().map(|row| readings.read(row)).collect::<Vec<_>>())
+    })?;
+    stacked(py, &read)
+}
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn corners<'py>(
+    py: Python<'py>,
+    m: usize,
+    places: PyReadonlyArray1<'py, f64>,
+    jumps: (PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>),
+    order: f64,
+    step: f64,
+) -> PyResult<Bound<'py, PyArray1<f64>>> {
+    let places = vector("times of readings", &places)?;
+    let (at, sizes) = (vector("times of jumps", &jumps.0)?, vector("jumps", &jumps.1)?);
+    let lacking = detached(py, || {
+        let readings = Readings::new(places, m)?;
+        Ok(readings.corners(&readings.jumps(&at, &sizes), order, step))
+    })?;
+    Ok(PyArray1::from_vec(py, lacking))
 }

@@ -1,4 +1,4 @@
-"""Runs with jittered times put on a regular step: held commands by the exact mean of the hold."""
+"""Runs with jittered times put on a regular step: commands by the mean of the hold, outputs compared when read."""
 
 from __future__ import annotations
 
@@ -81,8 +81,8 @@ def test_regular_times_leave_intervals_that_cover() -> None:
     assert min(covered.values()) >= 27, covered
 
 
-def test_jitter_of_thirty_percent_moves_estimates_by_a_standard_error() -> None:
-    """Chords of the output between jittered times are an error of their own, which no interval of the fit knows."""
+def test_jitter_of_thirty_percent_leaves_intervals_that_cover_as_well() -> None:
+    """The output is compared when it was read; straight lines to a grid moved estimates by a standard error."""
     covered, errors = coverage(0.3)
-    assert min(covered.values()) >= 22, covered
-    assert np.abs(np.mean(errors, axis=0)).max() < 1.5
+    assert min(covered.values()) >= 27, covered
+    assert np.abs(np.mean(errors, axis=0)).max() < 0.5

@@ -10,10 +10,10 @@ import pytest
 
 import ftlm
 from ftlm import _core
+from ftlm.base.colour import autoregression, whitened
 from ftlm.base.statistics import chi_squared_99, is_white
 from ftlm.judge.charts import residual_charts
 from ftlm.judge.residuals import residual_warnings
-from ftlm.judge.whitening import autoregression, whitened
 
 WORDS = "D^1.6 y = a D^0.6 y + c y + b u"
 

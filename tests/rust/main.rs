@@ -19,6 +19,7 @@ mod metrics;
 mod output_error;
 mod plants;
 mod points;
+mod readings;
 mod refusals;
 mod rig;
 mod search;

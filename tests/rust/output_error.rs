@@ -84,7 +84,7 @@ fn run(intervals: usize, every: usize, initial: &[Vec<(f64, f64)>], noise: f64, 
         samples.push(clean.iter().map(|y| y + sigma * random.normal()).collect());
         record = with_signal(&record, i, means);
     }
-    Experiment { record, every, samples, filter: None, weights, instants: Vec::new() }
+    Experiment::new(record, every, samples, weights).unwrap()
 }
 
 fn point(orders: &[f64], coefficients: &[f64]) -> Point {

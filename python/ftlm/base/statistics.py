@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
@@ -27,18 +28,56 @@ def is_rest(samples: Floats) -> bool:
 
     Only the first sample is judged: a machine at rest may answer within a few samples.
     """
+    there = samples[~np.isnan(samples)]
     noise = noise_of(samples)
-    return bool(abs(samples[0]) <= REST_SIGMAS * noise + REST_SHARE * float(np.std(samples)))
+    return bool(abs(there[0]) <= REST_SIGMAS * noise + REST_SHARE * float(np.std(there)))
 
 
 def noise_of(samples: Floats) -> float:
     """Estimate the deviation of white noise on a smooth signal, from the median of its second differences."""
-    return float(np.median(np.abs(np.diff(samples, 2)))) / MAD / float(np.sqrt(6.0)) if samples.size > 2 else 0.0
+    bends = np.diff(samples, 2)
+    bends = bends[~np.isnan(bends)]
+    if bends.size == 0:
+        # No three neighbours were read: those that were stand closest.
+        bends = np.diff(samples[~np.isnan(samples)], 2)
+    return float(np.median(np.abs(bends))) / MAD / float(np.sqrt(6.0)) if bends.size else 0.0
+
+
+def robust_deviation(values: Floats) -> float:
+    """Deviation of normal values from the median of their sizes, which a few that are far off do not move."""
+    return float(np.median(np.abs(values))) / MAD if values.size else 0.0
+
+
+def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
+    """Autocovariances of series at lags from 0, and how many pairs each is the mean of; NaN is not there.
+
+    Each series is taken about its own mean; they are pooled.
+    """
+    sums, pairs = np.zeros(most + 1), np.zeros(most + 1)
+    for values in series:
+        there = ~np.isnan(values)
+        x = np.where(there, values - np.mean(values[there]) if there.any() else 0.0, 0.0)
+        known = there.astype(np.float64)
+        for lag in range(min(most, x.size - 1) + 1):
+            sums[lag] += float(x[lag:] @ x[: x.size - lag])
+            pairs[lag] += float(known[lag:] @ known[: x.size - lag])
+    return sums / np.maximum(pairs, 1.0), pairs
 
 
 def ljung_box(correlations: Floats, count: int) -> float:
     """Ljung and Box's sum over autocorrelations at lags from 1 of a series of ``count`` samples."""
     return count * (count + 2) * float(np.sum(correlations**2 / (count - np.arange(1, correlations.size + 1))))
+
+
+def whiteness(covariances: Floats, pairs: Floats) -> float:
+    """Ljung and Box's sum from covariances at lags from 0 and the pairs that each is the mean of.
+
+    Where all values are there it is theirs; where some are not, each correlation has the variance of its own pairs.
+    """
+    count = pairs[0]
+    # Sums over all of the power, as the statistic has them.
+    correlations = covariances[1:] * pairs[1:] / (covariances[0] * count)
+    return float((count + 2.0) * count * np.sum(correlations**2 / np.maximum(pairs[1:], 1.0)))
 
 
 def chi_squared(degrees: int, level: float) -> float:
@@ -67,9 +106,9 @@ def colour(series: Floats) -> float:
 
 def is_white(series: Floats, lags: int = 25) -> bool:
     """Ljung-Box test at 1 %: whether autocorrelations up to ``lags`` could be those of white noise."""
-    e = series - np.mean(series)
-    power = float(e @ e)
-    if power == 0.0 or e.size <= lags + 1:
+    if series.size <= lags + 1:
         return True
-    correlations = np.array([float(e[k:] @ e[:-k]) / power for k in range(1, lags + 1)])
-    return ljung_box(correlations, e.size) <= chi_squared_99(lags)
+    covariances, pairs = autocovariances([series], lags)
+    if not covariances[0] > 0 or pairs[0] <= lags + 1:
+        return True
+    return whiteness(covariances, pairs) <= chi_squared_99(lags)

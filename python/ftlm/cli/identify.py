@@ -49,6 +49,10 @@ def identify(
     *, files: Files, structure: StructureText,
     method: Annotated[Method, Option(help="Estimator.")] = "output-error",
     reading: ReadingOptions, shape: StructureOptions, search: SearchOptions, genetic: GeneticOptions,
+    loss: Annotated[
+        Literal["squares", "huber"] | None,
+        Option(help="Of output error: huber, so that outliers decide nothing; default squares."),
+    ] = None,
     threads: Threads = None,
     reference: Annotated[
         Text, Option(metavar="SIGNAL", help="What drives a closed loop from outside; also name it with -u.")
@@ -71,7 +75,7 @@ def identify(
         result = estimation.identify(
             runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
             genetic=genetic.settings(method), threads=threads, progress=progress, store=store,
-            reference=reference,
+            loss=loss, reference=reference,
         )  # fmt: skip
     if out is not None:
         result.model.save(out, force=force)

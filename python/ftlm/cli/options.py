@@ -58,9 +58,15 @@ class ReadingOptions:
     ] = None
     sliced: Annotated[Text, Option("--slice", metavar="FROM:TO", help="Seconds since the first row.")] = None
     resample: Annotated[
-        Number, Option(metavar="STEP", help="Interpolate onto this step [s], held inputs by their means.")
+        Number,
+        Option(
+            metavar="STEP", help="Put irregular rows on this step [s]; output error compares when outputs were read."
+        ),
     ] = None
-
+    missing: Annotated[
+        Literal["refuse", "weight", "hold"] | None,
+        Option(help="weight: outputs that are not there weigh nothing; hold: inputs hold their last value besides."),
+    ] = None
     detrend: Annotated[
         Literal["constant", "linear"] | None,
         Option(help="Subtract the mean or the straight line of every signal; --offset estimates it instead."),
@@ -77,6 +83,7 @@ class ReadingOptions:
             "time": self.time, "step": self.sampling, "inputs": pairs("-u", self.inputs),
             "outputs": pairs("-y", self.outputs), "units": pairs("--unit", self.units), "columns": self.columns,
             "time_unit": self.time_unit, "intersample": pairs("--intersample", self.between), "resample": self.resample,
+            "missing": self.missing,
         }  # fmt: skip
         if not files:
             return []

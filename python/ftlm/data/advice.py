@@ -126,6 +126,7 @@ def advise(run: Measured, structure: Structure | None = None) -> Advice:
 
 
 def _findings(run: Measured, structure: Structure | None) -> Iterator[Finding]:
+    run = run.bridged()
     moving = [n for n in run.signals if np.ptp(run[n]) > 0]
     for name in run.signals:
         if name not in moving:
@@ -367,6 +368,7 @@ def excitation_for(run: Measured, structure: Structure) -> Iterator[Finding]:
 
     In steady state a spectral line tells two numbers of every output that it reaches, a constant level one.
     """
+    run = run.bridged()
     for item in structure.equations:
         inputs = [s for s in item.signals if s in run.inputs]
         # What is measured of the other outputs drives the equation, too.

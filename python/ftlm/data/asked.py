@@ -9,10 +9,20 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import listed
+from ftlm.base.checks import bad_rows, listed
 from ftlm.base.errors import DataError
 from ftlm.data.measured import Measured
 from ftlm.data.names import check_run_name, check_signal_name
+from ftlm.data.readings import (
+    Missing,
+    Readings,
+    checked_missing,
+    few_read,
+    held,
+    places_on_grid,
+    said_missing,
+    unread,
+)
 from ftlm.data.samples import (
     FEWEST_ROWS,
     HELD,
@@ -20,12 +30,14 @@ from ftlm.data.samples import (
     as_vector,
     check_increasing,
     check_lengths,
+    check_rows,
     check_values,
     checked_intersample,
     checked_step,
     grid_of,
     how_interpolated,
     interpolated,
+    is_regular,
     regular_step,
     window_rows,
 )
@@ -38,7 +50,7 @@ class Asked:
 
     Parameters
     ----------
-    inputs, outputs, step, time, units, intersample, name, resample, time_unit
+    inputs, outputs, step, time, units, intersample, name, resample, time_unit, missing
         As there.
     window
         Its ``slice``.
@@ -65,6 +77,7 @@ class Asked:
     known_step: float | None = None
     facts: tuple[str, ...] = ()
     about: Mapping[str, Any] = field(default_factory=dict)
+    missing: str = "refuse"
 
     def thing(self, signal: str) -> str:
         """Return what errors call a signal."""
@@ -85,13 +98,17 @@ class Asked:
             **checked_intersample(self.intersample, tuple(self.inputs)),
         }
         new_step = None if self.resample is None else checked_step(self.resample, "resample")
-        vectors = {s: as_vector(v, self.thing(s))[0] for s, v in {**self.inputs, **self.outputs}.items()}
+        missing = checked_missing(self.missing)
+        vectors = {
+            s: as_vector(v, self.thing(s), gaps=missing != "refuse" and (missing == "hold" or s in self.outputs))[0]
+            for s, v in {**self.inputs, **self.outputs}.items()
+        }
         clock = self._clock(vectors)
         first, last = self._rows(clock.times)
         if last - first < clock.times.size:
             # Copies: a view would keep the rest in memory, and could be written to.
             vectors = {s: vector[first:last].copy() for s, vector in vectors.items()}
-        data = self._values(vectors, units, first)
+        data = self._values(vectors, units, first, missing)
         times, facts = clock.times[first:last], self.facts
         if clock.step is not None:
             step, start = clock.step, float(f"{first * clock.step:.12g}")
@@ -100,17 +117,80 @@ class Asked:
             check_increasing(times, self.time_label, first)
             start = float(times[0])
             if new_step is None:
+                if missing != "refuse":
+                    times, data = self._with_lost_rows(times, data, missing, first)
                 step, jitter = regular_step(times, self.time_label, first, clock.resolution, self.known_step)
                 facts += jitter
+        data, said = self._known(data, behaviour, missing)
+        facts += said
+        readings = None
         if new_step is not None:
             step, since = new_step, times - times[0]
-            data = interpolated(since, data, behaviour, new_step)
-            facts += (_resampled(since, new_step, first, behaviour),)
+            whole = not any(np.isnan(data[s]).any() for s in self.outputs)
+            if whole and is_regular(since):
+                data = interpolated(since, data, behaviour, new_step)
+                facts += (resampled(since, new_step, first, how_interpolated(behaviour)),)
+            else:
+                check_rows(since, new_step)
+                readings = Readings(since, data)
+                data = readings.on(behaviour, new_step)
+                facts += (resampled(since, new_step, first, how_read(behaviour)),)
         return Measured(
             name=self.name, step=step, start=start, inputs=tuple(self.inputs), outputs=tuple(self.outputs), _data=data,
             _units={s: unit for s, (unit, _) in units.items()}, _intersample=behaviour,
-            facts=tuple(dict.fromkeys(facts)), _about=dict(self.about),
+            facts=tuple(dict.fromkeys(facts)), _about=dict(self.about), readings=readings,
         )  # fmt: skip
+
+    def _with_lost_rows(
+        self, times: Floats, data: dict[str, Floats], missing: Missing, first: int
+    ) -> tuple[Floats, dict[str, Floats]]:
+        """Rows for the places of a regular grid that have none, where the others lie on one."""
+        found = places_on_grid(times)
+        if found is None or found[0].size == found[0][-1] + 1:
+            return times, data
+        places, step = found
+        lost = int(places[-1]) + 1 - places.size
+        if self.inputs and missing != "hold":
+            row = first + int(np.flatnonzero(np.diff(places) > 1)[0]) + 1
+            raise DataError(
+                f"{self.time_label}: {lost} rows are missing of a regular grid of {step:.6g} s, the first before row "
+                f"{row}, and the inputs are not known there; give these rows with NaN for the outputs alone, or hold "
+                "the inputs over them with missing='hold'"
+            )
+        whole = times[0] + grid_of(int(places[-1]) + 1, step)
+        whole[places] = times
+        out = {}
+        for name, values in data.items():
+            out[name] = np.full(whole.size, np.nan)
+            out[name][places] = values
+        return whole, out
+
+    def _known(
+        self, data: dict[str, Floats], behaviour: Mapping[str, Intersample], missing: Missing
+    ) -> tuple[dict[str, Floats], tuple[str, ...]]:
+        """Inputs that are known throughout, and what there is to say of what was not read."""
+        said, out = [], dict(data)
+        for name, values in data.items():
+            gone = unread(values)
+            if not gone.any():
+                continue
+            if name in self.outputs:
+                if few_read(values):
+                    raise bad_rows(
+                        self.thing(name), f"{gone.size - int(gone.sum())} values, {FEWEST_ROWS} are needed", 0,
+                        int(gone.sum()), "use a longer record",
+                    )  # fmt: skip
+                said.append(said_missing(f"output {name}", gone, "they weigh nothing in output-error fits and figures"))
+                continue
+            if gone[0]:
+                raise bad_rows(
+                    self.thing(name), "no value before which there is none to hold", 0, int(gone.sum()),
+                    "begin where the input is known, with slice=",
+                )  # fmt: skip
+            out[name] = held(values, behaviour[name])
+            how = "its last value was held" if behaviour[name] == HELD else "a straight line was drawn"
+            said.append(said_missing(f"input {name}", gone, f"{how}, which is a guess"))
+        return out, tuple(said)
 
     def _check_names(self) -> None:
         check_run_name(self.name)
@@ -159,16 +239,20 @@ class Asked:
         return first, last
 
     def _values(
-        self, vectors: Mapping[str, Floats], units: Mapping[str, tuple[str, float]], first: int
+        self, vectors: Mapping[str, Floats], units: Mapping[str, tuple[str, float]], first: int, missing: Missing
     ) -> dict[str, Floats]:
-        """Return finite numbers in SI units."""
+        """Return finite numbers in SI units, NaN where they may be missing."""
         data: dict[str, Floats] = {}
         for signal, vector in vectors.items():
             unit, scale = units[signal]
-            check_values(vector, self.thing(signal), first)
+            gaps = missing == "hold" or (missing == "weight" and signal in self.outputs)
+            instead = "give them no weight with missing='weight'"
+            if signal in self.inputs:
+                instead = "hold the last value before them with missing='hold'"
+            check_values(vector, self.thing(signal), first, gaps=gaps, instead=f"{instead}, or avoid them with slice=")
             with np.errstate(over="ignore"):
                 data[signal] = vector * scale if scale != 1.0 else vector
-            check_values(data[signal], f"{self.thing(signal)} in {unit}", first)
+            check_values(data[signal], f"{self.thing(signal)} in {unit}", first, gaps=gaps)
         return data
 
 
@@ -181,9 +265,17 @@ class _Clock:
     resolution: float
 
 
-def _resampled(since: Floats, step: float, first: int, behaviour: Mapping[str, Intersample]) -> str:
+def resampled(since: Floats, step: float, first: int, how: str) -> str:
+    """Say what was put on which step, and how."""
     intervals = np.diff(since)
     return (
         f"resampled to {step:.12g} s from intervals of {intervals.min():.6g} to {intervals.max():.6g} s, the widest "
-        f"after row {first + int(intervals.argmax())} ({how_interpolated(behaviour)})"
+        f"after row {first + int(intervals.argmax())} ({how})"
     )
+
+
+def how_read(behaviour: Mapping[str, Intersample]) -> str:
+    """Say what becomes of each signal that has times of its own."""
+    kept = [signal for signal, kind in behaviour.items() if kind == HELD]
+    means = f"held: {', '.join(kept)}, by means over the new intervals; " if kept else ""
+    return f"{means}outputs keep their own times in output-error fits and figures, elsewhere straight lines"

@@ -12,15 +12,20 @@ from typing import Any
 from ftlm.base.errors import DataError
 from ftlm.data.measured import Measured
 from ftlm.data.names import is_run_name
+from ftlm.data.readings import unread
 
 CSV_MARK = "# ftlm-run "
 CSV_VERSION = 1
 BOM = b"\xef\xbb\xbf"
-#: What must be told, as JSON gives it; `about` may be left out, and the rows themselves say when they start.
+#: What a file says of rows at times of their own, which it does not hold.
+LEFT_BEHIND = "written on its grid: the times at which outputs were read stayed behind"
+#: What must be told, as JSON gives it; the rows themselves say when they start.
 _KINDS: dict[str, type] = {
     "name": str, "step": float, "inputs": list, "outputs": list, "units": dict, "intersample": dict, "warnings": list,
-    "about": dict,
+    "about": dict, "missing": list,
 }  # fmt: skip
+#: ... and what may be left out.
+_OPTIONAL: dict[str, Any] = {"about": {}, "missing": []}
 
 
 @dataclass(frozen=True)
@@ -36,18 +41,20 @@ class Header:
     intersample: dict[str, str]
     warnings: tuple[str, ...]
     about: dict[str, Any] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, run: Measured) -> Header:
         """Return the header of a run."""
         return cls(
-            run.name, run.step, run.start, run.inputs, run.outputs, run.units, dict(run.intersample), run.facts,
-            run.about,
+            run.name, run.step, run.start, run.inputs, run.outputs, run.units, dict(run.intersample),
+            run.facts if run.readings is None else (*run.facts, LEFT_BEHIND), run.about,
+            tuple(n for n in run.outputs if unread(run[n]).any()),
         )  # fmt: skip
 
     def text(self) -> str:
         """Write it."""
-        told = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "about" or self.about}
+        told = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _OPTIONAL or getattr(self, f.name)}
         return f"{CSV_VERSION} {json.dumps(told, ensure_ascii=False, allow_nan=False)}"
 
     @classmethod
@@ -71,7 +78,7 @@ class Header:
 def _checked(told: Any) -> Header:
     values: dict[str, Any] = {}
     for key, kind in _KINDS.items():
-        value = told[key] if key != "about" else told.get(key, {})
+        value = told.get(key, _OPTIONAL[key]) if key in _OPTIONAL else told[key]
         if not isinstance(value, kind):
             raise ValueError(f"{key!r} is {str(value)[:40]!r}")
         values[key] = tuple(value) if isinstance(value, list) else value

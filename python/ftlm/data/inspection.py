@@ -9,6 +9,7 @@ import numpy as np
 
 from ftlm.base.statistics import is_rest, noise_of
 from ftlm.data.measured import Measured
+from ftlm.data.readings import read
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,9 @@ def inspect_run(run: Measured) -> Inspection:
 
 
 def _figures(run: Measured, name: str) -> SignalFigures:
-    x = run[name]
-    low, high, noise = float(x.min()), float(x.max()), noise_of(x)
+    all_rows = run[name]
+    x = read(all_rows)
+    low, high, noise = float(x.min()), float(x.max()), noise_of(all_rows)
     changes = np.abs(np.diff(x))
     changes = changes[changes > 0]
     deviation = float(x.std())

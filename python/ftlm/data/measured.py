@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import listed, nearest
 from ftlm.base.errors import DataError
+from ftlm.data.readings import Readings, bridged, read, unread
 from ftlm.data.samples import Intersample, grid_of, is_constant, locked
 
 
@@ -26,6 +30,9 @@ class Measured:
         Names.
     facts
         What was done to the data, and what a rig said of them, in words.
+    readings
+        Rows at times of their own, where these are not those of the grid; on the grid stand means of the hold and
+        straight lines.
     """
 
     name: str
@@ -38,6 +45,7 @@ class Measured:
     _intersample: dict[str, Intersample]
     facts: tuple[str, ...] = ()
     _about: dict[str, Any] = field(default_factory=dict)
+    readings: Readings | None = None
 
     def __post_init__(self) -> None:
         for name, value in (
@@ -47,6 +55,9 @@ class Measured:
             ("_about", copy.deepcopy(self._about)),
         ):
             object.__setattr__(self, name, value)
+        if self.readings is not None:
+            own = Readings(locked(self.readings.times), {s: locked(self.readings.data[s]) for s in self.signals})
+            object.__setattr__(self, "readings", own)
 
     @property
     def signals(self) -> tuple[str, ...]:
@@ -81,13 +92,28 @@ class Measured:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What was done to the data and what is odd about them, in words."""
+        there = {name: read(self._data[name]) for name in self.outputs}
         constant = tuple(
-            f"output {name!r} is constant ({float(self._data[name][0])!r} in all {self.length} rows): nothing can be "
-            "identified from it"
-            for name in self.outputs
-            if is_constant(self._data[name])
+            f"output {name!r} is constant ({float(values[0])!r} in all {values.size} rows): nothing can be identified "
+            "from it"
+            for name, values in there.items()
+            if values.size and is_constant(values)
         )
         return self.facts + constant
+
+    @property
+    def missing(self) -> dict[str, NDArray[np.bool_]]:
+        """Outputs that were not read throughout, with the rows of the run (or of its `readings`) that hold no value."""
+        data = self._data if self.readings is None else self.readings.data
+        gone = {name: unread(data[name]) for name in self.outputs}
+        return {name: rows for name, rows in gone.items() if rows.any()}
+
+    def bridged(self) -> Measured:
+        """The same with straight lines over what was not read, for a first look; nothing is fitted to these."""
+        if not any(unread(self._data[name]).any() for name in self.outputs):
+            return self
+        told = {f.name: getattr(self, f.name) for f in fields(Measured)}
+        return Measured(**{**told, "_data": {name: bridged(values) for name, values in self._data.items()}})
 
     @property
     def about(self) -> dict[str, Any]:

@@ -8,21 +8,29 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any, NoReturn, cast
 
+import numpy as np
+
+from ftlm.base.arrays import Floats
 from ftlm.base.checks import as_mapping, bad_rows, listed, names_to_columns, nearest
 from ftlm.base.errors import DataError
 from ftlm.data.advice import Advice, advise
-from ftlm.data.asked import Asked
+from ftlm.data.asked import Asked, how_read
 from ftlm.data.measured import Measured
 from ftlm.data.names import check_signal_name
+from ftlm.data.readings import Readings, read
 from ftlm.data.samples import (
     FEWEST_ROWS,
+    as_vector,
+    check_lengths,
+    check_rows,
+    check_values,
     checked_intersample,
     checked_step,
-    detrended,
     grid_of,
     how_interpolated,
     interpolated,
     is_constant,
+    trend_of,
     window_rows,
 )
 from ftlm.data.structures import Structure
@@ -59,7 +67,7 @@ class Run(Measured):
         cls, *, step: float | None = None, time: object = None, inputs: Mapping[str, object] | None,
         outputs: Mapping[str, object], units: Mapping[str, str] | None = None,
         intersample: Mapping[str, str] | None = None, name: str = "run", resample: float | None = None,
-        slice: Sequence[float | None] | None = None, time_unit: str = "s",
+        slice: Sequence[float | None] | None = None, time_unit: str = "s", missing: str = "refuse",
     ) -> Run:  # fmt: skip
         """Make a run from one-dimensional arrays.
 
@@ -82,13 +90,19 @@ class Run(Measured):
         name : str, default "run"
             What reports call this run.
         resample : float, optional
-            Interpolate onto this step [s]: held inputs by the mean of the hold over each new interval, everything
-            else linearly. Recorded in `warnings`. Intervals of estimates do not know what this costs: times that
-            jitter by 30 % of a step moved the order of a plant with 1 % noise by one standard error.
+            Put the run on this step [s]: held inputs by the mean of the hold over each new interval, everything
+            else linearly. Recorded in `warnings`. Where the rows were not regular, or outputs were not read
+            throughout, they stay in `readings`: output error simulates under the inputs as they were, and compares
+            with each output when it was read. Methods of the equation error see the straight lines.
         slice : pair of float or None, optional
             Use the rows with a ≤ t < b only, [s] since the first row; applied before any other check of the rows.
         time_unit : {"s", "ms", "us", "min", "h"}, default "s"
             Unit of `time`.
+        missing : {"refuse", "weight", "hold"}, default "refuse"
+            What to do about values that are not there: NaN, None in a list, masked values, rows that a regular `time`
+            lacks. ``"weight"``: of outputs; they stay NaN and weigh nothing wherever output error is fitted or judged,
+            every other method refuses the run. ``"hold"``: of inputs as well, which hold their last value (a straight
+            line where they are ``"foh"``). What was missing is said in `warnings`.
 
         Returns
         -------
@@ -104,7 +118,7 @@ class Run(Measured):
         asked = Asked(
             as_mapping("inputs", {} if inputs is None else inputs), as_mapping("outputs", outputs), step=step,
             time=time, units=units, intersample=intersample, name=name, resample=resample, window=slice,
-            time_unit=time_unit,
+            time_unit=time_unit, missing=missing,
         )  # fmt: skip
         return built(asked)
 
@@ -114,7 +128,7 @@ class Run(Measured):
         inputs: Mapping[str, Hashable] | Sequence[str] | str | None,
         outputs: Mapping[str, Hashable] | Sequence[str] | str, units: Mapping[str, str] | None = None,
         intersample: Mapping[str, str] | None = None, name: str = "run", resample: float | None = None,
-        slice: Sequence[float | None] | None = None, time_unit: str | None = None,
+        slice: Sequence[float | None] | None = None, time_unit: str | None = None, missing: str = "refuse",
     ) -> Run:  # fmt: skip
         """Make a run from a pandas or polars frame, a dict of arrays or a structured NumPy array.
 
@@ -128,7 +142,7 @@ class Run(Measured):
             Time between rows [s], > 0.
         inputs, outputs : mapping of str to column, or list of str
             Columns by signal name; a list names columns that keep their names.
-        units, intersample, name, resample, slice
+        units, intersample, name, resample, slice, missing
             As in `Run.from_arrays`.
         time_unit : {"s", "ms", "us", "min", "h"}, optional
             Unit of the time column; where not given, the one that its name states, as in ``time [ms]`` (said in the
@@ -168,6 +182,7 @@ class Run(Measured):
         asked = Asked(
             given_inputs, given_outputs, step=step, time=clock, units=units, intersample=intersample, name=name,
             resample=resample, window=slice, time_unit=unit, labels=labels, facts=said, time_label=label,
+            missing=missing,
         )  # fmt: skip
         return built(asked)
 
@@ -184,7 +199,7 @@ class Run(Measured):
             f"<tr><td>{html.escape(name)}</td>"
             f"<td>{f'input ({self._intersample[name]})' if name in self._intersample else 'output'}</td>"
             f"<td>{html.escape(self._units[name])}</td>"
-            f"<td>{self._data[name].min():.6g}</td><td>{self._data[name].max():.6g}</td></tr>"
+            f"<td>{np.nanmin(self._data[name]):.6g}</td><td>{np.nanmax(self._data[name]):.6g}</td></tr>"
             for name in self.signals
         )
         warnings = "".join(f"<li>{html.escape(text)}</li>" for text in self.warnings)
@@ -219,7 +234,10 @@ class Run(Measured):
         data = {name: values[first:last] for name, values in self._data.items()}
         # The digits beyond the twelfth come from the sum and not from the source.
         begin = self.start if first == 0 else float(f"{self.start + first * self.step:.12g}")
-        return self._with(_data=data, start=begin)
+        readings = self.readings
+        if readings is not None:
+            readings = readings.part(self._intersample, first * self.step, (last - 1) * self.step, self.step)
+        return self._with(_data=data, start=begin, readings=readings)
 
     def resample(self, step: float) -> Run:
         """Return this run interpolated onto another step.
@@ -243,9 +261,16 @@ class Run(Measured):
             If `step` is not positive, or leaves fewer than three rows or more than 50 million.
         """
         new_step = checked_step(step, "resample")
-        data = interpolated(grid_of(self.length, self.step), self._data, self._intersample, new_step)
-        fact = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how_interpolated(self._intersample)})"
-        return self._with(_data=data, step=new_step, facts=(*self.facts, fact))
+        since, readings, how = grid_of(self.length, self.step), self.readings, how_interpolated(self._intersample)
+        if readings is None and self.missing:
+            readings = Readings(since, self._data)
+        if readings is None:
+            data = interpolated(since, self._data, self._intersample, new_step)
+        else:
+            check_rows(readings.times, new_step)
+            data, how = readings.on(self._intersample, new_step), how_read(self._intersample)
+        fact = f"resampled from {self.step:.12g} s to {new_step:.12g} s ({how})"
+        return self._with(_data=data, step=new_step, facts=(*self.facts, fact), readings=readings)
 
     def detrend(self, kind: str = "constant", signals: Iterable[str] | None = None) -> Run:
         """Return this run less the mean, or the straight line of least squares, of some signals.
@@ -276,11 +301,14 @@ class Run(Measured):
         unknown = next((name for name in wanted if name not in self), None)
         if unknown is not None:
             raise self._unknown(unknown)
-        data, facts = dict(self._data), list(self.facts)
+        data, facts, readings = dict(self._data), list(self.facts), self.readings
         for name in wanted:
-            data[name], words = detrended(self._data[name], self.step, linear=kind == "linear")
+            trend, words = trend_of(self._data[name], self.step, linear=kind == "linear")
+            data[name] = self._data[name] - trend(self.time)
+            if readings is not None:
+                readings = readings.changed(**{name: readings.data[name] - trend(readings.times)})
             facts.append(f"detrended: {words} subtracted from {name}")
-        return self._with(_data=data, facts=tuple(facts))
+        return self._with(_data=data, facts=tuple(facts), readings=readings)
 
     def rename(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with other signal names.
@@ -314,6 +342,9 @@ class Run(Measured):
             _data={renamed[name]: values for name, values in self._data.items()},
             _units={renamed[name]: unit for name, unit in self._units.items()},
             _intersample={renamed[name]: kind for name, kind in self._intersample.items()},
+            readings=None
+            if self.readings is None
+            else Readings(self.readings.times, {renamed[name]: v for name, v in self.readings.data.items()}),
         )
 
     def with_intersample(self, mapping: Mapping[str, str]) -> Run:
@@ -333,7 +364,43 @@ class Run(Measured):
         DataError
             If a name is not an input or a behaviour is neither "zoh" nor "foh".
         """
-        return self._with(_intersample={**self._intersample, **checked_intersample(mapping, self.inputs)})
+        behaviour = {**self._intersample, **checked_intersample(mapping, self.inputs)}
+        data = self._data if self.readings is None else self.readings.on(behaviour, self.step)
+        return self._with(_intersample=behaviour, _data={n: v[: self.length] for n, v in data.items()})
+
+    def with_outputs(self, values: Mapping[str, Floats]) -> Run:
+        """Return this run with further outputs, or other values of its own; on its grid, known throughout.
+
+        Parameters
+        ----------
+        values : mapping of str to array, shape (N,)
+            Numbers by name, finite, in SI units.
+
+        Returns
+        -------
+        Run
+
+        Raises
+        ------
+        DataError
+            If a name is an input of this run, is no name, or its values are not N finite numbers.
+        """
+        given = {n: as_vector(v, f"output {n!r}")[0] for n, v in as_mapping("values", values).items()}
+        for name, numbers in given.items():
+            check_signal_name(name)
+            if name in self.inputs:
+                raise DataError(f"with_outputs: {name!r} is an input of run {self.name!r}; give it another name")
+            check_lengths({f"run {self.name!r}": self.length, f"output {name!r}": numbers.size})
+            check_values(numbers, f"output {name!r}", 0)
+        readings = self.readings
+        if readings is not None:
+            readings = readings.changed(**{n: np.interp(readings.times, self.time, v) for n, v in given.items()})
+        return self._with(
+            outputs=tuple(dict.fromkeys([*self.outputs, *given])),
+            _data={**self._data, **given},
+            _units={**dict.fromkeys(given, ""), **self._units},
+            readings=readings,
+        )
 
     def select(self, names: Iterable[str]) -> Run:
         """Return this run with some of its signals only.
@@ -383,8 +450,14 @@ class Run(Measured):
                     f"its outputs are {listed(self.outputs)}"
                 )
             values = self._data[name]
+            there = read(values)
+            if there.size == 0:
+                raise DataError(
+                    f"output {name!r} of run {self.name!r}: none of its {values.size} rows holds a value; use a part "
+                    "of the record in which it was read"
+                )
             if is_constant(values):
-                thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(values[0])!r}"
+                thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(there[0])!r}"
                 way_out = "check the sensor and the column, or load a part of the record in which it moves with slice="
                 raise bad_rows(thing, what, 0, values.size, way_out)
 
@@ -412,7 +485,8 @@ class Run(Measured):
 
         The first line is a comment, ``# ftlm-run 1`` and a JSON object that holds name, step, start, inputs, outputs,
         units, intersample and warnings, and `about` where a rig made the run; then come a header ``t_s,…`` and the
-        rows. The file is written beside its place and renamed, so a reader never sees half of it.
+        rows, ``nan`` where an output was not read. `readings` stay behind: what is written is the grid. The file is
+        written beside its place and renamed, so a reader never sees half of it.
 
         Parameters
         ----------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, cast
 
@@ -43,8 +43,9 @@ def locked(values: Floats) -> Floats:
 
 
 def is_constant(values: Floats) -> bool:
-    """Whether all samples are equal."""
-    return bool((values == values[0]).all())
+    """Whether all samples that are there are equal."""
+    there = values[~np.isnan(values)]
+    return bool((there == there[:1]).all())
 
 
 def checked_intersample(given: Mapping[str, str] | None, inputs: tuple[str, ...]) -> dict[str, Intersample]:
@@ -83,8 +84,12 @@ def as_number(given: object) -> float | None:
         return math.inf
 
 
-def as_vector(given: object, thing: str) -> tuple[Floats, np.dtype[Any]]:
-    """Return a private float64 copy and the type the numbers came in."""
+def as_vector(given: object, thing: str, *, gaps: bool = False) -> tuple[Floats, np.dtype[Any]]:
+    """Return a private float64 copy and the type the numbers came in; with gaps, what is masked or None is NaN."""
+    if gaps and isinstance(given, (list, tuple)):
+        given = [np.nan if value is None else value for value in given]
+    if gaps and np.ma.isMaskedArray(given) and np.asarray(given).dtype.kind in "biuf":
+        given = np.ma.filled(np.ma.asarray(given, dtype=np.float64), np.nan)
     if np.ma.isMaskedArray(given):
         mask = np.ma.getmaskarray(cast("Any", given))
         if mask.any():
@@ -149,28 +154,38 @@ def check_lengths(lengths: Mapping[str, int]) -> None:
         )
 
 
-def detrended(values: Floats, step: float, *, linear: bool) -> tuple[Floats, str]:
-    """Samples less their mean or their line of least squares, and what that is in words."""
-    mean = float(np.mean(values))
+def trend_of(values: Floats, step: float, *, linear: bool) -> tuple[Callable[[Floats], Floats], str]:
+    """The mean of samples or their line of least squares as a function of time, and in words."""
+    there = ~np.isnan(values)
+    mean = float(np.mean(values[there]))
     if not linear:
-        return values - mean, f"{mean:.6g}"
-    clock = (np.arange(values.size) - 0.5 * (values.size - 1)) * step
-    slope = float(clock @ (values - mean)) / float(clock @ clock)
+        return (lambda t: np.full(t.size, mean)), f"{mean:.6g}"
+    clock = np.arange(values.size) * step
+    middle = float(np.mean(clock[there]))
+    late = clock[there] - middle
+    slope = float(late @ (values[there] - mean)) / float(late @ late)
     sign = "-" if slope < 0 else "+"
-    return values - mean - slope * clock, f"{mean - slope * clock[-1]:.6g} {sign} {abs(slope):.6g} t"
+    return (lambda t: mean + slope * (t - middle)), f"{mean - slope * middle:.6g} {sign} {abs(slope):.6g} t"
 
 
-def check_values(values: Floats, thing: str, offset: int) -> None:
-    """Refuse what is not finite, and numbers whose squares overflow; ``offset`` is the number of the first row."""
+def check_values(
+    values: Floats, thing: str, offset: int, *, gaps: bool = False, instead: str = "avoid them with slice="
+) -> None:
+    """Refuse what is not finite, and numbers whose squares overflow; ``offset`` is the number of the first row.
+
+    With gaps, NaN is let pass; ``instead`` is the other way out for what is NaN.
+    """
     with np.errstate(invalid="ignore"):
         good = np.abs(values) <= LARGEST
+    if gaps:
+        good |= np.isnan(values)
     if good.all():
         return
     rows = np.flatnonzero(~good)
     value = float(values[rows[0]])
     first, count = offset + int(rows[0]), rows.size
     if math.isnan(value):
-        raise bad_rows(thing, "NaN", first, count, "remove or fill these rows yourself, or avoid them with slice=")
+        raise bad_rows(thing, "NaN", first, count, f"remove or fill these rows yourself, or {instead}")
     if math.isinf(value):
         raise bad_rows(thing, f"infinity ({value})", first, count, "correct these rows, or avoid them with slice=")
     what = f"{value!r} is larger than {LARGEST:g} and its square overflows"
@@ -208,11 +223,14 @@ def regular_step(
         gaps = np.flatnonzero(steps > _GAP * usual)
         if gaps.size:
             what = f"gap of {steps[gaps[0]]:.6g} s where {usual:.6g} s is usual"
-            way_out = "load the part before or after it with slice=, or interpolate over it with resample=STEP"
+            way_out = (
+                "load the part before or after it with slice=, let the rows be missing with missing='hold', or put "
+                "the inputs on a regular grid with resample=STEP"
+            )
             raise bad_rows(thing, what, offset + int(gaps[0]) + 1, gaps.size, way_out)
         rows = np.flatnonzero(deviation > _JITTER * mean)
         share = f"{100.0 * worst / mean:.3g} % of the mean step {mean:.6g} s ({100 * _JITTER:g} % allowed)"
-        way_out = "interpolate onto a regular grid with resample=STEP"
+        way_out = "put the inputs on a regular grid with resample=STEP; outputs are compared when they were read"
         raise bad_rows(thing, f"jitter of up to {share}", offset + int(rows[0]), rows.size, way_out)
     fact: tuple[str, ...] = ()
     if worst > _JITTER_WORTH_SAYING * mean:
@@ -279,18 +297,30 @@ def window_rows(clock: Floats, window: object, argument: str, thing: str = "time
     return int(rows[0]), int(rows[-1]) + 1
 
 
-def interpolated(
-    since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
-) -> dict[str, Floats]:
-    """Return signals on another step: of held inputs the mean of the hold over each new interval, all else linearly."""
+def check_rows(since: Floats, step: float) -> int:
+    """Return how many rows of this step a record has, and refuse too many or too few."""
     spans = float(since[-1]) / step
     if spans + 1 > _MOST_ROWS:
         raise DataError(f"resample={step!r} gives more than {_MOST_ROWS} rows; use a larger step")
     rows = math.floor(spans + _EDGE) + 1
     if rows < FEWEST_ROWS:
         raise DataError(f"resample={step!r} leaves {rows} rows, {FEWEST_ROWS} are needed; use a smaller step")
+    return rows
+
+
+def is_regular(since: Floats) -> bool:
+    """Whether rows keep to a regular step."""
+    step = float(since[-1]) / (since.size - 1)
+    return bool(np.abs(since - grid_of(since.size, step)).max() <= _JITTER * step)
+
+
+def interpolated(
+    since: Floats, data: Mapping[str, Floats], behaviour: Mapping[str, Intersample], step: float
+) -> dict[str, Floats]:
+    """Return signals on another step: of held inputs the mean of the hold over each new interval, all else linearly."""
+    rows = check_rows(since, step)
     grid = grid_of(rows, step)
-    pieces = _Pieces.of(since, rows, step)
+    pieces = Pieces.of(since, rows, step)
     return {
         signal: pieces.means(values) if behaviour.get(signal) == "zoh" else np.interp(grid, since, values)
         for signal, values in data.items()
@@ -298,7 +328,7 @@ def interpolated(
 
 
 @dataclass(frozen=True)
-class _Pieces:
+class Pieces:
     """New intervals cut at the old rows: the row each piece holds, its share of a step, where each interval begins."""
 
     row: npt.NDArray[np.intp]
@@ -306,7 +336,7 @@ class _Pieces:
     first: npt.NDArray[np.intp]
 
     @classmethod
-    def of(cls, since: Floats, rows: int, step: float) -> _Pieces:
+    def of(cls, since: Floats, rows: int, step: float) -> Pieces:
         """Cut; an old row within rounding of a new one counts as there. The last row holds on."""
         edges = grid_of(rows + 1, step)
         place = np.searchsorted(edges, since, side="left")

@@ -21,7 +21,7 @@ _MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
 
 @dataclass(frozen=True)
 class Column:
-    """One column of numbers, or the reason why it is not one."""
+    """One column of numbers, or the reason why it is not one; `blank` where that is empty cells alone (NaN)."""
 
     variable: str
     name: str
@@ -29,9 +29,12 @@ class Column:
     values: npt.NDArray[np.float64] | npt.NDArray[np.float32] | None
     problem: DataError | None = None
     matrix: str | None = None
+    blank: bool = False
 
-    def numbers(self) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
-        """Return its numbers, or raise why there are none."""
+    def numbers(self, *, blank: bool = False) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
+        """Return its numbers, or raise why there are none; empty cells may be let pass."""
+        if blank and self.blank and self.values is not None:
+            return self.values
         if self.problem is not None or self.values is None:
             raise self.problem or DataError(f"column {self.name!r} holds no numbers; choose another column")
         return self.values

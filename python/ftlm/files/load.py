@@ -15,6 +15,7 @@ from ftlm.base.errors import DataError
 from ftlm.data.asked import Asked
 from ftlm.data.header import Header
 from ftlm.data.names import CSV_TIME, is_run_name
+from ftlm.data.readings import checked_missing
 from ftlm.data.run import Run, built
 from ftlm.data.units import time_unit_of
 from ftlm.files.apart import MATLAB, PARQUET, read_apart
@@ -44,7 +45,7 @@ def load(
     outputs: Mapping[str, str | int] | Sequence[str] | str | None = None, units: Mapping[str, str] | None = None,
     columns: Mapping[str, object] | PathLike | None = None, intersample: Mapping[str, str] | None = None,
     step: float | None = None, slice: Sequence[float | None] | None = None, resample: float | None = None,
-    name: str | None = None, time_unit: str | None = None,
+    name: str | None = None, time_unit: str | None = None, missing: str | None = None,
 ) -> Run:  # fmt: skip
     """Load one run from a text, version-5 .mat or parquet file, or from several files that hold its columns.
 
@@ -76,13 +77,17 @@ def load(
     slice : pair of float or None, optional
         Use the rows with a ≤ t < b only, [s] since the first row.
     resample : float, optional
-        Interpolate onto this step [s]: held inputs by the mean of the hold over each new interval, everything else
-        linearly. Recorded in the run's warnings.
+        Put the run on this step [s]: held inputs by the mean of the hold over each new interval, everything else
+        linearly; outputs of irregular rows keep their own times for output error, see `Run.from_arrays`. Recorded in
+        the run's warnings.
     name : str, optional
         What reports call the run; the first file's name where not given.
     time_unit : {"s", "ms", "us", "min", "h"}, optional
         Unit of the time column; where not given, the one that the column's header states (said in the run's
         warnings), or else s. A header that states another one is refused; the spacing of the rows is no guess.
+    missing : {"refuse", "weight", "hold"}, optional
+        What to do about NaN, empty cells and rows that a regular time lacks: see `Run.from_arrays`. Default
+        ``"refuse"``, and ``"weight"`` for a file of ftlm's own that says which outputs were not read throughout.
 
     Returns
     -------
@@ -101,6 +106,7 @@ def load(
     ...            units={"theta11": "deg"})  # doctest: +SKIP
     """
     paths = _paths(path)
+    chosen = checked_missing(missing or "refuse")
     wanted = _wanted(_columns_file(columns), time, step, inputs, outputs, units, intersample)
     tables = _tables(paths)
     header = tables[0].header
@@ -108,6 +114,7 @@ def load(
         raise DataError(f"{str(paths[0])!r} is a whole run of its own; load it alone")
     if header is not None:
         _take_header(wanted, header)
+        chosen = chosen if missing is not None or not header.missing else "weight"
     pool = Pool(tables)
     if not wanted.outputs:
         raise DataError(
@@ -117,16 +124,17 @@ def load(
     labels: dict[str, str] = {}
     used: list[Column] = []
 
-    def gather(columns: Mapping[str, Hashable]) -> dict[str, object]:
+    def gather(columns: Mapping[str, Hashable], *, blank: bool) -> dict[str, object]:
         picked: dict[str, object] = {}
         for signal, spec in columns.items():
             column = pool.find(spec, f"signal {signal!r}")
             labels[signal] = f"{column.source.name}: column {column.name!r} (signal {signal!r})"
             used.append(column)
-            picked[signal] = column.numbers()
+            picked[signal] = column.numbers(blank=blank)
         return picked
 
-    given_inputs, given_outputs = gather(wanted.inputs), gather(wanted.outputs)
+    given_inputs = gather(wanted.inputs, blank=chosen == "hold")
+    given_outputs = gather(wanted.outputs, blank=chosen != "refuse")
     clock = pool.time(wanted.time, used) if wanted.step is None else None
     label = "time" if clock is None else f"{clock.source.name}: column {clock.name!r} (time)"
     if clock is None and time_unit is not None:
@@ -138,7 +146,7 @@ def load(
     asked = Asked(
         given_inputs, given_outputs, step=wanted.step, time=None if clock is None else clock.numbers(),
         units=wanted.units, intersample=wanted.intersample, name=name, resample=resample, window=slice,
-        time_unit=unit, labels=labels, facts=said, time_label=label,
+        time_unit=unit, labels=labels, facts=said, time_label=label, missing=chosen,
     )  # fmt: skip
     if header is not None:
         stated = header.step if clock is not None and clock.name == CSV_TIME else None

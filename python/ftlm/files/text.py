@@ -35,13 +35,15 @@ class _Trouble:
     row: int
     cell: str
     count: int
+    blank: bool
 
     def error(self, column: str, source: Path) -> DataError:
         thing = f"{source.name}: column {column!r}, line {self.line}"
         text = self.cell.strip()
         shown = repr(text if len(text) <= 40 else text[:40] + "…")
         if not text:
-            what, way_out = "empty cell", "fill or remove these rows yourself"
+            what = "empty cell"
+            way_out = "fill or remove these rows yourself, or let them be missing with missing='weight' or 'hold'"
         elif _DECIMAL_COMMA.fullmatch(text):
             what, way_out = f"{shown} has a decimal comma", _DECIMAL_WAY_OUT
         else:
@@ -102,7 +104,11 @@ def _parse_text(path: Path, stream: BinaryIO) -> FileTable:
     if names is None:
         names = [f"c{index + 1}" for index in range(width)]
     problems = [troubles[k].error(name, path) if k in troubles else None for k, name in enumerate(names)]
-    columns = [Column(name, name, path, *column) for name, *column in zip(names, values, problems, strict=True)]
+    blank = [k in troubles and troubles[k].blank for k in range(len(names))]
+    columns = [
+        Column(name, name, path, column, problem, blank=empty)
+        for name, column, problem, empty in zip(names, values, problems, blank, strict=True)
+    ]
     return FileTable(path, columns, text=True, header=header)
 
 
@@ -217,9 +223,13 @@ def _numbers(
             values[:, index] = list(map(float, column))
         except ValueError:
             bad = [row for row, cell in enumerate(column) if not _is_number(cell)]
+            blank = all(not column[row].strip() for row in bad)
+            if blank:
+                values[:, index] = [float(cell) if cell.strip() else np.nan for cell in column]
             known = troubles.get(index)
             if known is None:
-                troubles[index] = _Trouble(lines[bad[0]], rows_before + bad[0], column[bad[0]], len(bad))
+                troubles[index] = _Trouble(lines[bad[0]], rows_before + bad[0], column[bad[0]], len(bad), blank)
             else:
                 known.count += len(bad)
+                known.blank &= blank
     return values

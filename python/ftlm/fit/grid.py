@@ -13,9 +13,11 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
+from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.problem import FreeProblem
+from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
 from ftlm.solve.records import Record, initial_tuple, record, sensor_series
 
 #: A descent ends where a whole step would lower the cost by a smaller share than this.
@@ -27,9 +29,14 @@ FINEST = 16
 
 
 def experiment(
-    run: Run, problem: FreeProblem, weights: Sequence[float], *, every: int = 1, decimation: int = 1
-) -> tuple[Any, ...]:
-    """A run as the core compares with it: ``every`` pulses a sample interval, each ``decimation``-th sample."""
+    run: Run, problem: FreeProblem, weights: Sequence[float], *, every: int = 1, decimation: int = 1,
+    shares: Floats | None = None,
+) -> tuple[Any, ...]:  # fmt: skip
+    """A run as the core compares with it: ``every`` pulses a sample interval, each ``decimation``-th sample.
+
+    ``shares`` are those of the weights with which the compared samples of each output count; what was not read counts
+    for nothing anyway.
+    """
     # Free delays are the core's to apply, to inputs as they were given.
     structure = replace(problem.structure, free_delays={})
     rows = (run.length - 1) // decimation * decimation + 1
@@ -38,6 +45,8 @@ def experiment(
     intervals = (rows - 1) // decimation
     coupled = structure.coupling == "simulated"
     rec = record(run, structure, intervals * every, filtered=not coupled)
+    if has_own_times(run, problem.structure):
+        return _at_own_times(run, structure, rec, weights, decimation, shares)
     samples = []
     for output in structure.outputs:
         measured_through = structure.sensor_filter is not None and output in structure.sensor_filter.outputs
@@ -51,7 +60,39 @@ def experiment(
         applies = [o in structure.sensor_filter.outputs for o in structure.outputs]
         filtered = (sensor_series(structure, rec.m, rec.step), applies)
     instants = [_instant(run, structure, rec, name, every, decimation) for name in structure.signals]
-    return rec.core(), every, np.ascontiguousarray(np.stack(samples)), filtered, list(weights), instants
+    measured, counted = _counted(np.stack(samples), slice(1, -1), shares)
+    return rec.core(), every, measured, filtered, list(weights), instants, counted, None
+
+
+def _at_own_times(
+    run: Run, structure: Structure, rec: Record, weights: Sequence[float], decimation: int, shares: Floats | None
+) -> tuple[Any, ...]:
+    """The same of a run whose rows have times of their own; the very first sample shows only where it starts."""
+    times = compared_times(run, structure)
+    kept = np.flatnonzero(times > 0.0)[::decimation]
+    at = Instants.of(run, rec, structure, times[kept])
+    measured, counted = _counted(
+        np.stack([compared_values(run, structure, o)[kept] for o in structure.outputs]), slice(None), shares
+    )
+    filtered = None
+    if structure.sensor_filter is not None:
+        applies = [o in structure.sensor_filter.outputs for o in structure.outputs]
+        filtered = (sensor_series(structure, rec.m, rec.step), applies)
+    signals = [at.values(name) for name in structure.signals]
+    # What was not read everywhere drives nothing.
+    instants = [(None if v is None or np.isnan(v).any() else v, False) for v in signals]
+    own = (at.places, [at.jumps(name) for name in structure.signals])
+    return rec.core(), 1, measured, filtered, list(weights), instants, counted, own
+
+
+def _counted(samples: Floats, compared: slice, shares: Floats | None) -> tuple[Floats, Floats | None]:
+    """Samples without gaps, and the shares with which the compared ones count; None where all count alike."""
+    unread = np.isnan(samples)
+    counted = shares
+    if unread.any():
+        known = np.where(unread[:, compared], 0.0, 1.0)
+        counted = np.ascontiguousarray(known if shares is None else known * shares)
+    return np.ascontiguousarray(np.where(unread, 0.0, samples)), counted
 
 
 def _instant(
@@ -59,10 +100,11 @@ def _instant(
 ) -> tuple[Floats | None, bool]:
     """What a signal is at the samples, after it changed there, and whether it holds in between.
 
-    None where it has no jump or corner of its own at the samples: behind a sensor filter, or made of other signals.
+    None where it has no jump or corner of its own at the samples: behind a sensor filter, or made of other signals; nor
+    where it was not read throughout, for then it drives nothing.
     """
     measured_through = structure.sensor_filter is not None and name in structure.sensor_filter.outputs
-    if name not in run or (rec.sensor is not None and not measured_through):
+    if name not in run or name in run.missing or (rec.sensor is not None and not measured_through):
         return None, False
     held = name in run.inputs and run.intersample[name] == "zoh"
     values, delay = run[name], structure.delay.get(name, 0.0)
@@ -122,19 +164,28 @@ def descend(
 
 @dataclass(frozen=True)
 class Grid:
-    """A problem on its runs, what each output weighs, pulses a sample interval, and of how many samples one counts."""
+    """A problem on its runs, what each output weighs, pulses a sample interval, and of how many samples one counts.
+
+    Shares of these weights by run, a row an output, are those of a robust loss.
+    """
 
     problem: FreeProblem
     runs: Sequence[Run]
     weights: Sequence[float]
     every: int = 1
     decimation: int = 1
+    shares: Sequence[Floats] | None = None
 
     @cached_property
     def experiments(self) -> list[Any]:
         """The runs as the core compares with them."""
-        options = {"every": self.every, "decimation": self.decimation}
-        return [experiment(run, self.problem, self.weights, **options) for run in self.runs]
+        return [
+            experiment(
+                run, self.problem, self.weights, every=self.every, decimation=self.decimation,
+                shares=None if self.shares is None else self.shares[k],
+            )
+            for k, run in enumerate(self.runs)
+        ]  # fmt: skip
 
     @property
     def finer(self) -> Grid:
@@ -152,22 +203,40 @@ class Grid:
         return second if second.outcome["cost"] <= first.outcome["cost"] else first
 
     def residuals(self, attempt: Attempt) -> list[dict[str, Floats]]:
-        """Weighted residuals of an attempt by run and output."""
+        """Residuals of an attempt over the noise by run and output, whatever their shares; NaN where none was read."""
         residuals = np.asarray(attempt.outcome["residuals"])
         parts, at = [], 0
-        for _, _, samples, *_ in self.experiments:
-            compared = samples.shape[1] - 2
+        for shares, count in self.counts:
             part = {}
-            for output in self.problem.structure.outputs:
-                part[output] = residuals[at : at + compared]
-                at += compared
+            for i, output in enumerate(self.problem.structure.outputs):
+                part[output] = residuals[at : at + count]
+                at += count
+                if shares is not None:
+                    part[output] = part[output] / np.where(shares[i] > 0, shares[i], np.nan)
             parts.append(part)
         return parts
 
+    @property
+    def counts(self) -> list[tuple[Floats | None, int]]:
+        """Shares and number of the compared samples of each run."""
+        return [(e[6], e[2].shape[1] - (2 if e[7] is None else 0)) for e in self.experiments]
+
+    @property
+    def every_share(self) -> Floats:
+        """Share of every residual, as the core strings them together."""
+        outputs = len(self.problem.structure.outputs)
+        return np.concatenate([
+            np.ones(outputs * count) if shares is None else shares.ravel() for shares, count in self.counts
+        ])  # fmt: skip
+
     def levels(self, attempt: Attempt) -> dict[str, float]:
         """Root mean square of the weighted residuals by output, over all runs."""
-        parts, outputs = self.residuals(attempt), self.problem.structure.outputs
-        return {o: float(np.sqrt(np.mean(np.concatenate([p[o] for p in parts]) ** 2))) for o in outputs}
+        return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled(attempt).items()}
+
+    def pooled(self, attempt: Attempt) -> dict[str, Floats]:
+        """Weighted residuals that are there by output, all runs one after another."""
+        parts = self.residuals(attempt)
+        return {o: read(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
 
     def matters(self, attempt: Attempt) -> bool:
         """Whether halving the step moves the simulated samples by a share of their noise that the fit would notice."""

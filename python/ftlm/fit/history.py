@@ -9,13 +9,15 @@ import numpy as np
 
 from ftlm.base.errors import FtlmError
 from ftlm.base.statistics import chi_squared, colour
+from ftlm.data.readings import read
 from ftlm.data.run import Run
+from ftlm.data.settings import Loss
 from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.motion import has_memory, history, misfit, needed, root_mean_square, together
-from ftlm.solve.sampled import FIRST_REFINEMENT, measured_samples, sampled
+from ftlm.solve.sampled import FIRST_REFINEMENT, measured_samples, own_times, sampled
 
 #: A run whose first values look like rest is in motion where its residuals would ask for a history in this share of
 #: runs at rest only: a first value near zero is rare for a run in motion, and common for one at rest. At a share of
@@ -25,7 +27,7 @@ RARE = 0.01
 
 def fit_any_start(
     runs: Sequence[Run], structure: Structure, start: Initial, *, threads: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
 ) -> JointFit:  # fmt: skip
     """Fit a structure on runs whose initial terms look like `start`, and decide by the fit where it leaves them open.
 
@@ -34,7 +36,8 @@ def fit_any_start(
     """
 
     def fitted(initial: Initial) -> JointFit:
-        return fit_output_error(runs, replace(structure, initial=initial), threads=threads, progress=progress)
+        asked = replace(structure, initial=initial)
+        return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss)
 
     joint = fitted(start)
     if structure.initial != "auto" or not has_memory(structure):
@@ -43,20 +46,20 @@ def fit_any_start(
         if not _moved(joint, runs, structure):
             return joint
         return fitted(together([history(run, structure) for run in runs]) or history(runs[0], structure))
-    return _shorter(joint, runs, structure) if isinstance(start, History) else joint
+    return _shorter(joint, runs, structure, loss) if isinstance(start, History) else joint
 
 
-def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit:
+def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss) -> JointFit:
     """The fit with Caputo's terms where they are enough, else the one with a history."""
     values = dict(zip(joint.names, joint.values.tolist(), strict=True))
     try:
-        few = fit_output_error(runs, replace(structure, initial="caputo"), start=values)
+        few = fit_output_error(runs, replace(structure, initial="caputo"), start=values, loss=loss)
     except FtlmError:
         # From here it has no finite free run, so it is not enough.
         return joint
     outputs = structure.outputs
     ours, theirs = (np.array([fit.noise[o] for o in outputs]) for fit in (few, joint))
-    size = np.array([np.std(np.concatenate([run[o] for run in runs])) for o in outputs])
+    size = np.array([np.nanstd(np.concatenate([run[o] for run in runs])) for o in outputs])
     excess = misfit(ours, theirs, size, joint.samples / len(outputs))
     return joint if needed(structure, excess, joint.initial_terms - few.initial_terms) else few
 
@@ -72,15 +75,15 @@ def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
         for start in ("rest", history(run, structure)):
             model = Solved(replace(solved, initial=start))
             try:
-                samples, found = sampled(model, run, FIRST_REFINEMENT, None)
+                samples, found = sampled(model, run, FIRST_REFINEMENT, None, own_times(model, run))
             except FtlmError:
                 return False
             ends.append(measured_samples(model, run, FIRST_REFINEMENT) - samples)
             terms += sum(map(len, found.values())) if start != "rest" else 0
-        if not all(np.all(np.isfinite(e)) for e in ends):
+        if any(np.any(np.isinf(e)) for e in ends):
             return False
-        size = np.std([run[o] for o in structure.outputs], axis=1)
+        size = np.nanstd([run[o] for o in structure.outputs], axis=1)
         excess += misfit(root_mean_square(ends[0]), root_mean_square(ends[1]), size, run.length)
-        spread = max([spread, *map(colour, ends[1])])
+        spread = max([spread, *map(colour, map(read, ends[1]))])
     # Noise that is coloured is followed by slow terms in any run.
     return terms > 0 and excess / spread > chi_squared(terms, RARE)

@@ -16,19 +16,26 @@ import numpy as np
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import ConvergenceError, DataError, FtlmError
 from ftlm.base.statistics import NORMAL_95, noise_of
+from ftlm.data.readings import read
 from ftlm.data.run import Run
+from ftlm.data.settings import Loss
 from ftlm.data.structures import Initial, Structure, delay_name
 from ftlm.fit.extrapolation import feasible
 from ftlm.fit.grid import FINEST, Attempt, Grid
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.race import SAME_COST, finalists, race
+from ftlm.fit.robust import Robust, huber_shares, same_shares, scales
 from ftlm.fit.uncertainty import covariance, deviation
+from ftlm.solve.instants import compared_values
 
 #: Residual that costs 1 in a coarse fit, as a share of an output's size.
 COARSE_SHARE = 0.01
 #: Evaluations of each finalist on all samples, and of what is left then.
 FINAL_LAP = 60
 LAST_LAP = 120
+#: Descents to settled weights, and to those of a robust loss, which settle by a factor of some four each.
+ROUNDS = 4
+ROBUST_ROUNDS = 15
 #: Weights are settled when no output's residuals differ from their weight by more than this share.
 SETTLED = 0.01
 #: Refinement ends when halving the step moves no estimate, extrapolated to step 0, by this share of its standard error.
@@ -47,11 +54,11 @@ class JointFit:
         Of orders, coefficients, then delays, robust to coloured residuals. Variances of what takes part in a direction
         that the runs do not see are infinite, their covariances not numbers.
     noise
-        Standard deviation of the residuals by output.
+        Standard deviation of the residuals by output; under a robust loss from the median of their sizes.
     cost
         Half the sum of squared weighted residuals.
     samples
-        Number of residuals.
+        Number of residuals, of samples that were read.
     refinement
         Pulses a sample interval on the finest grid; the estimates are the limit that it and the next coarser one tell.
     settled
@@ -62,13 +69,17 @@ class JointFit:
     starts
         Coarse cost (per residual) and origin of every start, best first.
     residuals
-        By run and output.
+        By run and output, over the noise; NaN where nothing was read.
     products
         Coefficients that the coefficient law gives: sign and factors by name.
     delays
         Estimated delays [s] by input; in covariance and errors they stand last, as ``delay_`` and the input's name.
     initial, initial_terms
         Initial terms that were fitted, and how many coefficients they have on all runs together.
+    robust
+        What a robust loss did; None for squares.
+    shares
+        With which share of its weight each sample counted under it, by run, a row an output.
     """
 
     orders: dict[str, float]
@@ -86,6 +97,8 @@ class JointFit:
     delays: dict[str, float] = field(default_factory=dict)
     initial: Initial = "rest"
     initial_terms: int = 0
+    robust: Robust | None = None
+    shares: Sequence[Floats] | None = field(default=None, repr=False)
 
     @property
     def choice(self) -> str:
@@ -143,13 +156,13 @@ class JointFit:
 
 def fit_output_error(
     runs: Sequence[Run], structure: Structure, *, threads: int = 1, start: Mapping[str, float] | None = None,
-    refine: bool = True, progress: Callable[[int, int], None] | None = None,
+    refine: bool = True, progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
 ) -> JointFit:  # fmt: skip
     """Fit all equations of a structure on all runs by output error, from an automatic start.
 
     A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
     everything free by name; without `refine` the grid is not refined below the samples. Progress is told (starts done,
-    starts in all).
+    starts in all). The loss decides between optima on all samples, not between starts.
 
     Raises
     ------
@@ -159,14 +172,14 @@ def fit_output_error(
         No start has a finite free run.
     """
     problem, outputs = FreeProblem.of(structure), structure.outputs
-    samples = sum(run.length - 2 for run in runs) * len(outputs)
+    samples = sum(max(read(compared_values(run, structure, o)).size - 2, 0) for run in runs for o in outputs)
     if samples <= len(problem.names):
         raise DataError(
             f"{samples} samples between the first and the last do not tell {len(problem.names)} free numbers; use "
             "longer runs, or fix orders or coefficients"
         )
-    sizes = {o: math.sqrt(float(np.mean([np.var(run[o]) for run in runs]))) for o in outputs}
-    noise = {o: first_noise(runs, o, sizes[o]) for o in outputs}
+    sizes = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in outputs}
+    noise = {o: first_noise(runs, structure, o, sizes[o]) for o in outputs}
     # Starts are compared with every output weighing alike: noise decides where the optimum is, not how to get near it.
     alike = Grid(problem, runs, [1.0 / (COARSE_SHARE * sizes[o]) for o in outputs])
     weighed = Grid(problem, runs, [1.0 / noise[o] for o in outputs])
@@ -186,13 +199,15 @@ def fit_output_error(
     while weighed.every < FINEST and weighed.matters(contenders[0]):
         weighed = weighed.finer
     best = weighed.descend(winner(contenders, replace(alike, every=weighed.every)), LAST_LAP)
-    best, weighed = with_settled_weights(best, weighed)
-    return joint_fit(refined(best, weighed) if refine else Optimum(best, weighed, best.values, settled=True), starts)
+    best, weighed = with_settled_weights(best, weighed, loss)
+    return joint_fit(
+        refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True), starts
+    )
 
 
-def first_noise(runs: Sequence[Run], output: str, size: float) -> float:
+def first_noise(runs: Sequence[Run], structure: Structure, output: str, size: float) -> float:
     """A first guess of an output's noise, from second differences, but not below a share of its size."""
-    return max(float(np.median([noise_of(run[output]) for run in runs])), 1e-3 * size)
+    return max(float(np.median([noise_of(compared_values(run, structure, output)) for run in runs])), 1e-3 * size)
 
 
 def winner(contenders: Sequence[Attempt], near: Grid) -> Attempt:
@@ -208,15 +223,18 @@ def winner(contenders: Sequence[Attempt], near: Grid) -> Attempt:
     return near.lowest(near.finer.ranked(ends)[0], LAST_LAP)
 
 
-def with_settled_weights(attempt: Attempt, grid: Grid) -> tuple[Attempt, Grid]:
-    """Descend on a grid until the weights are those of the residuals, pooled over runs."""
-    for _ in range(4):
+def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -> tuple[Attempt, Grid]:
+    """Descend on a grid until the weights are those of the residuals, pooled over runs, and so are robust shares."""
+    last = (ROBUST_ROUNDS if loss == "huber" else ROUNDS) - 1
+    for turn in range(last + 1):
         attempt = grid.descend(attempt, LAST_LAP, plain=True)
-        levels = grid.levels(attempt)
-        if all(abs(v - 1.0) < SETTLED for v in levels.values()):
+        levels = scales(grid, attempt) if loss == "huber" else grid.levels(attempt)
+        settled = all(abs(v - 1.0) < SETTLED for v in levels.values())
+        shares = huber_shares(grid, attempt, levels) if loss == "huber" else None
+        if turn == last or (settled and same_shares(grid.shares, shares)):
             break
         weights = [w / max(level, 1e-300) for w, level in zip(grid.weights, levels.values(), strict=True)]
-        grid = replace(grid, weights=weights)
+        grid = replace(grid, weights=weights, shares=shares)
     return attempt, grid
 
 
@@ -230,12 +248,12 @@ class Optimum:
     settled: bool
 
 
-def refined(best: Attempt, grid: Grid) -> Optimum:
+def refined(best: Attempt, grid: Grid, loss: Loss = "squares") -> Optimum:
     """Halve the step until that moves the estimate by little of its standard error."""
     estimate, settled = best.values, False
     while not settled and grid.every < FINEST:
         # On a finer grid residuals may shrink to their noise, so weights follow anew.
-        finer, grid = with_settled_weights(best, grid.finer)
+        finer, grid = with_settled_weights(best, grid.finer, loss)
         errors = np.sqrt(np.diag(covariance(finer, grid)))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
         # Of a flat valley in which neither stood still, or of two fits that a wall stopped, they tell nothing.
@@ -254,14 +272,17 @@ def joint_fit(optimum: Optimum, starts: list[tuple[float, str]]) -> JointFit:
     problem = grid.problem
     low, high = np.array(problem.all_bounds).T
     orders, coefficients, delays = problem.split(np.clip(optimum.estimate, low, high).tolist())
-    levels = grid.levels(best)
+    levels = grid.levels(best) if grid.shares is None else scales(grid, best)
+    residuals = grid.residuals(best)
     return JointFit(
         orders=dict(zip(problem.orders, orders, strict=True)),
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
         delays=dict(zip(problem.delays, delays, strict=True)), products=dict(problem.products),
-        covariance=covariance(best, grid), residuals=grid.residuals(best),
+        covariance=covariance(best, grid), residuals=residuals,
+        robust=None if grid.shares is None else Robust.of(grid, best), shares=grid.shares,
         noise={o: level / w for (o, level), w in zip(levels.items(), grid.weights, strict=True)},
-        cost=float(best.outcome["cost"]), samples=len(best.outcome["residuals"]), refinement=grid.every,
+        cost=float(best.outcome["cost"]), samples=sum(read(e).size for part in residuals for e in part.values()),
+        refinement=grid.every,
         settled=optimum.settled, converged=best.converged, starts=starts, initial=problem.structure.initial,
         initial_terms=sum(len(x) for run in best.outcome["initial"] for x in run),
     )  # fmt: skip

@@ -13,6 +13,7 @@ from ftlm import _core
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.equations import Equation
 from ftlm.data.orders import SEARCHED_ORDER
+from ftlm.data.readings import bridged
 from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Hints, Structure
@@ -55,7 +56,8 @@ DELAY_STARTS = 12
 
 def power_frequency(run: Run, output: str) -> float:
     """Frequency [rad/s] below which 90 % of an output's power lies."""
-    y = run[output] - np.mean(run[output])
+    samples = bridged(run[output])
+    y = samples - np.mean(samples)
     power = np.abs(np.fft.rfft(y * np.hanning(y.size))) ** 2
     share = np.cumsum(power) / np.sum(power)
     at = int(np.searchsorted(share, 0.9))

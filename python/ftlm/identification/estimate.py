@@ -14,7 +14,7 @@ import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.run import Run
-from ftlm.data.settings import Settings
+from ftlm.data.settings import Loss, Settings
 from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.coefficients import estimate_coefficients, step_bias
 from ftlm.fit.genetic import Genetic, genetic_search
@@ -24,7 +24,7 @@ from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
 from ftlm.identification.judged import Task
 from ftlm.identification.local import errors_with_orders
-from ftlm.identification.warnings import broken_law, uncertain
+from ftlm.identification.warnings import broken_law, irregular, uncertain
 from ftlm.judge.comparison import compare_means
 from ftlm.model.model import Model
 from ftlm.search.job import run_job
@@ -94,19 +94,27 @@ def offset_setting(structure: Structure) -> dict[str, str]:
     return {} if structure.offset == "none" else {"offset": structure.offset}
 
 
+def loss_setting(joint: JointFit) -> dict[str, Any]:
+    """The loss, where it is another one than squares, and what it did."""
+    return {} if joint.robust is None else {"loss": "huber", **asdict(joint.robust)}
+
+
 def by_output_error(
-    task: Task, m: int | None, threads: int, progress: Told, answers: Sequence[Run] | None = None
-) -> Fit:
+    task: Task, m: int | None, threads: int, progress: Told, answers: Sequence[Run] | None = None,
+    loss: Loss = "squares",
+) -> Fit:  # fmt: skip
     """Orders and coefficients together by joint output error; answers of the inputs to a reference are instruments."""
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
-    record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False)[0]
-    joint = fit_any_start(answers or task.runs, structure, record.initial, threads=threads, progress=progress)
+    record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False, gaps=True)[0]
+    joint = fit_any_start(
+        answers or task.runs, structure, record.initial, threads=threads, progress=progress, loss=loss
+    )
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     if answers is not None:
         joint = instrumented(joint, problem, task.runs, answers)
-    warnings = uncertain(joint, problem)
+    warnings = [*uncertain(joint, problem), *irregular(task.runs, joint, problem)]
     if record.initial == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
         structure = replace(structure, initial="history")
@@ -125,7 +133,7 @@ def by_output_error(
         {
             "method": "output-error", "m": record.m, "initial": in_words(joint.initial),
             "refinement": joint.refinement, "starts": len(joint.starts), "noise": joint.noise,
-            "converged": joint.converged, **offset_setting(structure),
+            "converged": joint.converged, **offset_setting(structure), **loss_setting(joint),
         },
         warnings, joint=joint,
         covariance=tuple(tuple(row) for row in spread.tolist()) if np.all(np.isfinite(spread)) else None,

@@ -11,7 +11,7 @@ from typing import Any, Literal
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.lattice import Lattice, check_lattice, check_lattice_names
 from ftlm.data.run import Run
-from ftlm.data.settings import METHODS, Settings, check_used
+from ftlm.data.settings import LOSSES, METHODS, Loss, Settings, check_used
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Estimate
 from ftlm.data.structures import Structure, check_offset
@@ -21,15 +21,12 @@ from ftlm.identification.judged import Task
 from ftlm.identification.offsets import with_decided_offset
 from ftlm.identification.reference import by_reference, driven_by
 from ftlm.identification.result import Identification
-from ftlm.identification.warnings import discretisation, growing, unexcited
+from ftlm.identification.warnings import ROUNDING, discretisation, growing, unexcited
 from ftlm.judge.comparison import Comparison, compared_samples, free_runs
 from ftlm.judge.criteria import InformationCriteria, information_criteria
 from ftlm.judge.metrics import finite
 from ftlm.judge.residuals import LAGS, Residuals, residual_warnings, tested_residuals
 from ftlm.solve.records import default_m
-
-#: Residuals of an output-error fit below this share of the output are rounding and discretisation.
-ROUNDING = 3e-5
 
 
 def identify(
@@ -54,6 +51,7 @@ def identify(
     executor: Executor | None = None,
     offset: Literal["none", "constant", "ramp", "auto"] | None = None,
     reference: str | None = None,
+    loss: Loss | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
@@ -106,6 +104,10 @@ def identify(
         Name of a signal of the runs that drives a closed loop from outside, such as its set point: the instrument of
         ``"output-error"``. Residuals are then made orthogonal to what the part of every input that follows the
         reference does, which noise that the loop feeds back is no part of.
+    loss
+        Of output error: ``"squares"`` (default), or ``"huber"``, which counts residuals beyond 1.345 of the usual ones
+        by their size, so that outliers decide nothing; without any it has 95 % of the precision. Figures stay those of
+        all samples.
 
     Returns
     -------
@@ -139,7 +141,12 @@ def identify(
         "prior_covariance": prior_covariance, "rows": rows, "keep": keep,
     }  # fmt: skip
     words = {n: value for n, value in words.items() if value is not None}
-    others = {"lattice": lattice, "genetic": genetic, "store": store, "executor": executor, "reference": reference}
+    if loss is not None and loss not in LOSSES:
+        raise ModelError(f"loss = {loss!r} is not known; use {' or '.join(map(repr, LOSSES))}")
+    others = {
+        "loss": loss, "lattice": lattice, "genetic": genetic, "store": store, "executor": executor,
+        "reference": reference,
+    }  # fmt: skip
     given = [*(n for n, value in others.items() if value is not None), *words]
     estimator = "least-squares" if method in ("output-error", "genetic") else method
     settings = Settings.check(coefficients=estimator, threads=threads, **words)
@@ -156,7 +163,7 @@ def identify(
     def estimate(asked: Structure) -> Fit:
         task = Task(tuple(several), asked, lattice)
         if method == "output-error":
-            return by_output_error(task, m, settings.threads, progress, answers)
+            return by_output_error(task, m, settings.threads, progress, answers, loss or "squares")
         if method == "genetic":
             return by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress)
         return by_lattice(task, settings, m, progress, store, executor)

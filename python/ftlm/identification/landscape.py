@@ -112,7 +112,7 @@ class Around:
         """The optimum of the last grid; the estimate is extrapolated to step 0, so it is close by."""
         problem = FreeProblem.of(replace(task.structure, initial=joint.initial))
         weights = [1.0 / joint.noise[o] for o in problem.structure.outputs]
-        grid = Grid(problem, task.runs, weights, joint.refinement)
+        grid = Grid(problem, task.runs, weights, joint.refinement, shares=joint.shares)
         best = _moved(grid, joint.values, REFITS)
         at = [problem.names.index(n) for n in names]
         others = np.delete(np.asarray(best.outcome["jacobian"]), at, axis=0)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
+from ftlm.base.colour import autoregression
 from ftlm.base.errors import FtlmError
 from ftlm.base.statistics import LEVEL, chi_squared
 from ftlm.data.equations import Term
@@ -19,7 +20,6 @@ from ftlm.data.structures import Initial, Structure
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.uncertainty import covariance
-from ftlm.judge.whitening import autoregression
 from ftlm.solve.motion import decided, together
 
 #: Pulses a sample interval where the fit does not say how many it needed.
@@ -113,9 +113,9 @@ def offset_test(
     equations = tuple(
         replace(e, terms=(*e.terms, Term(one, Order(), n))) for e, n in zip(structure.equations, names, strict=True)
     )
-    extended = replace(structure, equations=equations, offset="none")
+    extended = replace(structure, equations=equations, offset="none", initial=decided_initial(runs, structure))
     try:
-        grid, here = at_point([_with_ones(run, one) for run in runs], extended, {**values, **dict.fromkeys(names, 0.0)},
+        grid, here = at_point([run.with_outputs({one: np.ones(run.length)}) for run in runs], extended, {**values, **dict.fromkeys(names, 0.0)},
                               every)  # fmt: skip
     except FtlmError:
         # No finite free run on this grid: the result says so elsewhere.
@@ -147,7 +147,7 @@ def offset_test(
     spread = _coloured(told, residuals - told @ along, blocks, residuals.size - basis.shape[1] - count)
     statistic = float(along @ np.linalg.pinv(spread) @ along)
     explained = told @ along
-    sizes = [float(np.std(run[o])) for run in runs for o in structure.outputs]
+    sizes = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]
     weights = [w for _ in runs for w in grid.weights]
     places = [place for own in blocks for place in own]
     size = max(
@@ -157,21 +157,14 @@ def offset_test(
     return OffsetTest(statistic, count, float(along @ along) / total, size)
 
 
-def _with_ones(run: Run, name: str) -> Run:
-    return Run.from_arrays(
-        step=run.step, inputs={**{n: run[n] for n in run.inputs}, name: np.ones(run.length)},
-        outputs={n: run[n] for n in run.outputs}, intersample=run.intersample, name=run.name,
-    )  # fmt: skip
-
-
 def _blocks(grid: Grid) -> list[list[tuple[int, int]]]:
     """First and last place of the residuals of every output, by run."""
     blocks, at = [], 0
-    for run in grid.runs:
+    for _, count in grid.counts:
         own = []
         for _ in grid.problem.structure.outputs:
-            own.append((at, at + run.length - 2))
-            at += run.length - 2
+            own.append((at, at + count))
+            at += count
         blocks.append(own)
     return blocks
 

@@ -10,12 +10,12 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import nearest
+from ftlm.base.colour import autoregression, is_constant
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.identification.estimate import Fit
 from ftlm.judge.feedback import past_columns
-from ftlm.judge.whitening import autoregression, is_constant
 
 #: How many samples of a reference may stand by themselves, one for so many rows of the shortest run at least; those
 #: before are averaged over blocks, each wider by a factor.
@@ -49,6 +49,11 @@ def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tupl
             "model does not read it"
         )
     for run in runs:
+        if run.readings is not None:
+            raise DataError(
+                f"run {run.name!r} has rows with times of their own, but the answer of an input to reference= is found on "
+                "regular ones; give regular rows"
+            )
         if reference not in run:
             raise DataError(
                 f"run {run.name!r} has no signal {reference!r}{nearest(reference, run.signals)} for reference=; it has "
@@ -111,7 +116,7 @@ def _answering(run: Run, number: int, answers: dict[str, list[Floats]]) -> Run:
     return Run.from_arrays(
         step=run.step, inputs={n: answers[n][number] if n in answers else run[n] for n in run.inputs},
         outputs={n: run[n] for n in run.outputs}, units={n: u for n, u in run.units.items() if u},
-        intersample=run.intersample, name=run.name,
+        intersample=run.intersample, name=run.name, missing="weight",
     )  # fmt: skip
 
 

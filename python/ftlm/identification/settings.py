@@ -25,11 +25,21 @@ def settings_in_words(settings: Mapping[str, Any]) -> str:
     if "innovation_length" in settings:
         words += f", p = {settings['innovation_length']}, K0 = {settings['prior_covariance']:g}"
         words += f", {settings['rows']} rows"
+    if "loss" in settings:
+        words += f", loss: {settings['loss']} ({robust_in_words(settings)})"
     words += f", initial terms: {settings['initial']}"
     words += f", offset: {settings['offset']}, one a run" if "offset" in settings else ""
     words += f", offset found by test: {settings['offset_test']}" if "offset_test" in settings else ""
     return words + (
         f", instrument: what of the inputs follows {settings['reference']}" if "reference" in settings else ""
+    )
+
+
+def robust_in_words(settings: Mapping[str, Any]) -> str:
+    """What a robust loss did."""
+    return (
+        f"{settings['lowered']} of {settings['samples']} residuals down-weighted, {settings['outliers']} of them "
+        "beyond five deviations"
     )
 
 
@@ -48,6 +58,8 @@ def settings_rows(settings: Mapping[str, Any], *, searched: bool) -> list[list[C
             ["automatic starts", int(settings["starts"])],
         ]
         rows += [[f"noise found on {symbol(name)}", float(level)] for name, level in settings["noise"].items()]
+    if "loss" in settings:
+        rows.append(["loss", f"{settings['loss']}: {robust_in_words(settings)}"])
     rows.append(["initial terms", INITIAL.get(str(settings["initial"]), str(settings["initial"]))])
     if "offset" in settings:
         rows.append(["offset of each equation", f"{settings['offset']}, estimated for each run"])

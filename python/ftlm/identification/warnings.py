@@ -10,15 +10,18 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
-from ftlm.base.statistics import is_white
+from ftlm.base.statistics import is_white, robust_deviation
 from ftlm.data.advice import excitation_for
+from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure, delay_name
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
+from ftlm.fit.robust import FAR
 from ftlm.identification.judged import Judged
 from ftlm.judge.comparison import Comparison, compare, validation_warnings
 from ftlm.model.model import Model
+from ftlm.solve.instants import compared_values, has_own_times
 
 #: Two parameters more correlated than this cannot be told apart where neither is known by itself.
 INSEPARABLE = 0.995
@@ -26,6 +29,15 @@ INSEPARABLE = 0.995
 #: where it exceeds this much. However correlated two numbers are, both are usable if each is within a tenth: then its
 #: 95 % interval spans less than half its value, and an order's less than the steps of 0.5 in which mechanisms differ.
 VAGUE = 0.1
+#: Residuals below this share of an output are rounding and discretisation, of which nothing follows.
+ROUNDING = 3e-5
+#: Outliers are worth a word from so many on, and from this share of all residuals on.
+FEWEST_OUTLIERS = 3
+OUTLIERS = 2e-3
+#: Noise of this share of a step shakes an output over its steps; with less, residuals are the rounding itself.
+COARSE = 2.0
+#: Share of a step by which multiples of it may be off.
+ROUNDED = 0.01
 #: Two coefficients further apart than this share do not obey the coefficient law.
 LAW_BROKEN = 0.05
 
@@ -79,6 +91,75 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             "standard errors allow for the colour, not for the bias of what is left out"
         )
     return warnings
+
+
+def irregular(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[str]:
+    """Say what in the samples harms the figures: outliers, quantisation, times that could not be honoured."""
+    warnings = []
+    for output in problem.structure.outputs:
+        size = math.sqrt(float(np.mean([np.nanvar(run[output]) for run in runs])))
+        noise = joint.noise[output]
+        if noise <= ROUNDING * size:
+            continue
+        warnings += [
+            w for w in (_outliers(runs, joint, output), _quantised(runs, problem.structure, output, noise)) if w
+        ]
+    kept = [run.name for run in runs if run.readings is not None and not has_own_times(run, problem.structure)]
+    if kept:
+        warnings.append(
+            f"{', '.join(kept)}: outputs were read at times of their own, but a free delay, or a sensor filter with "
+            "coupling='measured', needs them on a grid: straight lines were drawn between them, and the intervals do "
+            "not know what that costs"
+        )
+    return warnings
+
+
+def _outliers(runs: Sequence[Run], joint: JointFit, output: str) -> str | None:
+    """Residuals far beyond the usual ones, where nothing was done about them."""
+    if joint.robust is not None:
+        return None
+    usual = robust_deviation(read(np.concatenate([part[output] for part in joint.residuals])))
+    far, first = 0, ""
+    for run, part in zip(runs, joint.residuals, strict=True):
+        rows = np.flatnonzero(np.abs(part[output]) > FAR * usual)
+        if rows.size and not far:
+            # Compared rows begin behind the first one.
+            first = f"first at row {int(rows[0]) + 1} of {run.name}"
+        far += rows.size
+    count = sum(read(part[output]).size for part in joint.residuals)
+    if usual == 0.0 or far < max(FEWEST_OUTLIERS, OUTLIERS * count):
+        return None
+    return (
+        f"{far} of {count} residuals of {output} lie beyond {FAR:g} times the usual one, {first}: outliers, or moments "
+        "that the model does not explain; squares let them cost precision: loss='huber' weighs them down"
+    )
+
+
+def _quantised(runs: Sequence[Run], structure: Structure, output: str, noise: float) -> str | None:
+    """An output whose steps are coarser than anything that would shake it over them."""
+    steps = [quantum(read(compared_values(run, structure, output))) for run in runs]
+    coarse = [(step, run) for step, run in zip(steps, runs, strict=True) if step > COARSE * noise]
+    if not coarse:
+        return None
+    step, run = max(coarse, key=lambda pair: pair[0])
+    return (
+        f"{output} is quantised in steps of {step:.3g} in {run.name}, and its residuals are {noise:.3g}: rounding, "
+        "which repeats where the signal does and is no noise; intervals do not allow for it; use a finer converter or "
+        "scale"
+    )
+
+
+def quantum(values: Floats) -> float:
+    """Step of which all values are whole multiples; 0 where there is none."""
+    levels = np.unique(values)
+    gaps = np.diff(levels)
+    gaps = gaps[gaps > 1e-9 * max(float(np.abs(levels).max()), float(np.ptp(levels)))] if gaps.size else gaps
+    if gaps.size == 0:
+        return 0.0
+    # Rounding apart, the least gap is the step; the mean of those close to it tells it better.
+    step = float(np.mean(gaps[gaps < 1.5 * gaps.min()]))
+    multiples = gaps / step
+    return step if float(np.abs(multiples - np.rint(multiples)).max()) < ROUNDED else 0.0
 
 
 def inseparable(joint: JointFit) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field, replace
 from typing import Any
 
@@ -13,15 +13,17 @@ from markupsafe import Markup
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.frames import to_frame
+from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.several import Runs, as_runs
 from ftlm.data.solved import Solved, check_solved
 from ftlm.data.structures import Structure, offset_exponents
-from ftlm.judge.metrics import Metrics, pooled
+from ftlm.judge.metrics import UNKNOWN, Metrics, pooled
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol_html
 from ftlm.solve.free_run import compared, respond
-from ftlm.solve.records import Record, check_m, default_m, equation_tuple, initial_tuple, records
+from ftlm.solve.instants import compared_times
+from ftlm.solve.records import Record, check_m, default_m, equation_tuple, initial_tuple, records, whole
 from ftlm.solve.sampled import Sampled, initial_exponents, measured_samples, refined
 
 #: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
@@ -51,7 +53,8 @@ class Comparison:
     per_run
         The same for each run by name: (equation error, output error).
     simulated, measured
-        By output, one array a run: samples at the run's instants, or pulse means (see ``sampled``).
+        By output, one array a run: samples when they were read, or pulse means (see ``sampled``). What was not read is
+        NaN in ``measured``, and no figure of the output error counts it; that of the equation error is not known then.
     step
         Pulse width of each run [s], of the equation error.
     m
@@ -127,7 +130,7 @@ class Comparison:
                     f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>10.4g}"
                 )
         if self.sampled:
-            count = sum(t.size for t in self.times)
+            count = max(sum(read(y).size for y in parts) for parts in self.measured.values())
             lines.append(f"output error over {count} samples, equation error over {self.m} block pulses a run")
         else:
             lines.append(f"over {self.m} block pulses a run")
@@ -188,8 +191,9 @@ def compared_samples(model: Solved, runs: Runs, free: Sequence[Sampled], *, m: i
     for run, sampled, rec in zip(runs, free, full, strict=True):
         measured = dict(zip(model.outputs, measured_samples(model, run, sampled.refinement), strict=True))
         simulated = dict(zip(model.outputs, sampled.outputs, strict=True))
-        parts.append(_beside(model, rec, simulated, measured, sampled.initial))
-    found = _comparison(model, runs, parts, m, [run.time for run in runs], sampled=True)
+        parts.append(_beside(model, rec, simulated, measured, sampled.initial, gaps=run.missing))
+    times = [compared_times(run, model.structure) for run in runs]
+    found = _comparison(model, runs, parts, m, times, sampled=True)
     restless = [run.name for run, sampled in zip(runs, free, strict=True) if _moves(sampled)]
     words = f"the free run on {', '.join(restless)} still moves with the step at the finest grid: the model is stiffer "
     words += "than these samples can show, and its output error is provisional"
@@ -207,6 +211,7 @@ def compare_means(model: Solved, runs: Run | Sequence[Run], *, m: int | None = N
     Means average neighbours: with noise they flatter, and where few pulses carry a period they condemn.
     """
     several, m = _checked(model, runs, m)
+    whole(several, "figures of pulse means")
     pairs = zip(compared(several, model, m), records(several, model.structure, m), strict=True)
     parts = []
     for free, full in pairs:
@@ -277,12 +282,17 @@ class _Beside:
 
 def _beside(
     model: Solved, full: Record, simulated: dict[str, Floats], measured: dict[str, Floats],
-    initial: dict[str, dict[float, float]],
+    initial: dict[str, dict[float, float]], *, gaps: Container[str] = (),
 ) -> _Beside:  # fmt: skip
-    """A free run with what it is compared with, and the equation error, with all signals behind the sensor filter."""
+    """A free run with what it is compared with, and the equation error, with all signals behind the sensor filter.
+
+    The equation of an output with gaps has no error: it would be that of the straight lines over them.
+    """
     core, inputs, powers = full.core(), list(full.inputs), initial_tuple(full.initial, full.offset)
     missed = {
-        e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers) for e in model.equations
+        e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers)
+        for e in model.equations
+        if e.output not in gaps
     }
     return _Beside(full.step, initial, simulated, measured, {o: full.of(o) for o in model.outputs}, missed)
 
@@ -304,7 +314,12 @@ def _comparison(
 def _figures(parts: Sequence[_Beside]) -> tuple[dict[str, Metrics], dict[str, Metrics]]:
     """Figures of the equation error and of the free run, over these runs together."""
     outputs = parts[0].measured
-    equation = {o: pooled([p.equated[o] for p in parts], [p.missed[o] for p in parts]) for o in outputs}
+    equation = {
+        o: pooled([p.equated[o] for p in parts], [p.missed[o] for p in parts])
+        if all(o in p.missed for p in parts)
+        else UNKNOWN
+        for o in outputs
+    }
     free = {o: pooled([p.measured[o] for p in parts], [p.measured[o] - p.simulated[o] for p in parts]) for o in outputs}
     return equation, free
 
@@ -321,8 +336,8 @@ def near_identity(
         name, alpha = item.output, item.order.constant
         equation, output = equation_error[name], output_error[name]
         close = [t.order.constant for t in item.terms if t.signal == name and alpha - t.order.constant < NEAR_IDENTITY]
-        # Negated so that a figure that is not a number counts as bad.
-        worse = not output.nr <= FLATTERED * equation.nr
+        # Negated so that a figure that is not a number counts as bad; an equation error that is not known says nothing.
+        worse = not output.nr <= FLATTERED * equation.nr and not math.isnan(equation.nr)
         useless = not output.nr <= USELESS
         if close and worse:
             listed = ", ".join(f"{order:g}" for order in close)
@@ -347,7 +362,7 @@ def validation_warnings(own: Comparison, validation: Comparison) -> list[str]:
     warnings = []
     for k, (name, _, _) in enumerate(own.per_run):
         for j, (other, _, _) in enumerate(validation.per_run):
-            if all(np.array_equal(own.measured[o][k], validation.measured[o][j]) for o in own.measured):
+            if all(np.array_equal(own.measured[o][k], validation.measured[o][j], equal_nan=True) for o in own.measured):
                 warnings.append(
                     f"{other}: its outputs are those of {name}, which the model was identified from; "
                     "it validates nothing"

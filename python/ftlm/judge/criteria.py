@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from ftlm.base.checks import whole_number
 from ftlm.base.errors import ModelError
+from ftlm.data.readings import read
 from ftlm.judge.metrics import finite
 from ftlm.judge.residuals import Residuals
 from ftlm.paint.table import Table
@@ -76,7 +77,7 @@ def information_criteria(tests: Residuals, parameters: int) -> InformationCriter
     given = whole_number(parameters)
     if given is None or given < 0:
         raise ModelError(f"parameters = {parameters!r} is no number of parameters; give a whole number, at least 0")
-    counts = {name: sum(r.size for r in output.residuals) for name, output in tests.outputs.items()}
+    counts = {name: sum(read(r).size for r in output.residuals) for name, output in tests.outputs.items()}
     samples = sum(counts.values())
     k = given + tests.initial_terms + len(tests.outputs)
     likelihood = 0.0

@@ -44,6 +44,10 @@ class Metrics:
         return {name: finite(getattr(self, name)) for name in ("error", "rmse", "nr", "fit")}
 
 
+#: Figures that nothing is known of.
+UNKNOWN = Metrics(math.nan, math.nan, math.nan, math.nan)
+
+
 def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
     """Error (45), RMSE (46), NR (47) and fit of a prediction.
 
@@ -71,7 +75,11 @@ def metrics(measured: ArrayLike, predicted: ArrayLike) -> Metrics:
 
 
 def pooled(measured: list[Floats], residuals: list[Floats]) -> Metrics:
-    """Figures over several runs; each run's mean is its own."""
+    """Figures over several runs, of what was read; each run's mean is its own."""
+    known = [~np.isnan(y) for y in measured]
+    if not all(k.all() for k in known):
+        measured = [y[k] for y, k in zip(measured, known, strict=True)]
+        residuals = [e[k] for e, k in zip(residuals, known, strict=True)]
     if len(measured) == 1:
         return Metrics(*_core.metrics(measured[0], residuals[0]))
     return Metrics(*_core.metrics(np.concatenate([y - np.mean(y) for y in measured]), np.concatenate(residuals)))

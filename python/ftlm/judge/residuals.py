@@ -15,17 +15,19 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import whole_number
+from ftlm.base.colour import autoregression, is_constant, whitened
 from ftlm.base.errors import DataError, ModelError
-from ftlm.base.statistics import LEVEL, NORMAL_99, chi_squared_99, ljung_box
+from ftlm.base.statistics import LEVEL, NORMAL_99, autocovariances, chi_squared_99, ljung_box, whiteness
+from ftlm.data.readings import bridged
 from ftlm.data.run import Run
 from ftlm.data.several import Runs, as_runs
 from ftlm.data.solved import Solved, check_solved
 from ftlm.judge.comparison import free_runs
 from ftlm.judge.feedback import FeedbackTest, feedback_test
 from ftlm.judge.metrics import finite
-from ftlm.judge.whitening import autoregression, is_constant, whitened
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, symbol_html
+from ftlm.solve.instants import compared_values
 from ftlm.solve.sampled import Sampled, measured_samples
 
 #: Orders closer than this are one order.
@@ -107,7 +109,8 @@ class OutputResiduals:
     Parameters
     ----------
     residuals
-        Measured minus simulated samples, one array a run, without its first and last sample; SI units.
+        Measured minus simulated samples, one array a run, without its first and last sample; SI units. NaN where the
+        output was not read.
     rms
         Their root mean square over all runs.
     nr
@@ -328,33 +331,40 @@ def tested_residuals(model: Solved, runs: Runs, free: Sequence[Sampled], *, lags
             residuals[name].append(np.ascontiguousarray(series[1:-1]))
     read = [s for s in model.structure.signals if s not in model.outputs and s in runs[0]]
     inputs = list(dict.fromkeys([*runs[0].inputs, *read]))
-    signals = {n: [np.ascontiguousarray(run[n][1:-1]) for run in runs] for n in inputs}
+    signals = {
+        n: [np.ascontiguousarray(bridged(compared_values(run, model.structure, n))[1:-1]) for run in runs]
+        for n in inputs
+    }
     outputs = {}
     for item in model.equations:
         name = item.output
-        deviation = math.sqrt(float(np.mean([np.var(run[name]) for run in runs])))
+        measured = [compared_values(run, model.structure, name) for run in runs]
+        deviation = math.sqrt(float(np.mean([np.nanvar(y) for y in measured])))
+        gaps = [np.isnan(y[1:-1]) for y in measured]
         direct = {t.signal for t in item.terms if t.order.constant >= item.order.constant - GRAIN}
         commands = {s: s in direct for s in item.signals if s in runs[0].inputs}
-        outputs[name] = _tested(residuals[name], signals, lags, deviation, commands)
+        outputs[name] = _tested(residuals[name], gaps, signals, lags, deviation, commands)
     steps, terms = tuple(run.step for run in runs), sum(len(t) for s in free for t in s.initial.values())
     return Residuals(outputs, tuple(run.name for run in runs), steps, max(s.refinement for s in free), terms)
 
 
 def _tested(
-    series: list[Floats], signals: Mapping[str, list[Floats]], lags: int, deviation: float, commands: Mapping[str, bool]
-) -> OutputResiduals:
-    """Both tests of one output's residuals, and signs of a loop; all fail where these are not finite.
+    series: list[Floats], gaps: list[NDArray[np.bool_]], signals: Mapping[str, list[Floats]], lags: int,
+    deviation: float, commands: Mapping[str, bool],
+) -> OutputResiduals:  # fmt: skip
+    """Both tests of one output's residuals, and signs of a loop, of those that are there; all fail where not finite.
 
     Commands are the inputs of the runs, each with whether the model has direct feed-through from it.
     """
-    everything = np.concatenate(series)
+    everything = np.concatenate([e[~gone] for e, gone in zip(series, gaps, strict=True)])
     with np.errstate(over="ignore", invalid="ignore"):
         rms = float(np.sqrt(np.mean(everything**2)))
     nr = rms / deviation if deviation > 0 else math.inf
     if not math.isfinite(rms):
         lost, across = _lost(np.arange(lags + 1)), _lost(np.arange(-lags, lags + 1))
         return OutputResiduals(series, math.inf, math.inf, lost, dict.fromkeys(signals, across))
-    whiteness = _whiteness(series, everything.size, lags)
+    series = [np.where(gone, np.nan, e) for e, gone in zip(series, gaps, strict=True)]
+    white_test = _whiteness(series, everything.size, lags)
     # Through this filter the residuals are white, and the inputs lose what they share with them by chance alone.
     colour = autoregression(series, lags)
     white = whitened(series, colour)
@@ -369,7 +379,7 @@ def _tested(
         # What answers within the sample is no sign of what the model lacks.
         at_once = name in loops and loops[name].found and not commands[name]
         inputs[name] = _independence(white, values, colour, lags, first=int(at_once))
-    return OutputResiduals(series, rms, nr, whiteness, inputs, loops)
+    return OutputResiduals(series, rms, nr, white_test, inputs, loops)
 
 
 def _lost(lags: NDArray[np.int64]) -> CorrelationTest:
@@ -379,8 +389,14 @@ def _lost(lags: NDArray[np.int64]) -> CorrelationTest:
 
 def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
     """Ljung and Box's sum against its limit."""
-    own = _core.correlation(series, series, lags)[0][lags:]
-    statistic, limit = ljung_box(own[1:], count), chi_squared_99(lags)
+    limit = chi_squared_99(lags)
+    if any(np.isnan(e).any() for e in series):
+        covariances, pairs = autocovariances(series, lags)
+        power = covariances[0] if covariances[0] > 0 else 1.0
+        own, statistic = covariances / power, whiteness(covariances, pairs)
+    else:
+        own = _core.correlation(series, series, lags)[0][lags:]
+        statistic = ljung_box(own[1:], count)
     band = NORMAL_99 / math.sqrt(count)
     return CorrelationTest(np.arange(lags + 1), own, band, statistic, limit, passed=statistic <= limit)
 

@@ -114,7 +114,7 @@ def simulate(
     largest_m = min(largest_m, MAX_M)
     if own > largest_m:
         raise ModelError(f"run {run.name!r} has {own} intervals, more than {largest_m}; slice it")
-    free = refined(model, _completed(run, model), initial or {}, tolerance=tolerance, largest_m=largest_m)
+    free = refined(model, _completed(run, model), initial or {}, tolerance=tolerance, largest_m=largest_m, on_grid=True)
     for name, samples in zip(model.outputs, free.outputs, strict=True):
         if not np.all(np.isfinite(samples)):
             at = int(np.argmax(~np.isfinite(samples))) * run.step
@@ -155,13 +155,7 @@ def _completed(run: Run, model: Solved) -> Run:
             f"run {run.name!r} has no signal {lacking!r}, which the equation of {read[lacking]} reads as measured; "
             "give it, or use coupling='simulated'"
         )
-    return Run.from_arrays(
-        step=run.step,
-        inputs={n: run[n] for n in run.inputs},
-        outputs={n: run[n] for n in run.outputs} | {n: np.zeros(run.length) for n in missing},
-        intersample=run.intersample,
-        name=run.name,
-    )
+    return run.with_outputs({n: np.zeros(run.length) for n in missing})
 
 
 def explicit_euler(model: Solved, run: Run, *, step: Literal["record"] = "record") -> dict[str, Floats]:

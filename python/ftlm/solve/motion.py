@@ -16,6 +16,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.statistics import chi_squared, is_rest, noise_of
+from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import History, Initial, Structure
 
@@ -56,11 +57,11 @@ def history(run: Run, structure: Structure) -> History:
     visible = 1.0
     for name in structure.outputs:
         if name in run:
-            samples = run[name]
+            samples = read(run[name])
             # A level that is no offset is a part of the past; one that is takes no power of its own.
             size = float(np.linalg.norm(samples - (0.0 if structure.offset == "none" else np.mean(samples))))
             if size:
-                visible = max(visible, size / max(noise_of(samples), np.finfo(np.float64).eps * size))
+                visible = max(visible, size / max(noise_of(run[name]), np.finfo(np.float64).eps * size))
     quarters = QUARTERS + math.ceil(math.log(visible / REFERENCE) / math.log(FACTOR))
     quarters = max(LEAST, min(quarters, MOST, run.length // SPARSEST))
     highest = max((e.order.constant for e in structure.equations if not e.order.names), default=0.0)
@@ -103,9 +104,9 @@ def misfit(few: Floats, many: Floats, size: Floats, count: float) -> float:
 
 
 def root_mean_square(residuals: Floats) -> Floats:
-    """Of each row."""
+    """Of each row, of what was read."""
     with np.errstate(over="ignore", invalid="ignore"):
-        rows: Floats = np.sqrt(np.mean(residuals**2, axis=1))
+        rows: Floats = np.sqrt(np.nanmean(residuals**2, axis=1))
     return rows
 
 

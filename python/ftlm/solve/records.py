@@ -16,6 +16,7 @@ from ftlm.base.checks import check_pulses, nearest
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.equations import Equation, Term
 from ftlm.data.orders import Order
+from ftlm.data.readings import bridged
 from ftlm.data.run import Run
 from ftlm.data.samples import locked
 from ftlm.data.several import Runs
@@ -109,8 +110,10 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     Outputs are point samples taken as linear in between; inputs hold or are linear as the run says; m may exceed the
     run's own grid only where nothing is measured against it. ``filtered`` puts signals that were not measured through
     the sensor filter through it (equation error); a coupled free run leaves them. Refuses signals that the run lacks,
-    those so small that their squares vanish, and delays of what is no input.
+    those so small that their squares vanish, delays of what is no input, and samples that are missing where an equation
+    needs them; over others stand straight lines, to which nothing may be fitted.
     """
+    _check_known(run, structure)
     initial = decided(run, structure)
     sensor = None
     if filtered and structure.sensor_filter is not None:
@@ -166,6 +169,44 @@ def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
     return None if sensor is None else _core.filter_series(list(sensor.numerator), list(sensor.denominator), m, step)
 
 
+def _check_known(run: Run, structure: Structure) -> None:
+    """Refuse missing samples of what drives an equation, and of outputs that pass a filter before they are compared."""
+    missing = run.missing
+    if not missing:
+        return
+    outputs, coupled = structure.outputs, structure.coupling == "simulated"
+    drivers = {
+        name: e.output
+        for e in structure.equations
+        for name in (s.removeprefix(COULOMB) if s not in run else s for s in e.signals)
+        if name != e.output and not (coupled and name in outputs)
+    }
+    lacking = next((name for name in missing if name in drivers), None)
+    if lacking is not None:
+        gone = missing[lacking]
+        raise DataError(
+            f"signal {lacking!r} of run {run.name!r} holds no value in {int(gone.sum())} rows, first row "
+            f"{int(np.flatnonzero(gone)[0])}, and drives the equation of {drivers[lacking]} as measured; fill these "
+            "rows yourself, avoid them with slice=, or use coupling='simulated'"
+        )
+    if structure.sensor_filter is not None and not coupled and any(name in missing for name in outputs):
+        raise DataError(
+            f"run {run.name!r} has missing samples, and a sensor filter with coupling='measured' must see all of them; "
+            "use coupling='simulated', or a part without gaps"
+        )
+
+
+def whole(runs: Sequence[Run], what: str) -> None:
+    """Refuse runs with missing samples for what cannot leave them out."""
+    for run in runs:
+        for name, gone in run.missing.items():
+            raise DataError(
+                f"output {name!r} of run {run.name!r} holds no value in {int(gone.sum())} rows, first row "
+                f"{int(np.flatnonzero(gone)[0])}: {what} cannot leave them out; use method='output-error' "
+                "(identify), a part without gaps, or fill them yourself"
+            )
+
+
 def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) -> Floats:
     if name not in run and name.startswith(COULOMB) and name.removeprefix(COULOMB) in run:
         # The sign of the measured rate over each interval; the last row repeats so that rows match.
@@ -176,7 +217,7 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
             f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
             f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs= (commands: -u and -y)"
         )
-    samples = run[name]
+    samples = bridged(run[name])
     if name in structure.free_delays:
         raise ModelError(
             f"the delay of {name} is free: only method='output-error' estimates delays; give its value in seconds"
@@ -185,8 +226,13 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
     if name not in run.inputs:
         if delay:
             raise ModelError(f"delay of {name} = {delay:g} s, but run {run.name!r} has it as an output; delay inputs")
+        if run.readings is not None and name not in run.missing:
+            return run.readings.means(name, "foh", m, run.duration, 0.0, 0.0)
         return _core.pulse_means(samples, m, False)
     held = run.intersample[name] == "zoh"
+    if run.readings is not None:
+        before = 0.0 if at_rest else float(samples[0])
+        return run.readings.means(name, run.intersample[name], m, run.duration, delay, before)
     if delay:
         intervals = run.length - 1
         # On a finer grid the delayed command switches within an interval, so it is held on that grid before the delay.
@@ -240,9 +286,16 @@ def named_signals(error: ModelError, signals: Sequence[str]) -> ModelError:
     return ModelError(re.sub(r"signal (\d+)", lambda m: f"signal {signals[int(m[1])]!r}", str(error)))
 
 
-def prepare(runs: Sequence[Run], structure: Structure, m: int | None, *, power_of_two: bool) -> list[Record]:
-    """Make the records of runs for an estimator on the equation error, refusing what it cannot be given."""
+def prepare(
+    runs: Sequence[Run], structure: Structure, m: int | None, *, power_of_two: bool, gaps: bool = False
+) -> list[Record]:
+    """Make the records of runs for an estimator on the equation error, refusing what it cannot be given.
+
+    Missing samples are refused unless gaps are let pass by an estimator that leaves them out.
+    """
     check_decided(structure.offset)
+    if not gaps:
+        whole(runs, "an estimator on the equation error")
     m = check_m(default_m(runs, power_of_two=power_of_two) if m is None else m, runs, power_of_two=power_of_two)
     for run in runs:
         run.require_outputs([o for o in structure.outputs if o in run])

@@ -18,7 +18,8 @@ from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
-from ftlm.data.structures import History, Initial, Offset, SensorFilter, offset_exponents
+from ftlm.data.structures import History, Initial, Offset, SensorFilter, Structure, offset_exponents
+from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
 from ftlm.solve.motion import decided, misfit, needed, root_mean_square
 from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_series
 
@@ -27,6 +28,8 @@ from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_ser
 FIRST_REFINEMENT = 2
 #: Orders closer than this are one order.
 GRAIN = 1e-9
+#: Orders of integration from which on a kink is as smooth as pulses follow.
+SMOOTH = 2.0
 #: Share of a response of an initial term that others must leave for it to be told from them.
 SPANNED = 1e-10
 
@@ -40,7 +43,8 @@ class Sampled:
     Parameters
     ----------
     outputs
-        Shape (outputs, N), measured through the sensor filter where they are; not finite where the run diverges.
+        Shape (outputs, N), measured through the sensor filter where they are; not finite where the run diverges. At the
+        rows of the run, or of its readings within its grid.
     initial
         Coefficients of the initial terms, by output and exponent.
     refinement
@@ -66,7 +70,9 @@ def initial_exponents(item: Equation, initial: Initial, offset: Offset) -> list[
     return sorted(found)
 
 
-def refined(model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int = MAX_M) -> Sampled:
+def refined(
+    model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int = MAX_M, on_grid: bool = False
+) -> Sampled:
     """Samples on grids refined, and extrapolated in the step, until they stand still or the pulses run out.
 
     Parameters
@@ -76,19 +82,22 @@ def refined(model: Solved, run: Run, initial: Terms | None, *, tolerance: float,
         outputs, each weighted by its own deviation.
     tolerance
         Change, as a share of each output's largest value, at which refinement ends.
+    on_grid
+        Whether the instants are those of the run's grid although its rows have times of their own.
     """
     own = run.length - 1
     every = FIRST_REFINEMENT
     if initial is None:
         model = started(model, run)
-    coarse, known = _tried(model, run, every, initial)
+    times = run.time if on_grid and has_own_times(run, model.structure) else own_times(model, run)
+    coarse, known = _tried(model, run, every, initial, times)
     terms = known
     best, change = coarse, np.full(len(model.outputs), np.inf)
     extrapolated: Floats | None = None
     lost = 0
     while 2 * every * own <= largest_m and lost < 2:
         every *= 2
-        fine, found = _tried(model, run, every, initial, last=lost == 1)
+        fine, found = _tried(model, run, every, initial, times, last=lost == 1)
         # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
         lost = 0 if np.all(np.isfinite(fine)) else lost + 1
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
@@ -105,6 +114,11 @@ def refined(model: Solved, run: Run, initial: Terms | None, *, tolerance: float,
     return Sampled(best, terms, every, change)
 
 
+def own_times(model: Solved, run: Run) -> Floats | None:
+    """When the samples of a run that are compared were read [s], where its rows have times of their own."""
+    return compared_times(run, model.structure) if has_own_times(run, model.structure) else None
+
+
 def started(model: Solved, run: Run) -> Solved:
     """The model with its initial terms decided on a run: Caputo's where the run's samples ask for no other history."""
     start = decided(run, model.structure)
@@ -114,12 +128,13 @@ def started(model: Solved, run: Run) -> Solved:
     short = replace(model, structure=replace(model.structure, initial="caputo"))
     try:
         measured = measured_samples(model, run, FIRST_REFINEMENT)
-        (few, ours), (many, theirs) = (sampled(each, run, FIRST_REFINEMENT, None) for each in (short, long))
+        times = own_times(model, run)
+        (few, ours), (many, theirs) = (sampled(each, run, FIRST_REFINEMENT, None, times) for each in (short, long))
     except ModelError:
         # The coarse grid makes the equations unsolvable; finer ones need not.
         return long
     more = sum(map(len, theirs.values())) - sum(map(len, ours.values()))
-    size, count = np.std(measured, axis=1), measured.shape[1]
+    size, count = np.nanstd(measured, axis=1), measured.shape[1]
     excess = misfit(root_mean_square(measured - few), root_mean_square(measured - many), size, count)
     return long if needed(model.structure, excess, more) else short
 
@@ -130,44 +145,54 @@ def _limit(coarse: Terms, fine: Terms) -> dict[str, dict[float, float]]:
 
 
 def _tried(
-    model: Solved, run: Run, every: int, initial: Terms | None, *, last: bool = False
+    model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Samples on one grid; no numbers where it happens to make the equations unsolvable, unless it is the last try."""
     try:
-        return sampled(model, run, every, initial)
+        return sampled(model, run, every, initial, times)
     except ModelError:
         # An own coefficient c meets 1 = c h^alpha / gamma(alpha + 2) on one step, not on two.
         if last:
             raise
-        return np.full((len(model.outputs), run.length), np.nan), {o: {} for o in model.outputs}
+        count = run.length if times is None else times.size
+        return np.full((len(model.outputs), count), np.nan), {o: {} for o in model.outputs}
 
 
-def sampled(model: Solved, run: Run, every: int, initial: Terms | None) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Samples on ``every`` pulses a sample interval, shape (outputs, N), and initial terms; they may not be finite."""
+def sampled(
+    model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None = None
+) -> tuple[Floats, dict[str, dict[float, float]]]:
+    """Samples on ``every`` pulses a sample interval, shape (outputs, N), and initial terms; they may not be finite.
+
+    At the instants of the grid, or at times of their own [s].
+    """
     coupled = model.structure.coupling == "simulated"
     rec = record(run, model.structure, (run.length - 1) * every, filtered=not coupled)
     still = replace(rec, means=np.zeros_like(rec.means))
+    at = None if times is None else Instants.of(run, rec, model.structure, times)
     if initial is not None:
         kept = {o: dict(initial.get(o, {})) for o in model.outputs}
-        return _read(model, run, rec, every, _responses(model, rec, kept), kept), kept
+        return _read(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
     names = [(e.output, power) for e in model.equations for power in initial_exponents(e, rec.initial, rec.offset)]
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
-    driven = _read(model, run, rec, every, _responses(model, rec, none), none)
+    driven = _read(model, run, rec, every, _responses(model, rec, none), none, at)
     if not names or not np.all(np.isfinite(driven)):
         return driven, none
     columns = []
     for output, power in names:
         unit = {**none, output: {power: 1.0}}
-        columns.append(_read(model, None, still, every, _responses(model, still, unit), unit))
+        columns.append(_read(model, None, still, every, _responses(model, still, unit), unit, at))
     return _fitted(model, measured_samples(model, run, every, rec), driven, names, columns)
 
 
 def measured_samples(model: Solved, run: Run, every: int, rec: Record | None = None) -> Floats:
-    """What the outputs are compared with, shape (outputs, N): as measured, or filtered where the equation is."""
+    """What the outputs are compared with, shape (outputs, N): as measured, or filtered where the equation is.
+
+    NaN where an output was not read.
+    """
     sensor = model.structure.sensor_filter
     filtered = sensor is not None and model.structure.coupling != "simulated"
     if not filtered or sensor is None or set(model.outputs) <= set(sensor.outputs):
-        return np.stack([run[name] for name in model.outputs])
+        return np.stack([compared_values(run, model.structure, name) for name in model.outputs])
     rec = rec or record(run, model.structure, (run.length - 1) * every)
     return np.stack([run[n] if n in sensor.outputs else _core.point_samples(rec.of(n))[::every] for n in model.outputs])
 
@@ -176,8 +201,11 @@ def _fitted(
     model: Solved, measured: Floats, driven: Floats, names: Sequence[tuple[str, float]], columns: Sequence[Floats]
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Initial terms that bring the run closest to what was measured, by least squares, and the run with them."""
-    deviation = np.std(measured, axis=1, keepdims=True)
-    weight = 1.0 / np.where(deviation > 0, deviation, 1.0)
+    deviation = np.nanstd(measured, axis=1, keepdims=True)
+    # What was not read weighs nothing.
+    unread = np.isnan(measured)
+    weight = np.where(unread, 0.0, 1.0 / np.where(deviation > 0, deviation, 1.0))
+    measured = np.where(unread, 0.0, measured)
     with np.errstate(over="ignore", invalid="ignore"):
         basis = np.stack([(weight * c).ravel() for c in columns], axis=1)
         sizes = np.linalg.norm(basis, axis=0)
@@ -204,15 +232,19 @@ def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
     return np.concatenate([_core.respond(rec.core(), [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
 
 
-def _read(model: Solved, run: Run | None, rec: Record, every: int, means: Floats, terms: Terms) -> Floats:
+def _read(
+    model: Solved, run: Run | None, rec: Record, every: int, means: Floats, terms: Terms, at: Instants | None
+) -> Floats:
     """Samples at the instants from pulse means: what integrates from the left, what feeds through as it is there.
 
     The last two pulses before each instant are extended to it: no jump of a held input lies in them, so the
-    extrapolation crosses none of the kinks t^alpha that jumps leave.
+    extrapolation crosses none of the kinks t^alpha that jumps leave. At times of their own, among which jumps lie
+    anywhere, samples follow from the pulses around them and the kinks that these do not show.
     """
     names, structure = model.outputs, model.structure
     coupled = structure.coupling == "simulated"
-    system, drive, now = np.eye(len(names)), np.zeros_like(means), np.zeros((len(names), rec.m // every + 1))
+    count = rec.m // every + 1 if at is None else at.times.size
+    system, drive, now = np.eye(len(names)), np.zeros_like(means), np.zeros((len(names), count))
     start = np.zeros(len(names))
     for i, item in enumerate(model.equations):
         start[i] = terms[item.output].get(0.0, 0.0)
@@ -224,7 +256,7 @@ def _read(model: Solved, run: Run | None, rec: Record, every: int, means: Floats
                 system[i, names.index(term.signal)] -= factor
             elif run is not None:
                 drive[i] += factor * rec.of(term.signal)
-                now[i] += factor * _at_instants(run, rec, structure.delay.get(term.signal, 0.0), term.signal, every)
+                now[i] += factor * _at_instants(run, rec, structure, term.signal, every, at)
     through = np.linalg.inv(system)
     drive, now, start = through @ drive, through @ now, through @ start
     with np.errstate(invalid="ignore", over="ignore"):
@@ -236,8 +268,45 @@ def _read(model: Solved, run: Run | None, rec: Record, every: int, means: Floats
                 if name in structure.sensor_filter.outputs and np.all(np.isfinite(means[i])):
                     gain[i] = high_frequency_gain(structure.sensor_filter)
                     rest[i] = _core.series_multiply(series, means[i], rec.m) - gain[i] * drive[i]
+        if at is not None:
+            kinks = through @ _kinks(model, run, at, terms)
+            kinks[gain != 1.0] = 0.0
+            # At the very start nothing has been integrated yet.
+            begun = np.where(at.times > 0.0, _finite_readings(rest, at) + kinks, (gain * start)[:, None])
+            return np.asarray(begun + gain[:, None] * now)
         later = 1.5 * rest[:, every - 1 :: every] - 0.5 * rest[:, every - 2 :: every]
         return np.concatenate([(gain * start)[:, None], later], axis=1) + gain[:, None] * now
+
+
+def _finite_readings(rest: Floats, at: Instants) -> Floats:
+    """Readings of what is smooth; not finite from where a run leaves the range of numbers."""
+    return _core.read_at(np.ascontiguousarray(rest), at.places)
+
+
+def _kinks(model: Solved, run: Run | None, at: Instants, terms: Terms) -> Floats:
+    """What the pulses do not show of the kinks at the times: of jumps of inputs, and of initial terms at the start.
+
+    Jumps by themselves, and once through the output's own terms, as the joint fit has them.
+    """
+    names, coupled = model.outputs, model.structure.coupling == "simulated"
+    out = np.zeros((len(names), at.times.size))
+    for i, item in enumerate(model.equations):
+        for power, value in terms[item.output].items():
+            if value and power != round(power):
+                jump = (np.zeros(1), np.array([value * math.gamma(power + 1.0)]))
+                out[i] += _core.corners(at.record.m, at.places, jump, power, at.record.step)
+        own = [t for t in item.terms if t.signal == item.output]
+        for term in item.terms if run is not None else ():
+            if term.signal == item.output or (coupled and term.signal in names):
+                continue
+            for path in ([term], *([term, other] for other in own)):
+                order = sum(item.order.constant - t.order.constant for t in path)
+                if order <= GRAIN or (len(path) > 1 and order >= SMOOTH):
+                    continue
+                known = at.corners(term.signal, order)
+                if known is not None:
+                    out[i] += math.prod(float(t.fixed or 0.0) for t in path) * known
+    return out
 
 
 def high_frequency_gain(sensor: SensorFilter) -> float:
@@ -247,9 +316,14 @@ def high_frequency_gain(sensor: SensorFilter) -> float:
     return top / bottom
 
 
-def _at_instants(run: Run, rec: Record, delay: float, name: str, every: int) -> Floats:
+def _at_instants(
+    run: Run, rec: Record, structure: Structure, name: str, every: int, at: Instants | None
+) -> Floats:  # fmt: skip
     """Values of a signal just after the instants."""
-    filtered = rec.sensor is not None
+    if at is not None:
+        values = at.values(name)
+        return _core.read_at(rec.of(name)[None], at.places)[0] if values is None else values
+    delay, filtered = structure.delay.get(name, 0.0), rec.sensor is not None
     if not delay and not filtered:
         return run[name]
     means = rec.of(name)

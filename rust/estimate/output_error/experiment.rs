@@ -1,6 +1,7 @@
 //! One run to compare with, sample by sample.
 
 use crate::error::{check_finite, check_length, Error, Result};
+use crate::readings::{Jumps, Readings};
 use crate::regressors::Record;
 use crate::series;
 
@@ -20,6 +21,20 @@ pub struct Experiment {
     pub weights: Vec<f64>,
     /// What each signal is at the samples, for terms that feed through at once; empty: nothing but the pulse means.
     pub instants: Vec<Instant>,
+    /// Share of its weight with which each compared sample of each output counts, 0 for one that was not read; empty: all
+    /// count alike.
+    pub shares: Vec<Vec<f64>>,
+    /// When the samples were read, where that is not at every `every`-th edge.
+    pub own: Option<OwnTimes>,
+}
+
+/// Samples at times of their own, all of which are compared.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OwnTimes {
+    /// When they were read.
+    pub readings: Readings,
+    /// Jumps of each signal of the record that holds in between, near them.
+    pub jumps: Vec<Option<Jumps>>,
 }
 
 /// A signal at the instants of the samples.
@@ -37,9 +52,34 @@ impl Experiment {
     /// # Errors
     /// As [`Experiment::check`].
     pub fn new(record: Record, every: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Result<Self> {
-        let experiment = Self { record, every, samples, filter: None, weights, instants: Vec::new() };
+        let experiment = Self::unchecked(record, every, samples, weights);
         experiment.check()?;
         Ok(experiment)
+    }
+
+    /// An experiment whose samples were read at times of their own.
+    ///
+    /// # Errors
+    /// As [`Experiment::check`].
+    pub fn with_own_times(record: Record, samples: Vec<Vec<f64>>, weights: Vec<f64>, own: OwnTimes) -> Result<Self> {
+        let experiment = Self { own: Some(own), ..Self::unchecked(record, 1, samples, weights) };
+        experiment.check()?;
+        Ok(experiment)
+    }
+
+    fn unchecked(record: Record, every: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Self {
+        let (filter, instants, shares, own) = (None, Vec::new(), Vec::new(), None);
+        Self { record, every, samples, filter, weights, instants, shares, own }
+    }
+
+    /// The same experiment, some of its compared samples counting less.
+    ///
+    /// # Errors
+    /// As [`Experiment::check`].
+    pub fn with_shares(mut self, shares: Vec<Vec<f64>>) -> Result<Self> {
+        self.shares = shares;
+        self.check()?;
+        Ok(self)
     }
 
     /// The same experiment, its outputs compared behind a filter.
@@ -74,7 +114,7 @@ impl Experiment {
         }
         for (i, samples) in self.samples.iter().enumerate() {
             check_finite(&format!("samples of output {i}"), samples)?;
-            check_length("samples", m / every + 1, samples.len())?;
+            check_length("samples", self.own.as_ref().map_or(m / every + 1, |own| own.readings.len()), samples.len())?;
         }
         if let Some((series, applies)) = &self.filter {
             check_finite("filter", series)?;
@@ -86,15 +126,48 @@ impl Experiment {
         }
         for values in self.instants.iter().filter_map(|instant| instant.values.as_ref()) {
             check_finite("signal at the samples", values)?;
-            check_length("signal at the samples", m / every + 1, values.len())?;
+            check_length("signal at the samples", self.samples.first().map_or(m / every + 1, Vec::len), values.len())?;
+        }
+        if let Some(own) = &self.own {
+            check_length("jumps of signals", self.record.len(), own.jumps.len())?;
+        }
+        if !self.shares.is_empty() {
+            check_length("outputs with shares", self.samples.len(), self.shares.len())?;
+        }
+        for shares in &self.shares {
+            check_finite("shares of samples", shares)?;
+            check_length("shares of samples", self.compared(), shares.len())?;
         }
         check_finite("weights", &self.weights)?;
         check_length("weights", self.samples.len(), self.weights.len())
     }
 
-    /// Samples that are compared: all that have a pulse on either side.
+    /// Samples that are compared: all that have a pulse on either side, or all that were read at times of their own.
     pub(super) fn compared(&self) -> usize {
-        (self.record.m() / self.every).saturating_sub(1)
+        match &self.own {
+            Some(own) => own.readings.len(),
+            None => (self.record.m() / self.every).saturating_sub(1),
+        }
+    }
+
+    /// The compared ones of values at the samples.
+    fn inner<'a>(&self, values: &'a [f64]) -> &'a [f64] {
+        let first = usize::from(self.own.is_none());
+        &values[first..first + self.compared()]
+    }
+
+    /// Weights of an output's compared samples.
+    pub(super) fn weights_of(&self, output: usize) -> impl Iterator<Item = f64> + '_ {
+        let (weight, shares) = (self.weights[output], self.shares.get(output));
+        (0..self.compared()).map(move |k| weight * shares.map_or(1.0, |shares| shares[k]))
+    }
+
+    /// Weighted compared samples as measured, all outputs after one another.
+    pub(super) fn measured(&self) -> Vec<f64> {
+        let weighted = |(i, values): (usize, &Vec<f64>)| -> Vec<f64> {
+            self.weights_of(i).zip(self.inner(values)).map(|(w, v)| w * v).collect()
+        };
+        self.samples.iter().enumerate().flat_map(weighted).collect()
     }
 
     /// Pulses on either side of each compared sample.
@@ -102,12 +175,21 @@ impl Experiment {
         (1..=self.compared()).map(move |k| (means[k * self.every - 1], means[k * self.every]))
     }
 
-    /// A signal at each compared sample less the mean of the pulses on either side.
+    /// A signal at each compared sample as its pulse means tell it.
+    fn told(&self, means: &[f64]) -> Vec<f64> {
+        match &self.own {
+            Some(own) => own.readings.read(means),
+            None => self.sides(means).map(|(a, b)| 0.5 * (a + b)).collect(),
+        }
+    }
+
+    /// A signal at each compared sample less what the pulses on either side tell.
     pub(super) fn lacking(&self, signal: usize) -> Vec<f64> {
-        let sides = self.sides(self.record.signal(signal));
         match self.instants.get(signal).and_then(|instant| instant.values.as_ref()) {
-            Some(values) => values[1..].iter().zip(sides).map(|(v, (a, b))| v - 0.5 * (a + b)).collect(),
-            None => sides.map(|_| 0.0).collect(),
+            Some(values) => {
+                self.inner(values).iter().zip(self.told(self.record.signal(signal))).map(|(v, told)| v - told).collect()
+            }
+            None => vec![0.0; self.compared()],
         }
     }
 
@@ -130,9 +212,18 @@ impl Experiment {
                 }
                 _ => means,
             };
-            let w = self.weights[i];
-            samples.extend(self.sides(means).map(|(a, b)| 0.5 * w * (a + b)));
+            samples.extend(self.weights_of(i).zip(self.told(means)).map(|(w, v)| w * v));
         }
         samples
+    }
+
+    /// Weighted, as the samples are, what pulse means do not tell of each output; nothing of what passes the filter.
+    pub(super) fn weighted(&self, values: &[Vec<f64>]) -> Vec<f64> {
+        let mut out = Vec::with_capacity(values.len() * self.compared());
+        for (i, row) in values.iter().enumerate() {
+            let behind = self.filter.as_ref().is_some_and(|(_, applies)| applies[i]);
+            out.extend(self.weights_of(i).zip(row).map(|(w, v)| if behind { 0.0 } else { w * v }));
+        }
+        out
     }
 }

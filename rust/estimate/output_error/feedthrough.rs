@@ -11,7 +11,7 @@ use crate::error::Result;
 use crate::small;
 
 /// Orders closer than this are the same: the term integrates nothing.
-const AT_ONCE: f64 = 1e-9;
+pub(super) const AT_ONCE: f64 = 1e-9;
 
 /// What feeds through in one experiment.
 pub(super) struct Direct {
@@ -94,7 +94,7 @@ impl Direct {
     }
 
     /// (I − C)⁻¹ times what drives each equation.
-    fn through(&self, driven: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
+    pub(super) fn through(&self, driven: Vec<Vec<f64>>) -> Vec<Vec<f64>> {
         let Some(between) = &self.between else { return driven };
         let gains = between.chunks_exact(driven.len());
         let mixed = |gains: &[f64]| {
@@ -107,20 +107,9 @@ impl Direct {
         gains.map(mixed).collect()
     }
 
-    /// Weighted, as the samples are, all outputs after one another; none of what passes the filter.
-    fn sampled(experiment: &Experiment, values: &[Vec<f64>]) -> Vec<f64> {
-        let mut out = Vec::with_capacity(values.len() * experiment.compared());
-        for (i, row) in values.iter().enumerate() {
-            let behind = experiment.filter.as_ref().is_some_and(|(_, applies)| applies[i]);
-            let w = if behind { 0.0 } else { experiment.weights[i] };
-            out.extend(row.iter().map(|v| w * v));
-        }
-        out
-    }
-
     /// What the sampled means lack.
     pub(super) fn samples(&self, experiment: &Experiment) -> Vec<f64> {
-        Self::sampled(experiment, &self.values)
+        experiment.weighted(&self.values)
     }
 }
 
@@ -153,7 +142,7 @@ pub(super) fn add_slope(
         };
         direct.add_driven(model, &mut driven, weight, |l| &l.1);
     }
-    column.iter_mut().zip(Direct::sampled(experiment, &direct.through(driven))).for_each(|(v, s)| *v += s);
+    column.iter_mut().zip(experiment.weighted(&direct.through(driven))).for_each(|(v, s)| *v += s);
 }
 
 /// Pulses see a jump of a held signal at a sample too early: the mean of the pulses on either side holds half of what
@@ -172,7 +161,8 @@ impl Early {
     pub(super) fn of(model: &FreeModel, experiment: &Experiment, shifted: &[(Vec<f64>, Vec<f64>)]) -> Self {
         let jumps = (0..experiment.record.len())
             .map(|signal| {
-                experiment.instants.get(signal).filter(|instant| instant.held)?;
+                // Corners of samples at times of their own are known one by one.
+                experiment.instants.get(signal).filter(|instant| instant.held && experiment.own.is_none())?;
                 let still = (experiment.record.signal(signal).to_vec(), Vec::new());
                 Some(match model.delay_of(signal) {
                     Some(d) => experiment.lacking_behind(signal, &shifted[d]),
@@ -227,10 +217,11 @@ impl Early {
                 continue;
             }
             for (signal, jump) in self.jumps.iter().enumerate() {
-                let weight = experiment.weights[i] * gains[i * signals + signal];
-                let Some(jump) = jump.as_ref().filter(|_| weight != 0.0) else { continue };
+                let gain = gains[i * signals + signal];
+                let Some(jump) = jump.as_ref().filter(|_| gain != 0.0) else { continue };
                 let half = if slopes { &jump.1 } else { &jump.0 };
-                row.iter_mut().zip(half).for_each(|(v, j)| *v -= weight * j);
+                let weights = experiment.weights_of(i);
+                row.iter_mut().zip(half).zip(weights).for_each(|((v, j), w)| *v -= w * gain * j);
             }
         }
     }

@@ -1,5 +1,6 @@
 //! The free run of a model at a point, its residuals on every experiment, and the initial terms that are projected out.
 
+use super::corners::Corners;
 use super::experiment::Experiment;
 use super::feedthrough::{Direct, Early};
 use super::model::{FreeModel, Point};
@@ -47,6 +48,8 @@ pub(super) struct Part {
     pub(super) direct: Option<Direct>,
     /// What pulses see too early.
     pub(super) early: Early,
+    /// Corners near samples that were read at times of their own.
+    pub(super) corners: Option<Corners>,
 }
 
 /// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
@@ -114,12 +117,7 @@ impl FreeModel {
             operators.push(row);
         }
         let mut response = Solver::new(&matrix)?.solve(&rhs)?;
-        let mut residuals: Vec<f64> = experiment
-            .samples
-            .iter()
-            .zip(&experiment.weights)
-            .flat_map(|(y, w)| y[1..=experiment.compared()].iter().map(move |v| v * w))
-            .collect();
+        let mut residuals = experiment.measured();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
         let mut sampled = experiment.sampled(&response);
         let early = Early::of(self, experiment, &shifted);
@@ -128,6 +126,11 @@ impl FreeModel {
         let direct = Direct::of(self, experiment, structures, point, &shifted)?;
         if let Some(direct) = &direct {
             residuals.iter_mut().zip(direct.samples(experiment)).for_each(|(e, v)| *e -= v);
+        }
+        let corners = Corners::of(self, experiment, structures);
+        if let Some(corners) = &corners {
+            let there = corners.samples(self, experiment, point, direct.as_ref());
+            residuals.iter_mut().zip(there).for_each(|(e, v)| *e -= v);
         }
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
             return Err(Error::Diverged { what: "free run".into(), index });
@@ -153,7 +156,12 @@ impl FreeModel {
                             means
                         })
                         .collect();
-                    terms.push((i, experiment.sampled(&means), means));
+                    let mut column = experiment.sampled(&means);
+                    if experiment.own.is_some() {
+                        let corner = Corners::of_power(experiment, i, exponent);
+                        column.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
+                    }
+                    terms.push((i, column, means));
                 }
             }
             inverse = Some(made);
@@ -172,7 +180,7 @@ impl FreeModel {
         }
         out.residuals.extend(residuals);
         out.initial.push(initial);
-        out.parts.push(Part { matrix, inverse, operators, response, basis, shifted, direct, early });
+        out.parts.push(Part { matrix, inverse, operators, response, basis, shifted, direct, early, corners });
         Ok(())
     }
 }

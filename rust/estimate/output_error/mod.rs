@@ -5,8 +5,9 @@
 //! one inverse transform a parameter and output. Rejected steps cost no Jacobian. Initial terms are linear and projected
 //! out (variable projection, Kaufman's form, doi:10.1007/BF01932995). Records are compared sample by sample: y_k with the
 //! mean of the pulses on either side of kh, on a grid that may be finer than the samples, plus what the inputs of that
-//! instant feed through.
+//! instant feed through. Samples that were not read weigh nothing; samples at times of their own are compared there.
 
+mod corners;
 pub mod experiment;
 mod feedthrough;
 pub mod fit;
@@ -15,7 +16,7 @@ pub mod levenberg_marquardt;
 pub mod model;
 mod sensitivities;
 
-pub use experiment::{Experiment, Instant};
+pub use experiment::{Experiment, Instant, OwnTimes};
 pub use fit::{fit, Fit};
 pub use levenberg_marquardt::{Settings, Status};
 pub use model::{Coordinate, FreeDelay, FreeEquation, FreeModel, Monomial, Point};

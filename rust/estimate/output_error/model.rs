@@ -164,6 +164,10 @@ impl FreeModel {
         for experiment in experiments {
             experiment.check()?;
             check_length("outputs", self.equations.len(), experiment.samples.len())?;
+            if experiment.own.is_some() && !self.delays.is_empty() {
+                let what = "a free delay with samples at times of their own".to_owned();
+                return refuse(what, "give the delay, or samples at regular times");
+            }
         }
         self.initial.check()
     }

@@ -117,6 +117,9 @@ impl FreeModel {
             if let Some(direct) = &part.direct {
                 add_slope(self, experiment, direct, point, parameter, &mut column);
             }
+            if let Some(corners) = &part.corners {
+                corners.add_slope(self, experiment, part.direct.as_ref(), point, parameter, &mut column);
+            }
             for direction in &part.basis {
                 let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
                 column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
