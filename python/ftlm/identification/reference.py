@@ -51,8 +51,8 @@ def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tupl
     for run in runs:
         if run.readings is not None:
             raise DataError(
-                f"run {run.name!r} has rows with times of their own, but the answer of an input to reference= is found on "
-                "regular ones; give regular rows"
+                f"run {run.name!r} has rows with times of their own, but the answer of an input to reference= is found "
+                "on regular ones; give regular rows"
             )
         if reference not in run:
             raise DataError(
