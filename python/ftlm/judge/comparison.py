@@ -337,7 +337,8 @@ def near_identity(
         equation, output = equation_error[name], output_error[name]
         close = [t.order.constant for t in item.terms if t.signal == name and alpha - t.order.constant < NEAR_IDENTITY]
         # Negated so that a figure that is not a number counts as bad; an equation error that is not known says nothing.
-        worse = not output.nr <= FLATTERED * equation.nr and not math.isnan(equation.nr)
+        unknown = math.isnan(equation.nr) and math.isfinite(output.nr)
+        worse = not output.nr <= FLATTERED * equation.nr and not unknown
         useless = not output.nr <= USELESS
         if close and worse:
             listed = ", ".join(f"{order:g}" for order in close)
