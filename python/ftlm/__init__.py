@@ -29,6 +29,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.identification.result import Identification
     from ftlm.judge.comparison import Comparison, compare
     from ftlm.judge.criteria import InformationCriteria, information_criteria
+    from ftlm.judge.feedback import FeedbackTest
     from ftlm.judge.metrics import Metrics, metrics
     from ftlm.judge.residuals import CorrelationTest, OutputResiduals, Residuals, resid
     from ftlm.model.model import Model, load_model
@@ -48,8 +49,8 @@ if _typing.TYPE_CHECKING:
 
 __all__ = [
     "PARAMETERS", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation", "Estimate",
-    "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria", "InternalError", "Lattice",
-    "LinkParameters", "Metrics", "Model", "ModelError", "Order", "OutputResiduals", "PhysicalParameter",
+    "FeedbackTest", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria", "InternalError",
+    "Lattice", "LinkParameters", "Metrics", "Model", "ModelError", "Order", "OutputResiduals", "PhysicalParameter",
     "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow", "SensorFilter", "StoreStatus",
     "Structure", "Term", "Trace", "__version__", "block_pulse_matrix", "compare", "equation", "explicit_euler",
     "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse", "haar_matrix",
@@ -82,6 +83,7 @@ _HOMES = {
         "identification.result": "Identification",
         "judge.comparison": "Comparison compare",
         "judge.criteria": "InformationCriteria information_criteria",
+        "judge.feedback": "FeedbackTest",
         "judge.metrics": "Metrics metrics",
         "judge.residuals": "CorrelationTest OutputResiduals Residuals resid",
         "model.model": "Model load_model",

@@ -52,6 +52,7 @@ GIVEN = {
     "store": ("store.ftlm", ["--store", "store.ftlm"]),
     "executor": (object(), None),
     "loss": ("huber", ["--loss", "huber"]),
+    "reference": ("r", ["--reference", "r"]),
 }
 #: What belongs to every method: what is identified, on which grid, with how much of the machine.
 EVERYONE = {"runs", "structure", "method", "offset", "m", "threads", "progress"}
@@ -74,7 +75,7 @@ def test_an_option_that_a_method_does_not_use_is_refused_by_name(
     used = method in USED_BY[option]
     if used:
         # What is used must change nothing into a refusal; that it acts is tested where it is made.
-        if option in ("executor", "store", "genetic") or method == "genetic":
+        if option in ("executor", "store", "genetic", "reference") or method == "genetic":
             return
         beside = {"lattice": GIVEN["lattice"][0]} if method in USED_BY["lattice"] else {}
         assert ftlm.identify(

@@ -67,8 +67,8 @@ class Judged:
     def standard_errors(self) -> dict[str, float]:
         """Standard errors by name.
 
-        Of orders and coefficients by output error; of coefficients alone, at the orders found and robust to coloured
-        residuals, by instrumental variables; empty for the equation-error methods.
+        Of orders and coefficients by output error and by instrumental variables, robust to coloured residuals; where
+        all orders were given, of the coefficients. Empty for the equation-error methods.
         """
         if self.joint is None:
             return dict(self.coefficient_errors)

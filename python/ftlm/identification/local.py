@@ -144,7 +144,9 @@ def offset_test(
     if count == 0 or not total > 0:
         return OffsetTest(0.0, 0, 0.0, 0.0)
     along = told.T @ residuals
-    spread = _coloured(told, residuals - told @ along, blocks, residuals.size - basis.shape[1] - count)
+    # Where the numbers come from a fit with an offset, part of what it does lies along their sensitivities.
+    noise = residuals - told @ along - basis @ (basis.T @ residuals)
+    spread = _coloured(told, noise, blocks, residuals.size - basis.shape[1] - count)
     statistic = float(along @ np.linalg.pinv(spread) @ along)
     explained = told @ along
     sizes = [float(np.nanstd(run[o])) for run in runs for o in structure.outputs]

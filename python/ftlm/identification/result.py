@@ -50,7 +50,7 @@ class Identification(Judged):
     task
         The runs and the structure as they were given.
     coefficient_errors
-        Standard errors of the coefficients at these orders, where the method gives no joint covariance.
+        Standard errors of coefficients, and of orders that were found, where the method gives no joint covariance.
     """
 
     def physical(self, **known: float) -> dict[str, PhysicalParameter]:
