@@ -115,8 +115,8 @@ def offset_test(
     )
     extended = replace(structure, equations=equations, offset="none", initial=decided_initial(runs, structure))
     try:
-        grid, here = at_point([run.with_outputs({one: np.ones(run.length)}) for run in runs], extended, {**values, **dict.fromkeys(names, 0.0)},
-                              every)  # fmt: skip
+        whole = [run.with_outputs({one: np.ones(run.length)}) for run in runs]
+        grid, here = at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
     except FtlmError:
         # No finite free run on this grid: the result says so elsewhere.
         return None
