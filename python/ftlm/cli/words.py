@@ -13,7 +13,8 @@ OPTIONS = {
     "m": "--m", "keep": "--keep", "threads": "--threads", "store": "--store", "genetic": "--seed or --evaluations",
     "slice": "--slice", "resample": "--resample", "step": "--sampling", "time": "--time", "time_unit": "--time-unit",
     "units": "--unit", "columns": "--columns", "intersample": "--intersample", "inputs": "-u", "outputs": "-y",
-    "coupling": "--coupling", "initial": "--initial", "laws": "--laws", "input_order": "--input-order",
+    "coupling": "--coupling", "initial": "--initial", "laws": "--laws", "form": "--form",
+    "input_order": "--input-order",
     "friction": "--friction", "cross_stage": "--cross-stage", "tolerance": "--tolerance", "lags": "--lags",
     "delay": "--delay", "force": "--force",
 }  # fmt: skip

@@ -116,6 +116,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     the sensor filter through it (equation error); a coupled free run leaves them. Refuses signals that the run lacks,
     those so small that their squares vanish, and delays of what is no input.
     """
+    _check_held(run, structure)
     initial = structure.initial
     if initial == "auto":
         initial = "rest" if starts_at_rest(run, structure) else "caputo"
@@ -143,6 +144,20 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         initial,
         structure.offset,
     )
+
+
+def _check_held(run: Run, structure: Structure) -> None:
+    """Refuse the derivative of a jump: a held input above the order of the output that it drives."""
+    for item in structure.equations:
+        for term in item.terms:
+            if item.order.names or term.order.names or term.order.constant <= item.order.constant + 1e-9:
+                continue
+            if term.signal in run.inputs and run.intersample[term.signal] == "zoh":
+                raise ModelError(
+                    f"order {term.order.constant:g} of {term.signal} is above alpha = {item.order.constant:g} of "
+                    f"{item.output}, and run {run.name!r} holds {term.signal} between its samples: its jumps have no "
+                    "derivative; lower the order, or say intersample='foh' if it moves in between"
+                )
 
 
 def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True) -> list[Record]:
