@@ -61,7 +61,7 @@ def clocked(work):
 def searches(quick: bool) -> None:
     """P1 and P2."""
     threads = available_threads()
-    equation = replace(ftlm.flexible_link(stage=1).equation("theta12"), initial="rest")
+    equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
     lattice = ftlm.lattice(alpha=(1.05, 2.0))
     options = {"coefficients": "least-squares", "m": M}
     clean, coarse = plant_a_run(), ftlm.lattice(step=0.1, alpha=(1.1, 2.0))
@@ -97,7 +97,7 @@ def searches(quick: bool) -> None:
 def refined(quick: bool) -> None:
     """P3: coefficients by instrumental variables."""
     threads = available_threads()
-    equation = replace(ftlm.flexible_link(stage=1).equation("theta12"), initial="rest")
+    equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
     step = 0.1 if quick else 0.05
     for hub, deflection in ((1e-3, 1e-4), (1e-3, 1e-3)):
         run = plant_a_run(hub, deflection)
@@ -146,7 +146,7 @@ def numpy_refinement(run: ftlm.Run, equation: ftlm.Structure) -> float:
 def stage(quick: bool) -> None:
     """Five free orders under the order law, two equations: the joined tables beside evaluating every tuple."""
     run = plant_a_run()
-    structure = replace(ftlm.flexible_link(stage=1), initial="rest")
+    structure = replace(ftlm.flexible_link(form="published", stage=1), initial="rest")
     options = {"coefficients": "least-squares", "m": M}
     # Both equations of a tuple, each fitted and run to its end.
     one = replace(structure.equation("theta12"), initial="rest")
@@ -322,7 +322,7 @@ from dataclasses import replace
 import ftlm
 from search import plant_a_run
 run = plant_a_run()
-equation = replace(ftlm.flexible_link(stage=1).equation("theta12"), initial="rest")
+equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
 step = float(sys.argv[1])
 coarse = ftlm.lattice(step=0.5, alpha=(1.0, 2.0))
 ftlm.search_orders(run, equation, coarse, coefficients="least-squares", m=2048)

@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +37,7 @@ rig.record(rig.VirtualBoard(page=sys.argv[1], paced=True), input="sine", amplitu
 def real_time(rate: float, seconds: float) -> None:
     excitation = rig.Excitation("multisine", 0.25, period=10.0, band=(0.1, 10.0))
     commands = excitation.commands(rate, seconds)
-    structure = ftlm.flexible_link(stage=1, laws=("orders",), coupling="measured")
+    structure = ftlm.flexible_link(form="published", stage=1, laws=("orders",), coupling="measured")
     arm = rig.ArmParameters.of("effective")
     stream = rig.Streaming(
         structure.with_orders(arm.stage1.orders(1)), step=1.0 / rate, longest=seconds + 1.0, prior_covariance=1e8
@@ -98,7 +99,7 @@ def cost() -> None:
             arm.advance((-0.3, 0.3), True)
         each = 1e6 * (time.perf_counter() - start) / n
         print(f"one sample of the arm at {rate:g} Hz: {each:.1f} us, {arm.memory} numbers hold the past of 600 s")
-    structure = ftlm.flexible_link(stage=1, laws=("orders",), coupling="measured")
+    structure = ftlm.flexible_link(form="published", stage=1, laws=("orders",), coupling="measured")
     structure = structure.with_orders(rig.ArmParameters.of("effective").stage1.orders(1))
     rng = np.random.default_rng(0)
     for n in (1_000, 10_000, 100_000):
@@ -111,7 +112,8 @@ def cost() -> None:
 
 
 def truth() -> None:
-    run = rig.record(duration=10.0, parameters="linear")
+    linear = replace(rig.ArmParameters.of("linear"), form="published")
+    run = rig.record(duration=10.0, parameters=linear)
     clean = {}
     for stage in (1, 2):
         names = [f"theta{stage}1", f"theta{stage}2"]
@@ -120,7 +122,7 @@ def truth() -> None:
         )
         solved = demo_plant(stage).simulate(blank, tolerance=1e-7)
         clean |= {n: solved[n] for n in names}
-    arm = rig.ArmParameters.of("linear").arm(run.step, 600.0)
+    arm = linear.arm(run.step, 600.0)
     states = np.empty((run.length, 4))
     currents = np.column_stack([run["I1"], run["I2"]])
     for k, row in enumerate(-2.0 * currents):

@@ -66,7 +66,7 @@ def main() -> None:
     write = parser.parse_args().write
     threads = available_threads()
     run = plant_a_run()
-    equation = replace(ftlm.flexible_link(stage=1).equation("theta12"), initial="rest")
+    equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
     lines: list[str] = []
 
     def say(text: str) -> None:

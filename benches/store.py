@@ -76,8 +76,8 @@ def stage(path, progress=None):
     given = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy, name="stage")
     lattice = ftlm.lattice(step=0.025, alpha=(1.8, 2.0), gamma1=(0.8, 1.1), beta2=(0.0, 0.5), mu2=(0.7, 1.0))
     return ftlm.search_orders(
-        given, ftlm.flexible_link(), lattice, early_stopping=False, m=1024, coefficients="least-squares", store=path,
-        progress=progress,
+        given, ftlm.flexible_link(form="published"), lattice, early_stopping=False, m=1024,
+        coefficients="least-squares", store=path, progress=progress,
     )  # fmt: skip
 
 

@@ -4,6 +4,7 @@
 //! y = Σ_k c_k I^{α−ν_k} s_k + initial terms, which is how everything else reads it.
 
 use crate::error::{check_finite, check_length, check_points, check_step, Error, Result};
+use crate::excess::MAX_EXCESS;
 use crate::kernels::{block_pulse_kernel, MAX_ORDER, MIN_INPUT_ORDER};
 use crate::series;
 
@@ -166,8 +167,8 @@ impl Initial {
 }
 
 impl Structure {
-    /// Refuses orders that make no equation: α outside (0, 10], an own-output order outside [0, α), another
-    /// outside [0, α] (an input's may be negative down to −3).
+    /// Refuses orders that make no equation: α outside (0, 10], an own-output order outside [0, α), another outside
+    /// [0, α + 1) (an input's may be negative down to −3).
     ///
     /// # Errors
     /// [`Error::OutOfRange`] naming the term, [`Error::Structure`] for a signal that is not there.
@@ -195,18 +196,18 @@ impl Structure {
                     return Err(range(name, term.order, allowed, "an own-output order must stay below alpha"));
                 }
             } else {
-                let input = is_input(term.signal);
-                if !order_fits(self.order, term.order, false, input) {
-                    let lowest = if input { MIN_INPUT_ORDER } else { 0.0 };
-                    let allowed = format!("[{lowest}, {}]", self.order);
-                    return Err(range(name, term.order, allowed, "an order must not exceed alpha"));
+                let lowest = if is_input(term.signal) { MIN_INPUT_ORDER } else { 0.0 };
+                let beyond = self.order + MAX_EXCESS;
+                if !(term.order >= lowest && term.order < beyond - ORDER_GRAIN) {
+                    let allowed = format!("[{lowest}, {beyond})");
+                    return Err(range(name, term.order, allowed, "an order must stay below alpha + 1"));
                 }
             }
         }
         Ok(())
     }
 
-    /// Order α − ν by which term k is integrated.
+    /// Order α − ν by which term k is integrated; below 0 it is differentiated.
     #[must_use]
     pub fn integration(&self, k: usize) -> f64 {
         tidy(self.order - self.terms[k].order)
@@ -239,8 +240,9 @@ pub fn alpha_fits(alpha: f64) -> bool {
     alpha > 0.0 && alpha <= MAX_ORDER
 }
 
-/// Whether a term of this order may stand under α: of the output itself in [0, α), of another signal in [0, α], of an
-/// input in [−3, α].
+/// Whether a search tries a term of this order under α: of the output itself in [0, α), of another signal in [0, α], of
+/// an input in [−3, α]. Of another signal [`Structure::check`] lets more pass: beyond α a freely chosen term is a way to
+/// say that the output nearly equals itself.
 #[must_use]
 pub fn order_fits(alpha: f64, order: f64, own: bool, input: bool) -> bool {
     if own {

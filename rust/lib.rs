@@ -3,10 +3,11 @@
 //! The modules in the order in which a measurement passes them:
 //!
 //! 1. [`means`]: point samples become means over block pulses; [`readings`]: and means samples at times of their own;
-//! 2. [`kernels`], [`fractional`], [`series`], [`haar`], [`operational`]: fractional integrals as truncated power series
+//! 2. [`kernels`], [`excess`], [`fractional`], [`series`], [`haar`], [`operational`]: fractional integrals as truncated power series
 //!    in the one-step delay, and the operational matrices of the literature beside them ([`fft`] and [`dense`] serve
 //!    them);
-//! 3. [`equation`]: terms, orders, order laws, sensor filters;
+//! 3. [`equation`], [`regularity`]: terms, orders, order laws, sensor filters; whether equations tell their outputs
+//!    apart;
 //! 4. [`regressors`]: a record and an equation become regressors I^{α−ν} s;
 //! 5. [`estimate`]: coefficients at given orders by least squares, multi-innovation least squares and instrumental
 //!    variables; orders and coefficients together by joint output error ([`small`] and [`memory`] serve them);
@@ -48,6 +49,7 @@ pub mod error;
 pub mod means;
 pub mod readings;
 
+pub mod excess;
 pub mod fractional;
 pub mod haar;
 pub mod kernels;
@@ -60,6 +62,7 @@ pub mod lanes;
 
 pub mod equation;
 pub mod regressors;
+pub mod regularity;
 
 pub mod estimate;
 pub mod memory;

@@ -4,7 +4,8 @@ use std::collections::HashMap;
 
 use crate::equation::{grains, tidy};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
-use crate::kernels::{block_pulse_kernel, power_means};
+use crate::excess::kernel;
+use crate::kernels::power_means;
 use crate::series::{self, Buffers, Kernel};
 
 /// Largest bank kept in memory; beyond it a search refuses to start.
@@ -129,7 +130,7 @@ impl Record {
         &self.signals[index]
     }
 
-    /// I^η of a signal, as [`Record::m`] pulse means; η in [0, 10]. O(m log m).
+    /// I^η of a signal, as [`Record::m`] pulse means; η in (−1, 10], below 0 its derivative. O(m log m).
     ///
     /// # Panics
     /// Where there is no such signal.
@@ -143,7 +144,7 @@ impl Record {
     /// ```
     #[must_use]
     pub fn integral(&self, signal: usize, eta: f64) -> Vec<f64> {
-        series::multiply(&block_pulse_kernel(eta, self.m(), self.step), &self.signals[signal], self.m())
+        series::multiply(&kernel(eta, self.m(), self.step), &self.signals[signal], self.m())
     }
 
     /// Pulse means of the initial term t^exponent, t in seconds, through the sensor filter where there is one.
@@ -279,7 +280,7 @@ impl Bank {
         for key in &index.keys {
             match *key {
                 Key::Integral { signal, order } => {
-                    let kernel = block_pulse_kernel(tidy(order as f64 / 1e9), m, record.step());
+                    let kernel = kernel(tidy(order as f64 / 1e9), m, record.step());
                     let column = if order == 0 {
                         record.signal(signal).to_vec()
                     } else {

@@ -3,8 +3,9 @@
 use crate::equation::{Equation, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::estimate::least_squares;
-use crate::kernels::block_pulse_kernel;
+use crate::excess::kernel;
 use crate::regressors::Record;
+use crate::regularity::check_regular;
 use crate::series;
 
 /// A response with the initial terms that were fitted to the measured outputs.
@@ -64,7 +65,7 @@ impl<'a> System<'a> {
                 let eta = structure.integration(k);
                 match outputs.iter().position(|&o| o == term.signal) {
                     Some(j) => {
-                        let kernel = block_pulse_kernel(eta, m, record.step());
+                        let kernel = kernel(eta, m, record.step());
                         matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v);
                     }
                     None => {
@@ -162,7 +163,9 @@ fn checked<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, 
         check_finite("coefficients of the initial terms", &coefficients)?;
         Initial::Powers(exponents).check()?;
     }
-    System::new(equations, record)
+    let system = System::new(equations, record)?;
+    check_regular(equations)?;
+    Ok(system)
 }
 
 /// Free run of a damped copy of the equations: the series of their outputs read at ρz, ρ = e^{−decay}, which makes every
@@ -374,7 +377,7 @@ pub fn trace_errors(structure: &Structure, record: &Record, rows: &[Vec<f64>]) -
         .map(|k| {
             let (term, eta) = (structure.terms[k], structure.integration(k));
             if term.signal == structure.output {
-                (true, block_pulse_kernel(eta, m, record.step()))
+                (true, kernel(eta, m, record.step()))
             } else {
                 (false, record.integral(term.signal, eta))
             }

@@ -7,7 +7,7 @@ use super::arrays::{stacked, vector};
 use super::errors::{attached, detached};
 use crate::error::{check_length, Error};
 use crate::memory::integral_by_memory;
-use crate::rig::arm::{Arm, Parameters, Stage};
+use crate::rig::arm::{Arm, Form, Parameters, Stage};
 use crate::rig::guard::{self, Fault};
 use crate::rig::virtual_arm::{Injection, Pace, Plant, Reading, Sensors};
 
@@ -132,6 +132,7 @@ struct ArmArg {
     stages: [StageArg; 2],
     coupling: f64,
     inertia_ratio: f64,
+    published: bool,
 }
 
 impl From<ArmArg> for Parameters {
@@ -143,7 +144,8 @@ impl From<ArmArg> for Parameters {
             deflection: s.deflection,
             coulomb: s.coulomb,
         });
-        Self { stages, coupling: a.coupling, inertia_ratio: a.inertia_ratio }
+        let form = if a.published { Form::Published } else { Form::Lagrange };
+        Self { stages, coupling: a.coupling, inertia_ratio: a.inertia_ratio, form }
     }
 }
 

@@ -1,12 +1,16 @@
 //! The physical two-link arm stepped sample by sample, with its converters, paced in real time or not.
 //!
-//! Each stage obeys (22)–(23) with Newton's order 2 on the left. The hub's Coulomb friction is a set-valued torque, so
-//! it counts as a current that is subtracted from the motor's and may take any value up to its limit at standstill.
-//! Stage 2 rides on link 1: with φ = θ₁₁ + θ₁₂ its base accelerates by φ″, and its motor's torque pulls on link 1,
+//! Each hub obeys (17) with Newton's order 2 on the left, each link (15): it hangs on its hub's motion, which enters by
+//! D^{2−μ+γ} of the hub angle, a change of momentum. Or both obey (22)–(23) as published, where that motion is eliminated
+//! and a derivative of the current dropped: such a link bends the wrong way. The hub's Coulomb friction is a set-valued
+//! torque, so it counts as a current that is subtracted from the motor's and may take any value up to its limit at
+//! standstill. Stage 2 rides on link 1: with φ = θ₁₁ + θ₁₂ its base accelerates by φ″, and its motor's torque pulls on
+//! link 1,
 //!
 //!   J₁₁θ₁₁″ = τ₁ + …,   J₁₂φ″ = … − κτ₂,   J₂₁(κφ″ + θ₂₁″) = τ₂ + …,   κ = 0 (apart) … 1 (the real mounting),
 //!
-//! which follow from one Lagrangian for every κ. Fractional derivatives of the angles are integrals of their rates,
+//! which follow from one Lagrangian for every κ; link 2 hangs on the motion of its hub against the ground, κφ + θ₂₁.
+//! Fractional derivatives of the angles are integrals of their rates,
 //! D^ν θ = I^{1−ν} θ′ and D^ν θ = I^{2−ν} θ″, exact for rates that are linear over a substep; the past lives in a fixed
 //! number of exponentials ([`crate::memory`]). One substep is a trapezoidal step, implicit in all four rates at once.
 
@@ -22,6 +26,15 @@ const FRICTION_SWEEPS: usize = 60;
 /// Most substeps of a sample: more take seconds each, and a slip of the hand would never end.
 const MOST_SUBSTEPS: f64 = 1e6;
 
+/// Which equation of the deflection is integrated.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    /// (15): the link hangs on its hub.
+    Lagrange,
+    /// (23) as published.
+    Published,
+}
+
 /// Orders, coefficients and friction of one stage, by the paper's names.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Stage {
@@ -29,9 +42,9 @@ pub struct Stage {
     pub hub_orders: [f64; 3],
     /// a, b, d, g of the hub's equation.
     pub hub: [f64; 4],
-    /// Orders in the deflection's equation: β, γ, μ; in [0, 2).
+    /// Orders in the deflection's equation: β, γ, μ; in [0, 2), but γ in [1, 3) of [`Form::Lagrange`].
     pub deflection_orders: [f64; 3],
-    /// a, b, d, g of the deflection's equation.
+    /// a, b, d, g of the deflection's equation; g is 0 of [`Form::Lagrange`].
     pub deflection: [f64; 4],
     /// Coulomb friction of the hub as a current \[A\].
     pub coulomb: f64,
@@ -46,19 +59,25 @@ pub struct Parameters {
     pub coupling: f64,
     /// J₂₁/J₁₂.
     pub inertia_ratio: f64,
+    /// Which equation of the deflections.
+    pub form: Form,
 }
 
-/// A derivative of one angle and what it contributes to the four accelerations.
-#[derive(Debug, Clone)]
+/// A derivative of one angle and what it contributes to the four equations.
+#[derive(Debug, Clone, Default)]
 struct Operator {
     signal: usize,
     order: f64,
     into: [f64; 4],
+    /// Momenta that it is part of, beside the rates: what stands on the left of the equations, integrated once.
+    momentum: [f64; 4],
     /// On the states of the past; empty for orders 0 and 1.
     weights: Vec<f64>,
     /// On the rate at the start and at the end of the substep.
     before: f64,
     now: f64,
+    /// Its value at the start of the substep.
+    value: f64,
 }
 
 /// The arm's state and its substep.
@@ -70,7 +89,7 @@ pub struct Arm {
     /// Accelerations per ampere of both motors.
     input: [[f64; 2]; 4],
     coulomb: [f64; 2],
-    /// (1 − h/2·C)⁻¹ with C the accelerations per rate at the end of the substep.
+    /// (P − h/2·C)⁻¹ with P the momenta and C the forces per rate at the end of the substep.
     solve: [[f64; 4]; 4],
     implicit: [[f64; 4]; 4],
     keep: Vec<f64>,
@@ -115,14 +134,17 @@ impl Arm {
         for operator in &mut operators {
             operator.prepare(h, &rates);
         }
-        let mut implicit = [[0.0; 4]; 4];
+        let (mut implicit, mut momenta) = ([[0.0; 4]; 4], [[0.0; 4]; 4]);
+        (0..4).for_each(|i| momenta[i][i] = 1.0);
         for operator in &operators {
             for (row, c) in implicit.iter_mut().zip(operator.into) {
                 row[operator.signal] += c * operator.now;
             }
+            for (row, c) in momenta.iter_mut().zip(operator.momentum) {
+                row[operator.signal] += c * operator.now;
+            }
         }
-        let matrix: Vec<f64> =
-            (0..16).map(|i| f64::from(u8::from(i / 4 == i % 4)) - h / 2.0 * implicit[i / 4][i % 4]).collect();
+        let matrix: Vec<f64> = (0..16).map(|i| momenta[i / 4][i % 4] - h / 2.0 * implicit[i / 4][i % 4]).collect();
         let inverse = small::inverse(&matrix, 4)?;
         let mut solve = [[0.0; 4]; 4];
         for (i, value) in inverse.iter().enumerate() {
@@ -176,8 +198,8 @@ impl Arm {
 
     fn substep(&mut self, current: [f64; 2]) {
         let h = self.substep;
-        let mut history = [0.0; 4];
-        for operator in &self.operators {
+        let (mut history, mut gained) = ([0.0; 4], [0.0; 4]);
+        for operator in &mut self.operators {
             let s = operator.signal;
             let mut value = operator.before * self.rate[s];
             if operator.order == 0.0 {
@@ -187,15 +209,23 @@ impl Arm {
             for (sum, c) in history.iter_mut().zip(operator.into) {
                 *sum += c * value;
             }
+            for (sum, c) in gained.iter_mut().zip(operator.momentum) {
+                *sum += c * (operator.value - value);
+            }
+            // But for what the rate at the end adds.
+            operator.value = value;
         }
         let mut right = [0.0; 4];
         for (i, value) in right.iter_mut().enumerate() {
             let driven: f64 = self.input[i].iter().zip(current).map(|(b, u)| b * u).sum();
-            *value = self.rate[i] + h / 2.0 * (self.linear[i] + history[i]) + h * driven;
+            *value = self.rate[i] + gained[i] + h / 2.0 * (self.linear[i] + history[i]) + h * driven;
         }
         let mut rate = times(&self.solve, &right);
         if self.coulomb != [0.0; 2] {
             self.rub(&mut rate);
+        }
+        for operator in &mut self.operators {
+            operator.value += operator.now * rate[operator.signal];
         }
         let implicit = times(&self.implicit, &rate);
         for i in 0..4 {
@@ -276,7 +306,7 @@ fn decayed(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
     rates.weights(q).iter().zip(rates.rates()).map(|(w, s)| w * libm::exp(-s * h)).collect()
 }
 
-/// The four accelerations as derivatives of the angles and as motor currents.
+/// The forces and momenta of the four equations as derivatives of the angles, and their motor currents.
 fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4])> {
     let (k, ratio) = (parameters.coupling, parameters.inertia_ratio);
     let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
@@ -291,20 +321,8 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
     if !(ratio >= 0.0 && ratio.is_finite()) {
         return Err(outside("inertia ratio", ratio, "[0, ∞)"));
     }
-    let mut operators: Vec<Operator> = Vec::new();
-    let mut add = |signal: usize, order: f64, row: usize, c: f64| {
-        if c == 0.0 {
-            return;
-        }
-        #[allow(clippy::float_cmp)]
-        let known = operators.iter().position(|o| o.signal == signal && o.order == order);
-        let at = known.unwrap_or_else(|| {
-            let (into, weights) = ([0.0; 4], Vec::new());
-            operators.push(Operator { signal, order, into, weights, before: 0.0, now: 0.0 });
-            operators.len() - 1
-        });
-        operators[at].into[row] += c;
-    };
+    let mut terms: Vec<(usize, f64, usize, f64)> = Vec::new();
+    let mut momenta: Vec<(usize, f64, usize, f64)> = Vec::new();
     let mut input = [[0.0; 2]; 4];
     for (j, stage) in parameters.stages.iter().enumerate() {
         if !(stage.coulomb >= 0.0 && stage.coulomb.is_finite()) {
@@ -314,29 +332,44 @@ fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4
         for (row, orders, c) in [(hub, stage.hub_orders, stage.hub), (link, stage.deflection_orders, stage.deflection)]
         {
             crate::error::check_finite("coefficients of the arm", &c)?;
-            if let Some(&bad) = orders.iter().find(|o| !(0.0..2.0).contains(*o)) {
-                return Err(outside("order of the arm", bad, "[0, 2)"));
-            }
-            let signals = [link, hub, link];
-            for t in 0..3 {
-                add(signals[t], orders[t], row, c[t]);
-                // Link 1 carries stage 2: what accelerates φ accelerates the base of hub 2 the other way.
-                if j == 0 {
-                    add(signals[t], orders[t], 2, -k * c[t]);
+            for (t, signal) in [link, hub, link].into_iter().enumerate() {
+                // Integrated once with its equation, the hub's motion is a momentum.
+                let moved = row == link && t == 1 && parameters.form == Form::Lagrange;
+                let order = if moved { orders[t] - 1.0 } else { orders[t] };
+                if !(0.0..2.0).contains(&order) {
+                    return Err(outside("order of the arm", orders[t], if moved { "[1, 3)" } else { "[0, 2)" }));
+                }
+                if moved {
+                    momenta.push((signal, order, row, -c[t]));
+                    if j == 1 {
+                        // Hub 2 turns with the tip of link 1.
+                        momenta.extend([(0, order, row, -k * c[t]), (1, order, row, -k * c[t])]);
+                    }
+                } else {
+                    terms.push((signal, orders[t], row, c[t]));
                 }
             }
             input[row][j] += c[3];
-            if j == 0 {
-                input[2][0] -= k * c[3];
-            }
         }
-        if j == 1 {
-            // Motor 2 and its friction pull on link 1, and through φ on hub 2 itself.
-            let (gamma, b, g) = (stage.hub_orders[1], stage.hub[1], stage.hub[3]);
-            add(hub, gamma, 1, -k * ratio * b);
-            add(hub, gamma, 2, k * k * ratio * b);
-            input[1][1] -= k * ratio * g;
-            input[2][1] += k * k * ratio * g;
+    }
+    // What accelerates φ accelerates the base of hub 2 the other way.
+    momenta.extend([(0, 1.0, 2, k), (1, 1.0, 2, k)]);
+    // Motor 2 and its friction pull on link 1.
+    let second = &parameters.stages[1];
+    terms.push((2, second.hub_orders[1], 1, -k * ratio * second.hub[1]));
+    input[1][1] -= k * ratio * second.hub[3];
+
+    let mut operators: Vec<Operator> = Vec::new();
+    for (list, momentum) in [(terms, false), (momenta, true)] {
+        for (signal, order, row, c) in list.into_iter().filter(|term| term.3 != 0.0) {
+            #[allow(clippy::float_cmp)]
+            let known = operators.iter().position(|o| o.signal == signal && o.order == order);
+            let at = known.unwrap_or_else(|| {
+                operators.push(Operator { signal, order, ..Operator::default() });
+                operators.len() - 1
+            });
+            let into = if momentum { &mut operators[at].momentum } else { &mut operators[at].into };
+            into[row] += c;
         }
     }
     Ok((operators, input))

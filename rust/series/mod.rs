@@ -25,4 +25,4 @@ pub use division::{Division, BLOCK};
 #[cfg(feature = "oracles")]
 pub use naive::{divide_naive, multiply_naive};
 pub use product::{multiply, Buffers, Kernel, SumOfProducts};
-pub use system::{divide, solve, Solver};
+pub use system::{divide, reciprocal, solve, Solver};

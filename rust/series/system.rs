@@ -13,6 +13,21 @@ pub fn divide(numerator: &[f64], divisor: &[f64]) -> Result<Vec<f64>> {
     quotient.into_iter().next().ok_or_else(|| Error::Internal { what: "a division without a quotient".into() })
 }
 
+/// 1 over a series, mod z^m; not finite where it starts with zero. O(m log² m).
+///
+/// ```
+/// assert_eq!(ftlm::series::reciprocal(&[1.0, -1.0, 0.0]), [1.0, 1.0, 1.0]);
+/// ```
+#[must_use]
+pub fn reciprocal(series: &[f64]) -> Vec<f64> {
+    let mut unit = vec![0.0; series.len()];
+    unit.first_mut().into_iter().for_each(|first| *first = 1.0);
+    let mut division = Division::new(1, series.len());
+    let inverse = [1.0 / series.first().copied().unwrap_or(f64::NAN)];
+    division.run(&[vec![series]], &inverse, &[&unit]);
+    division.into_quotients().pop().unwrap_or_default()
+}
+
 /// Solves the n × n system Σ_j A_ij y_j = b_i of series mod z^m, A_ij of length m at least. O(n² m log² m).
 ///
 /// # Errors

@@ -64,7 +64,7 @@ def structure(name: str) -> ftlm.Structure:
     """What is identified: ten numbers of a stage under both laws, or all five of the three-term plant; at rest."""
     if name == "3T":
         return replace(ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u"), initial="rest")
-    return replace(ftlm.flexible_link(stage=1 if name == "A" else 2), initial="rest")
+    return replace(ftlm.flexible_link(form="published", stage=1 if name == "A" else 2), initial="rest")
 
 
 def truth(name: str) -> dict[str, float]:

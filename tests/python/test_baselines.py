@@ -97,13 +97,13 @@ def test_as_many_evaluations_as_the_lattice_has_candidates(small_run):
 
 
 def test_all_equations_of_a_stage_under_their_order_law(clean_a):
-    structure = ftlm.flexible_link(stage=1, coupling="measured")
+    structure = ftlm.flexible_link(form="published", stage=1, coupling="measured")
     found = ftlm.identify(
         clean_a, structure, method="genetic", m=256, lattice=ftlm.lattice(alpha=(2.0, 2.0)),
         genetic=Genetic(seeds=(0,), evaluations=400, population=40),
     )  # fmt: skip
     assert set(found.orders) == set(structure.order_names)
-    law = ftlm.order_law(1)["beta1"].at(found.orders)
+    law = ftlm.order_law(1, form="published")["beta1"].at(found.orders)
     assert found.model.equations[0].terms[0].order.constant == pytest.approx(law, abs=1e-9)
     assert np.isfinite(found.settings["errors"]["stage"]["0"])
     with pytest.raises(

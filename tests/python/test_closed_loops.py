@@ -164,7 +164,7 @@ def test_what_is_no_reference_is_refused(options, error, words):
 def test_instrumental_variables_count_the_error_of_their_orders():
     # The true order is on no lattice; errors at the order found alone covered one in three.
     held = []
-    near = ftlm.lattice(alpha="1.5:1.9:0.05")
+    near = ftlm.lattice(alpha=(1.5, 1.9))
     for seed in range(3):
         run = loops.open_run(seed, noise=0.05)
         found = ftlm.identify(run, STRUCTURE, method="instrumental-variables", lattice=near)

@@ -71,12 +71,12 @@ BAD = {
     ),
     "input order above alpha": (
         MODEL,
-        "order 1.7 of u is above alpha = 1.5",
-        lambda: ftlm.equation("D^1.5 y = a D^1.7 u"),
+        "order 2.7 of u is 1.2 above alpha = 1.5 of y",
+        lambda: ftlm.equation("D^1.5 y = a D^2.7 u"),
     ),
     "other output below 0": (
         MODEL,
-        "order of term 1 = -0.5 is outside [0, 1.5]",
+        "order of term 1 = -0.5 is outside [0, 2.5)",
         lambda: identify(run(outputs={"y": Y, "z": Y**2}), "D^1.5 y = a y + b D^-0.5 z"),
     ),
     "order without a value": (MODEL, "order mu has no value", lambda: ftlm.Order.parse("alpha-mu").at({"alpha": 1})),
@@ -144,7 +144,11 @@ BAD = {
     "unknown norm": (MODEL, "norm = 'linf' is not known", lambda: search(norm="linf")),
     "unknown rows": (MODEL, "rows = 'fast' is not known", lambda: search(rows="fast")),
     "unknown coefficients": (MODEL, "coefficients = 'free' is not known", lambda: search(coefficients="free")),
-    "unknown coupling": (MODEL, "coupling = 'none' is not known", lambda: ftlm.flexible_link(coupling="none")),
+    "unknown coupling": (
+        MODEL,
+        "coupling = 'none' is not known",
+        lambda: ftlm.flexible_link(coupling="none"),
+    ),
     "unknown rule": (
         MODEL,
         "rule 'simpson' is not known",
@@ -330,7 +334,7 @@ BAD = {
         "a trace needs one equation whose orders are numbers",
         lambda: ftlm.multi_innovation_trace(run(), ftlm.equation(WORDS)),
     ),
-    "unknown stage": (MODEL, "stage = 3 is not known", lambda: ftlm.flexible_link(stage=3)),
+    "unknown stage": (MODEL, "stage = 3 is not known", lambda: ftlm.flexible_link(form="published", stage=3)),
     "missing model file": (
         DATA,
         "model nowhere.json cannot be read: No such file or directory",

@@ -191,7 +191,7 @@ def stage_run(plant, drive, with_noise):
 def search_stage(run, executor=None, **options):
     lattice = ftlm.Lattice(step=0.1, orders={"alpha": (1.8, 2.0)})
     options = {"m": 64, "keep": 8, "coefficients": "least-squares", **options}
-    return ftlm.search_orders(run, ftlm.flexible_link(), lattice, executor=executor, **options)
+    return ftlm.search_orders(run, ftlm.flexible_link(form="published"), lattice, executor=executor, **options)
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +221,7 @@ def test_spawned_processes_give_the_same_bytes_of_a_stage_and_resume(stage_run, 
 
 @pytest.mark.parametrize("laws", [(), ("orders", "coefficients")])
 def test_an_identification_by_the_lattice_shares_its_searches_out(stage_run, laws):
-    structure = ftlm.flexible_link(laws=laws, coupling="measured")
+    structure = ftlm.flexible_link(form="published", laws=laws, coupling="measured")
     options = {"method": "least-squares", "lattice": ftlm.Lattice(step=0.3, alpha=(1.8, 2.0)), "m": 64, "keep": 5}
     with ThreadPoolExecutor(2) as pool:
         found = ftlm.identify(stage_run, structure, executor=pool, **options)

@@ -28,14 +28,14 @@ def orders_of(structure):
 def test_plants_follow_from_their_free_orders_and_coefficients(plants, name):
     described = plants[name]
     stage = described["stage"]
-    law = ftlm.order_law(stage)
+    law = ftlm.order_law(stage, form="published")
     found = {key: order.at(described["free_orders"]) for key, order in law.items()}
     for key, value in {**described["free_orders"], **described["derived_orders"], "input": 0.0}.items():
         assert found[key] == value, key
     derived = ftlm.order_law(stage, "derived")["input"]
     assert derived.at(described["free_orders"]) == described["derived_input_order"]
 
-    structure = ftlm.flexible_link(stage=stage)
+    structure = ftlm.flexible_link(form="published", stage=stage)
     at = structure.with_orders(described["free_orders"])
     for item, expected in zip(at.equations, described["equations"], strict=True):
         assert item.output == expected["output"]
@@ -80,7 +80,7 @@ def test_inertia_ratio_and_coefficients_of_parameters():
 def test_published_structure(stage):
     h, d = 2 * stage - 1, 2 * stage
     hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
-    structure = ftlm.flexible_link(stage=stage)
+    structure = ftlm.flexible_link(form="published", stage=stage)
     assert structure.coupling == "simulated"
     assert structure.has_order_law
     assert set(structure.order_names) == set(FREE[stage])
@@ -97,7 +97,7 @@ def test_published_structure(stage):
 @pytest.mark.parametrize("stage", [1, 2])
 def test_derived_structure_fixes_alpha_of_the_deflection(stage):
     h, d = 2 * stage - 1, 2 * stage
-    structure = ftlm.flexible_link(stage=stage, input_order="derived")
+    structure = ftlm.flexible_link(form="published", stage=stage, input_order="derived")
     assert set(structure.order_names) == set(FREE[stage]) - {f"alpha{d}"}
     assert structure.equations[1].order == ftlm.Order(2.0)
     current = structure.equations[1].terms[3]
@@ -105,7 +105,7 @@ def test_derived_structure_fixes_alpha_of_the_deflection(stage):
 
 
 def test_without_laws_every_order_is_its_own():
-    structure = ftlm.flexible_link(laws=())
+    structure = ftlm.flexible_link(form="published", laws=())
     assert not structure.has_order_law
     assert structure.coefficient_law == ()
     assert orders_of(structure) == {
@@ -121,17 +121,17 @@ def test_without_laws_every_order_is_its_own():
 
 
 def test_laws_are_chosen_one_by_one():
-    orders_only = ftlm.flexible_link(laws=("orders",))
+    orders_only = ftlm.flexible_link(form="published", laws=("orders",))
     assert orders_only.has_order_law
     assert orders_only.coefficient_law == ()
-    coefficients_only = ftlm.flexible_link(laws=("coefficients",))
+    coefficients_only = ftlm.flexible_link(form="published", laws=("coefficients",))
     assert not coefficients_only.has_order_law
     assert len(coefficients_only.coefficient_law) == 4
 
 
 @pytest.mark.parametrize("laws", [("orders",), ()])
 def test_one_equation_alone_has_its_own_orders(laws):
-    structure = ftlm.flexible_link(laws=laws)
+    structure = ftlm.flexible_link(form="published", laws=laws)
     hub, deflection = structure.equation("theta11"), structure.equation("theta12")
     assert hub.order_names == ("alpha1", "beta1", "gamma1", "mu1")
     assert deflection.order_names == ("alpha2", "beta2", "gamma2", "mu2")
@@ -146,18 +146,18 @@ def test_one_equation_alone_has_its_own_orders(laws):
 
 
 def test_one_derived_equation_alone_takes_the_current_as_it_is():
-    single = ftlm.flexible_link(input_order="derived").equation("theta12")
+    single = ftlm.flexible_link(form="published", input_order="derived").equation("theta12")
     assert single.order_names == ("beta2", "gamma2", "mu2")
     assert single.equations[0].terms[3].order == ftlm.Order()
 
 
 def test_cross_stage_terms():
-    structure = ftlm.flexible_link(stage=1, coupling="measured", cross_stage=True)
+    structure = ftlm.flexible_link(form="published", stage=1, coupling="measured", cross_stage=True)
     assert structure.signals == ("theta11", "theta12", "I1", "theta21", "theta22", "I2")
     for item, n in zip(structure.equations, (1, 2), strict=True):
         extra = [(t.signal, t.coefficient, t.order.constant) for t in item.terms[4:]]
         assert extra == [("theta21", f"p{n}", 0.0), ("theta22", f"q{n}", 0.0), ("I2", f"s{n}", 0.0)]
-    assert ftlm.flexible_link(stage=2, coupling="measured", cross_stage=True).signals[3:] == (
+    assert ftlm.flexible_link(form="published", stage=2, coupling="measured", cross_stage=True).signals[3:] == (
         "theta11",
         "theta12",
         "I1",
@@ -165,40 +165,40 @@ def test_cross_stage_terms():
 
 
 def test_friction_terms():
-    structure = ftlm.flexible_link(stage=2, coupling="measured", friction=True)
+    structure = ftlm.flexible_link(form="published", stage=2, coupling="measured", friction=True)
     assert [e.terms[-1] for e in structure.equations] == [
         ftlm.Term("coulomb_theta21", ftlm.Order(), "c3"),
         ftlm.Term("coulomb_theta21", ftlm.Order(), "c4"),
     ]
     with pytest.raises(ftlm.ModelError, match="friction=True makes the coupled free run non-linear"):
-        ftlm.flexible_link(friction=True)
+        ftlm.flexible_link(form="published", friction=True)
 
 
 def test_both_stages():
-    structure = ftlm.flexible_link(stage="both")
+    structure = ftlm.flexible_link(form="published", stage="both")
     assert structure.outputs == ("theta11", "theta12", "theta21", "theta22")
     assert set(structure.order_names) == {*FREE[1], *FREE[2]}
     assert len(structure.coefficient_law) == 8
     assert len(structure.reference) == 16
     assert structure.name == "flexible link, both stages"
-    first, second = ftlm.flexible_link(stage=1), ftlm.flexible_link(stage=2)
+    first, second = ftlm.flexible_link(form="published", stage=1), ftlm.flexible_link(form="published", stage=2)
     assert structure.equations == first.equations + second.equations
-    coupled = ftlm.flexible_link(stage="both", cross_stage=True)
+    coupled = ftlm.flexible_link(form="published", stage="both", cross_stage=True)
     assert {t.signal for t in coupled.equations[0].terms} >= {"theta21", "theta22", "I2"}
-    derived = ftlm.flexible_link(stage="both", input_order="derived")
+    derived = ftlm.flexible_link(form="published", stage="both", input_order="derived")
     assert {e.order.constant for e in (derived.equations[1], derived.equations[3])} == {2.0}
 
 
 @pytest.mark.parametrize(("stage", "outputs"), [(1, ("theta12",)), (2, ("theta22",)), ("both", ("theta12", "theta22"))])
 def test_stock_sensor_filter(stage, outputs):
-    sensor = ftlm.flexible_link(stage=stage, sensor_filter="stock").sensor_filter
+    sensor = ftlm.flexible_link(form="published", stage=stage, sensor_filter="stock").sensor_filter
     assert sensor == ftlm.SensorFilter.low_pass(outputs)
     own = ftlm.SensorFilter.low_pass(["theta12"], frequency=5.0, damping=0.7)
-    assert ftlm.flexible_link(sensor_filter=own).sensor_filter is own
+    assert ftlm.flexible_link(form="published", sensor_filter=own).sensor_filter is own
 
 
 def test_sensor_filter_follows_its_output_into_one_equation():
-    structure = ftlm.flexible_link(stage="both", sensor_filter="stock")
+    structure = ftlm.flexible_link(form="published", stage="both", sensor_filter="stock")
     assert structure.equation("theta11").sensor_filter.outputs == ("theta12",)
     assert structure.equation("theta22").sensor_filter.outputs == ("theta22",)
     uncoupled = ftlm.equation("D y = a y; D z = b z", sensor_filter=ftlm.SensorFilter.low_pass(["z"]))
@@ -221,7 +221,7 @@ def test_sensor_filter_follows_its_output_into_one_equation():
 )
 def test_options_that_are_not_known_are_refused(options, message):
     with pytest.raises(ftlm.ModelError) as refused:
-        ftlm.flexible_link(**options)
+        ftlm.flexible_link(form="published", **options)
     assert message in str(refused.value)
     with pytest.raises(ftlm.ModelError, match="stage = 3 is not known"):
         ftlm.order_law(3)
@@ -265,7 +265,7 @@ def test_both_stages_simulate_as_each_alone(plant, drive):
     first, second = plant("A"), plant("A2")
     runs = drive("A", samples=301), drive("A2", samples=301)
     both = ftlm.Model(
-        ftlm.flexible_link(stage="both")
+        ftlm.flexible_link(form="published", stage="both")
         .with_orders(first.orders | second.orders)
         .with_coefficients(first.coefficients | second.coefficients)
     )
@@ -300,15 +300,15 @@ def arm_in_motion(rows, noise=0.0):
 
 
 def test_stages_that_share_no_order_are_parts_of_their_own():
-    both = ftlm.flexible_link(stage="both").with_delays({"I2": 0.01})
+    both = ftlm.flexible_link(form="published", stage="both").with_delays({"I2": 0.01})
     parts = both.parts()
     assert list(parts) == ["theta11, theta12", "theta21, theta22"]
     for stage, part in zip((1, 2), parts.values(), strict=True):
-        assert part.equations == ftlm.flexible_link(stage=stage).equations
-        assert part.order_names == ftlm.flexible_link(stage=stage).order_names
+        assert part.equations == ftlm.flexible_link(form="published", stage=stage).equations
+        assert part.order_names == ftlm.flexible_link(form="published", stage=stage).order_names
     assert [p.delay for p in parts.values()] == [{}, {"I2": 0.01}]
-    assert list(ftlm.flexible_link(stage=1).parts()) == ["stage"]
-    assert list(ftlm.flexible_link(stage=1, laws=()).parts()) == ["theta11", "theta12"]
+    assert list(ftlm.flexible_link(form="published", stage=1).parts()) == ["stage"]
+    assert list(ftlm.flexible_link(form="published", stage=1, laws=()).parts()) == ["theta11", "theta12"]
     assert list(ftlm.equation("D^2 y = a D y + b u").parts()) == []
     # One equation may carry a law by itself, and equations may share an order without one.
     assert list(ftlm.equation("D^alpha y = a D^(alpha-nu) y + b D^nu u").parts()) == ["stage"]
@@ -322,11 +322,15 @@ def test_the_whole_arm_is_searched_stage_by_stage():
         alpha=(1.9, 2.0), **{f"gamma{h}": (0.9, 1.0) for h in (1, 3)},
         **{f"{n}{d}": v for d in (2, 4) for n, v in (("beta", (0.1, 0.2)), ("mu", (0.8, 0.9)))},
     )  # fmt: skip
-    whole = ftlm.identify(run, ftlm.flexible_link(stage="both"), method="least-squares", lattice=coarse)
+    whole = ftlm.identify(
+        run, ftlm.flexible_link(form="published", stage="both"), method="least-squares", lattice=coarse
+    )
     for stage in (1, 2):
         kept = ("alpha", f"gamma{2 * stage - 1}", f"beta{2 * stage}", f"mu{2 * stage}")
         own = replace(coarse, orders={n: v for n, v in coarse.orders.items() if n in kept})
-        alone = ftlm.identify(run, ftlm.flexible_link(stage=stage), method="least-squares", lattice=own)
+        alone = ftlm.identify(
+            run, ftlm.flexible_link(form="published", stage=stage), method="least-squares", lattice=own
+        )
         assert alone.orders.items() <= whole.orders.items()
         assert alone.coefficients.items() <= whole.coefficients.items()
 
@@ -335,7 +339,9 @@ def test_the_whole_arm_is_searched_stage_by_stage():
 def test_the_whole_arm_is_one_joint_fit():
     from ftlm.paper.arm import demo_plant
 
-    found = ftlm.identify(arm_in_motion(5000, 0.01), replace(ftlm.flexible_link(stage="both"), initial="rest"))
+    found = ftlm.identify(
+        arm_in_motion(5000, 0.01), replace(ftlm.flexible_link(form="published", stage="both"), initial="rest")
+    )
     assert len(found.joint.names) == 20
     for stage in (1, 2):
         for name, value in demo_plant(stage).orders.items():
@@ -344,7 +350,7 @@ def test_the_whole_arm_is_one_joint_fit():
 
 
 def test_hints_are_kept_by_what_changes_a_structure_and_stand_in_no_file_text_or_comparison(clean_a):
-    structure = ftlm.flexible_link(stage=1, coupling="measured")
+    structure = ftlm.flexible_link(form="published", stage=1, coupling="measured")
     fixed = structure.with_orders({"alpha1": 2.0}).with_coefficients({"a1": 600.0})
     assert fixed.hints.freed["a1"] == "beta1"
     assert replace(structure, hints=UNSET) == structure

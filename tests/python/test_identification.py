@@ -187,7 +187,7 @@ def test_search_settings_are_handed_on(small_run, criterion, norm):
 
 
 def test_equations_without_a_law_are_searched_one_by_one(clean_a):
-    structure = ftlm.flexible_link(laws=(), coupling="measured")
+    structure = ftlm.flexible_link(form="published", laws=(), coupling="measured")
     lattice = ftlm.Lattice(
         orders={
             "alpha1": [1.95, 2.0], "beta1": [0.75], "gamma1": [0.9, 0.95], "mu1": [0.0],
@@ -224,7 +224,7 @@ def test_law_search_recovers_the_five_free_orders_of_plant_a(clean_a, plants):
             "mu2": (0.75, 0.95),
         },
     )
-    found = ftlm.identify(clean_a, ftlm.flexible_link(), method="least-squares", lattice=lattice)
+    found = ftlm.identify(clean_a, ftlm.flexible_link(form="published"), method="least-squares", lattice=lattice)
     assert found.orders == plants["A"]["free_orders"]
     assert list(found.searches) == ["stage"]
     assert found.searches["stage"].candidates > 300
@@ -265,7 +265,7 @@ def test_printed_figures_are_those_of_compare(small_run, second, with_noise, met
 
 
 def test_results_print_and_are_json(clean_a, plants):
-    structure = ftlm.flexible_link().with_orders(plants["A"]["free_orders"])
+    structure = ftlm.flexible_link(form="published").with_orders(plants["A"]["free_orders"])
     found = ftlm.identify(clean_a, structure, method="multi-innovation", prior_covariance=100.0, m=256)
     text = str(found)
     assert text.startswith(
@@ -303,7 +303,7 @@ def test_a_prior_that_pulls_is_named(small_run, structure):
 
 def test_the_papers_prior_on_plant_a_is_named(clean_a, plants):
     # K0 = 1 in SI units: a1 = 1.25 for 629. The paper's columns show the same pull.
-    structure = ftlm.flexible_link().with_orders(plants["A"]["free_orders"])
+    structure = ftlm.flexible_link(form="published").with_orders(plants["A"]["free_orders"])
     found = ftlm.identify(clean_a, structure, method="multi-innovation")
     assert found.settings["m"] == 2048
     assert found.coefficients["a1"] == pytest.approx(1.25, abs=0.01)
@@ -313,7 +313,7 @@ def test_the_papers_prior_on_plant_a_is_named(clean_a, plants):
 
 
 def test_a_broken_coefficient_law_is_named(clean_a, with_noise, plants):
-    structure = ftlm.flexible_link().with_orders(plants["A"]["free_orders"])
+    structure = ftlm.flexible_link(form="published").with_orders(plants["A"]["free_orders"])
     found = ftlm.identify(with_noise(clean_a, 3e-3, 1), structure, method="least-squares")
     broken = [w for w in found.warnings if w.startswith("coefficient law: ")]
     assert any(w.startswith("coefficient law: b2 = ") and "but the other equation gives" in w for w in broken)
@@ -323,7 +323,7 @@ def test_a_broken_coefficient_law_is_named(clean_a, with_noise, plants):
 
 
 def test_near_identities_are_named(clean_a, with_noise):
-    structure = ftlm.flexible_link().equation("theta12")
+    structure = ftlm.flexible_link(form="published").equation("theta12")
     found = ftlm.identify(
         with_noise(clean_a, 1e-4, 1), structure, method="least-squares", criterion="equation-error", norm="l2",
         lattice=ftlm.lattice(alpha=(2.0, 2.0), gamma2=0.65), m=1024,

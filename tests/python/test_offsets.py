@@ -211,7 +211,7 @@ def test_words_say_an_offset_and_are_printed_back():
     # As ever: another name alone is a signal, and so is c with a number.
     assert ftlm.equation("D y = -a y + u").signals == ("y", "u")
     assert ftlm.equation("D y = -a y + 1 c").signals == ("y", "c")
-    assert ftlm.flexible_link(stage=1, offset="constant").offset == "constant"
+    assert ftlm.flexible_link(form="published", stage=1, offset="constant").offset == "constant"
     assert ftlm.equation("D x = a x + b u + c; D y = d y + e u + c", offset="ramp").offset == "ramp"
 
 

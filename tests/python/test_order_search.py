@@ -227,12 +227,12 @@ def stage_search(drive, plant, with_noise, **options):
     made = plant("A").simulate(drive("A", samples=601), tolerance=1e-5)
     noisy = with_noise(made, 1e-5, 3)
     settings = {"coefficients": "least-squares", "m": M, "keep": 12} | options
-    return ftlm.search_orders(noisy, ftlm.flexible_link(), ftlm.Lattice(orders=STAGE), **settings)
+    return ftlm.search_orders(noisy, ftlm.flexible_link(form="published"), ftlm.Lattice(orders=STAGE), **settings)
 
 
 def makes_equations(orders):
     """Whether the law keeps own orders in [0, alpha), the other angle's in [0, alpha], and those of a signal apart."""
-    law = {name: order.at(orders) for name, order in ftlm.order_law(1).items()}
+    law = {name: order.at(orders) for name, order in ftlm.order_law(1, form="published").items()}
     hub = 0 <= law["gamma1"] < law["alpha1"] and all(0 <= law[n] <= law["alpha1"] for n in ("beta1", "mu1"))
     deflection = all(0 <= law[n] < law["alpha2"] for n in ("beta2", "mu2")) and 0 <= law["gamma2"] <= law["alpha2"]
     return hub and deflection and law["beta1"] != law["mu1"] and law["beta2"] != law["mu2"]
@@ -240,7 +240,7 @@ def makes_equations(orders):
 
 def stage_scores(run, orders, criterion, norm):
     """Score of a tuple of free orders by dense matrices, and its coefficients."""
-    structure = ftlm.flexible_link().with_orders(orders)
+    structure = ftlm.flexible_link(form="published").with_orders(orders)
     names = ("theta11", "theta12", "I1")
     means = {n: oracles.pulse_means(run[n], M, "zoh" if n == "I1" else "foh") for n in names}
     total = 0.0
@@ -451,7 +451,7 @@ def test_orders_on_the_edge_of_their_interval_are_named(run):
 def test_alpha_of_two_is_no_edge(clean_a):
     found = ftlm.search_orders(
         clean_a,
-        ftlm.flexible_link().equation("theta12"),
+        ftlm.flexible_link(form="published").equation("theta12"),
         ftlm.lattice(step=0.1, alpha=(1.5, 2.0), gamma2=1.05, mu2=[0.1, 0.85], beta2=[0.1, 0.85]),
         m=512,
         coefficients="least-squares",
@@ -569,8 +569,8 @@ def test_an_error_in_progress_ends_a_long_search(clean_a):
 
 def long_search(run, **options):
     return ftlm.search_orders(
-        run, ftlm.flexible_link().equation("theta12"), ftlm.lattice(alpha=(1.05, 2.0)), early_stopping=False,
-        coefficients="least-squares", **options,
+        run, ftlm.flexible_link(form="published").equation("theta12"), ftlm.lattice(alpha=(1.05, 2.0)),
+        early_stopping=False, coefficients="least-squares", **options,
     )  # fmt: skip
 
 

@@ -62,7 +62,7 @@ def residuals_at(problem: FreeProblem, prepared: list, initial: object, orders: 
 def test_the_analytic_jacobian_is_that_of_finite_differences(coupling: str, initial: tuple) -> None:
     run = arm_run(1, 301, 1e-3, 0)
     words = "caputo" if initial[0] else "rest"
-    problem = FreeProblem.of(replace(ftlm.flexible_link(stage=1, coupling=coupling), initial=words))
+    problem = FreeProblem.of(replace(ftlm.flexible_link(form="published", stage=1, coupling=coupling), initial=words))
     prepared = [experiment(run, problem, [1.0, 10.0], every=2)]
     # Away from whole differences of orders, where initial terms merge.
     named = {"alpha1": 1.93, "alpha2": 1.91, "gamma1": 0.9, "beta2": 0.13, "mu2": 0.8}
@@ -127,7 +127,7 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
 @pytest.mark.parametrize(("stage", "noise"), [(1, 1e-2), (1, 1e-4), (2, 1e-2)])
 def test_the_arm_is_recovered_from_an_automatic_start_under_both_laws(stage: int, noise: float) -> None:
     run = arm_run(stage, 3001, noise, 3)
-    found = ftlm.identify(run, ftlm.flexible_link(stage=stage), method="output-error")
+    found = ftlm.identify(run, ftlm.flexible_link(form="published", stage=stage), method="output-error")
     truth = {n: v for n, v in demo_plant(stage).orders.items()} | demo_plant(stage).coefficients
     assert found.joint is not None
     for name, value in {**found.orders, **found.joint.coefficients}.items():
@@ -232,6 +232,6 @@ def test_only_one_equation_of_whole_orders_starts_from_a_lower_one(small_run):
     for words in ("D^alpha y = a1 D y + a0 y + b0 u", "D^2 y = b0 u"):
         assert lower_orders(FreeProblem.of(ftlm.equation(words)), [small_run]) == []
     # Of two equations each measures the other, but both are fitted at once.
-    pair = ftlm.flexible_link(stage=1, laws=(), coupling="measured")
+    pair = ftlm.flexible_link(form="published", stage=1, laws=(), coupling="measured")
     whole = pair.with_orders({n: 2.0 if n.startswith("alpha") else 0.5 for n in pair.order_names})
     assert lower_orders(FreeProblem.of(whole), [small_run]) == []

@@ -47,7 +47,7 @@ def sine():
 def identified(square):
     lattice = ftlm.lattice(0.05, alpha1=2.0, alpha2=2.0, gamma1=(0.9, 1.0), beta2=(0.05, 0.15), mu2=(0.8, 0.9))
     # Initial terms although the run starts at rest, so that the page has them to show.
-    structure = replace(ftlm.flexible_link(stage=1), initial="caputo")
+    structure = replace(ftlm.flexible_link(form="published", stage=1), initial="caputo")
     return ftlm.identify(square, structure, method="least-squares", lattice=lattice)
 
 
@@ -301,7 +301,7 @@ def test_results_are_rich_in_a_notebook(identified, square):
         "search": identified.searches["stage"]._repr_html_(),
         "advice": square.advice()._repr_html_(),
         "run": square._repr_html_(),
-        "structure": ftlm.flexible_link()._repr_html_(),
+        "structure": ftlm.flexible_link(form="published")._repr_html_(),
     }
     for name, text in shown.items():
         parsed = Page(text)
@@ -468,7 +468,7 @@ def test_settings_name_what_the_result_depends_on(identified, square):
     text = str(report.settings_table(identified).to_html())
     assert str(identified.settings["m"]) in text
     assert "least-squares" in text
-    at = ftlm.flexible_link().with_orders(identified.orders)
+    at = ftlm.flexible_link(form="published").with_orders(identified.orders)
     paper = ftlm.identify(square, at, method="multi-innovation", prior_covariance=100.0)
     rows = {str(row[0]): row[1] for row in report.settings_table(paper).rows}
     assert rows["innovation length, p"] == 7
@@ -630,7 +630,7 @@ def test_charts_refuse_what_does_not_fit():
 
 def test_convergence_and_error_charts(square, identified):
     equation = identified.model.structure.equation("theta12")
-    free = ftlm.flexible_link(laws=()).equation("theta12")
+    free = ftlm.flexible_link(form="published", laws=()).equation("theta12")
     orders = dict(zip(("alpha2", "beta2", "gamma2", "mu2"), (2.0, 0.1, 1.05, 0.85), strict=True))
     assert equation.outputs == free.outputs
     traces = [

@@ -53,7 +53,7 @@ def test_printed_numbers_are_those_of_the_other_transcription():
 @pytest.mark.parametrize("stage", [1, 2])
 def test_printed_orders_obey_the_order_law(stage):
     h, d = 2 * stage - 1, 2 * stage
-    law = ftlm.order_law(stage)
+    law = ftlm.order_law(stage, form="published")
     for rows in (lambda a: printed.FRACTIONAL[a][7], printed.GENETIC.__getitem__):
         orders = {f"{n}{h}": v for n, v in rows(f"theta{stage}1").orders.items()}
         orders |= {f"{n}{d}": v for n, v in rows(f"theta{stage}2").orders.items()}
@@ -70,7 +70,7 @@ def test_printed_orders_obey_the_order_law(stage):
 def test_tables_4_and_5_follow_from_the_saved_run(saved, table, stage):
     written = json.loads((saved / "tables.json").read_text())["stages"][str(stage)]["models"]
     run = ftlm.load(saved / "square.csv").select([f"I{stage}", f"theta{stage}1", f"theta{stage}2"])
-    structure = ftlm.flexible_link(stage=stage, coupling="measured", laws=())
+    structure = ftlm.flexible_link(form="published", stage=stage, coupling="measured", laws=())
     for p in printed.INNOVATION_LENGTHS:
         found = ftlm.identify(
             run, structure, method="multi-innovation", innovation_length=p, lattice=ftlm.Lattice(step=0.25), keep=1
@@ -105,7 +105,7 @@ def test_every_model_s_errors_follow_from_its_file_and_the_saved_runs(saved):
 def test_table_7_follows_from_the_saved_run(saved):
     written = json.loads((saved / "tables.json").read_text())["stages"]["1"]["genetic"]["theta12"]
     run = ftlm.load(saved / "square.csv").select(["I1", "theta11", "theta12"])
-    single = ftlm.flexible_link(stage=1, coupling="measured", laws=()).equation("theta12")
+    single = ftlm.flexible_link(form="published", stage=1, coupling="measured", laws=()).equation("theta12")
     found = ftlm.identify(
         run, single, method="genetic", genetic=ftlm.Genetic(seeds=(0, 1), evaluations=800),
         lattice=ftlm.Lattice(step=0.25, alpha=(1.95, 2.0)),

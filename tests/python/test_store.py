@@ -361,6 +361,7 @@ def test_zeros_behind_the_last_frame_are_a_torn_tail(run, whole, expected, tmp_p
 # A stage under its order law
 
 
+PUBLISHED = ftlm.flexible_link(form="published")
 STAGE = {
     "alpha1": [1.9, 1.95, 2.0],
     "alpha2": [1.9, 2.0],
@@ -378,7 +379,7 @@ def stage_run(plant, drive, with_noise):
 def search_stage(run, path=None, *, structure=None, lattice=None, **options):
     options = {"m": 64, "keep": 8, **options}
     lattice = lattice or ftlm.Lattice(orders=STAGE)
-    return ftlm.search_orders(run, structure or ftlm.flexible_link(), lattice, store=path, **options)
+    return ftlm.search_orders(run, structure or ftlm.flexible_link(form="published"), lattice, store=path, **options)
 
 
 @pytest.fixture
@@ -407,7 +408,10 @@ def stage_store(stage_run, small_pieces, tmp_path):
         {"early_stopping": False, "threads": 3},
         {"criterion": "equation-error", "norm": "l2", "rows": "time", "keep": 30},
         {"coefficients": "instrumental-variables", "norm": "l2", "threads": 1},
-        {"structure": ftlm.flexible_link(laws=("orders",), coupling="measured"), "coefficients": "least-squares"},
+        {
+            "structure": ftlm.flexible_link(form="published", laws=("orders",), coupling="measured"),
+            "coefficients": "least-squares",
+        },
         # More candidates than the first pass follows at a time, so that some are left early and followed further.
         {"lattice": ftlm.Lattice(step=0.1, orders={"alpha": (1.8, 2.0)}), "coefficients": "least-squares"},
     ],
@@ -541,7 +545,7 @@ def test_a_stage_that_is_interrupted_goes_on(stage_run, stage_expected, small_pi
     [
         (lambda run, path: search_stage(run, path, m=32), "asked is other data"),
         (lambda run, path: search_stage(run, path, keep=9), "asked is other settings: keep = 9"),
-        (lambda run, path: search_stage(run, path, structure=ftlm.flexible_link().with_coefficients({"g1": 40.0})),
+        (lambda run, path: search_stage(run, path, structure=PUBLISHED.with_coefficients({"g1": 40.0})),
          "asked is another equation"),
         (lambda run, path: search_stage(run, path, lattice=ftlm.Lattice(orders=STAGE | {"alpha2": 2.0})),
          "asked is another lattice"),
@@ -557,7 +561,7 @@ def test_the_search_of_another_stage_is_refused(stage_run, stage_store, tmp_path
 
 def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_pieces, tmp_path):
     """What a forger would write: whole frames, under digests that are right."""
-    job = job_of(stage_run, ftlm.flexible_link(), ftlm.Lattice(orders=STAGE), m=64, keep=8)
+    job = job_of(stage_run, ftlm.flexible_link(form="published"), ftlm.Lattice(orders=STAGE), m=64, keep=8)
     work = job.stage_work()
     wave = sum(last - first for _, first, last, _ in work.ready(keeps_course=True).wanted())
     for number, (first, last, kind, message) in enumerate(
@@ -591,7 +595,10 @@ def test_verdicts_that_do_not_fit_their_search_are_refused(stage_run, small_piec
 
 @pytest.mark.parametrize(
     ("structure", "names"),
-    [(ftlm.flexible_link(), ["stage"]), (ftlm.flexible_link(laws=(), coupling="measured"), ["theta11", "theta12"])],
+    [
+        (ftlm.flexible_link(form="published"), ["stage"]),
+        (ftlm.flexible_link(form="published", laws=(), coupling="measured"), ["theta11", "theta12"]),
+    ],
 )
 def test_an_identification_keeps_its_searches(stage_run, small_pieces, tmp_path, structure, names):
     path = tmp_path / "s.ftlm"
@@ -619,14 +626,18 @@ def test_a_store_where_nothing_is_searched_is_refused(stage_run, tmp_path):
     path = tmp_path / "s.ftlm"
     known = ftlm.equation("D^1.6 theta11 = a D^0.6 theta11 + b I1")
     for structure, method, why in (
-        (ftlm.flexible_link(), "output-error", "store= is not used by method='output-error'; leave it out"),
-        (ftlm.flexible_link(), "genetic", "store= is not used by method='genetic'; leave it out"),
+        (
+            ftlm.flexible_link(form="published"),
+            "output-error",
+            "store= is not used by method='output-error'; leave it out",
+        ),
+        (ftlm.flexible_link(form="published"), "genetic", "store= is not used by method='genetic'; leave it out"),
         (known, "least-squares", "store= is not used: it is for order searches, and every order here is a number"),
     ):
         with pytest.raises(ModelError, match=why):
             ftlm.identify(stage_run, structure, method=method, store=path)
     with pytest.raises(ModelError, match="a store keeps one identification"):
-        ftlm.identify_many([stage_run], ftlm.flexible_link(), method="least-squares", store=path)
+        ftlm.identify_many([stage_run], ftlm.flexible_link(form="published"), method="least-squares", store=path)
     assert not path.exists()
 
 

@@ -17,7 +17,7 @@ def run():
 
 @pytest.fixture(scope="module")
 def stage():
-    return ftlm.flexible_link(stage=1, laws=("orders",), coupling="measured").with_orders(ORDERS)
+    return ftlm.flexible_link(form="published", stage=1, laws=("orders",), coupling="measured").with_orders(ORDERS)
 
 
 def samples(stream, run):
@@ -104,7 +104,7 @@ def test_an_estimate_that_fails_does_not_stop_the_run(stage):
 @pytest.mark.parametrize(
     ("structure", "options", "words"),
     [
-        (ftlm.flexible_link(stage=1), {}, "are free; a stream needs numbers"),
+        (ftlm.flexible_link(form="published", stage=1), {}, "are free; a stream needs numbers"),
         (ftlm.equation("D^1.5 y = b u", initial="caputo"), {}, "cannot be followed in a stream"),
         (ftlm.equation("D^2.5 y = b u"), {}, "outside [0, 2]"),
         (ftlm.equation("D^1.5 y = b u"), {"innovation_length": 0}, "innovation length"),

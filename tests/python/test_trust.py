@@ -31,7 +31,7 @@ def test_a_model_that_can_be_trusted_warns_of_nothing(noisy, small_model):
 
 def test_near_identity_orders_say_so(clean_a, with_noise):
     run = with_noise(clean_a, 1e-4, 1)
-    structure = ftlm.flexible_link(stage=1, coupling="measured", laws=()).equation("theta12")
+    structure = ftlm.flexible_link(form="published", stage=1, coupling="measured", laws=()).equation("theta12")
     orders = {"alpha2": 2.0, "beta2": 1.95, "mu2": 1.9, "gamma2": 1.05}
     found = ftlm.identify(run, structure.with_orders(orders), method="least-squares")
     (warning,) = said(found, "nearly says that theta12 equals itself")

@@ -9,7 +9,7 @@ use ftlm::estimate::streaming::Streaming;
 use ftlm::kernels::digamma;
 use ftlm::means::{delayed, pulse_means, Intersample};
 use ftlm::memory::{integral_by_memory, Rates};
-use ftlm::rig::arm::{Arm, Parameters, Stage};
+use ftlm::rig::arm::{Arm, Form, Parameters, Stage};
 use ftlm::rig::virtual_arm::{Injection, Pace, Plant, Sensors};
 use ftlm::simulate::{self, OutputFilter};
 use ftlm::small::{self, Recursion};
@@ -151,7 +151,9 @@ fn arm(step: f64, substep: f64, horizon: f64) -> Result<Arm, Error> {
         deflection: [-84.0, 6.0, -2.1, -14.0],
         coulomb: 0.05,
     };
-    Arm::new(&Parameters { stages: [stage.clone(), stage], coupling: 1.0, inertia_ratio: 0.02 }, step, substep, horizon)
+    let form = Form::Published;
+    let parameters = Parameters { stages: [stage.clone(), stage], coupling: 1.0, inertia_ratio: 0.02, form };
+    Arm::new(&parameters, step, substep, horizon)
 }
 
 fn sensors() -> Sensors {

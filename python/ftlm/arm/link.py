@@ -1,14 +1,16 @@
 """The paper's physics: the flexible two-link arm, its order law, its coefficient law and its parameter sets.
 
-Stage j has the hub angle theta_j1, the deflection theta_j2 and the motor current I_j. Eliminating the highest
-derivatives from the fractional Euler-Lagrange equations (14)-(15) leaves (17) and (19), which (22)-(25) abbreviate.
-The orders and the coefficients that appear in them are not free: both follow from the physical ones.
+Stage j has the hub angle theta_j1, the deflection theta_j2 and the motor current I_j. The fractional Euler-Lagrange
+equations (14)-(15) are the physics: the link hangs on the hub's motion alone. Eliminating the highest derivatives
+leaves (17) and (19), which (22)-(25) abbreviate; on the way to (19) a derivative of the current is dropped, and with
+fractional orders the link that is left bends the wrong way. The orders and the coefficients that appear are not free:
+both follow from the physical ones.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from ftlm.arm.parameters import INTEGER_ORDERS, PARAMETERS, LinkParameters
 from ftlm.base.errors import ModelError
@@ -25,15 +27,39 @@ HIGHEST = (1.2, 2.0)
 NATURAL = {"alpha": (2.0,), "gamma": (0.9, 1.0), "beta": (0.0, 0.15), "mu": (0.8, 1.0)}
 #: Orders by the letter of the coefficient whose term they differentiate, as in (22)-(25).
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
-#: What no order law changes: where the orders of either stage lie, and what they are called.
-HINTS = Hints(
-    HIGHEST,
-    {f"{order}{n}": values for order, values in NATURAL.items() for n in range(1, 5)},
-    {f"{letter}{n}": f"{order}{n}" for letter, order in ORDER_OF.items() for n in range(1, 5)},
-)
+Form: TypeAlias = Literal["lagrange", "published"]
+InputOrder: TypeAlias = Literal["published", "derived"]
 
 
-def order_law(stage: int, input_order: Literal["published", "derived"] = "published") -> dict[str, Order]:
+def _hints(form: Form) -> Hints:
+    """What no order law changes: where the orders of either stage lie, what they are called, and what ratios exceed."""
+    return Hints(
+        HIGHEST,
+        {f"{order}{n}": values for order, values in NATURAL.items() for n in range(1, 5)},
+        {f"{letter}{n}": f"{order}{n}" for letter, order in ORDER_OF.items() for n in range(1, 5)},
+        {"j1": 0.0, "j2": 0.0} if form == "lagrange" else {"r1": 1.0, "r2": 1.0},
+        ("a1", "d1", "a3", "d3") if form == "lagrange" else (),
+    )
+
+
+def _form(form: Form | None, input_order: InputOrder | None) -> tuple[Form, InputOrder]:
+    """The form that is asked for: naming an order of the current names the form that has one."""
+    if form is None:
+        form = "lagrange" if input_order is None else "published"
+    if form not in ("lagrange", "published"):
+        raise ModelError(f"form = {form!r} is not known; use 'lagrange' or 'published'")
+    if form == "lagrange" and input_order is not None:
+        raise ModelError(
+            f"input_order = {input_order!r} is not used by form='lagrange', whose deflection does not see the current; "
+            "leave it out, or use form='published'"
+        )
+    input_order = input_order or "published"
+    if input_order not in ("published", "derived"):
+        raise ModelError(f"input_order = {input_order!r} is not known; use 'published' or 'derived'")
+    return form, input_order
+
+
+def order_law(stage: int, input_order: InputOrder | None = None, *, form: Form | None = None) -> dict[str, Order]:
     """Every order of a stage's two equations as a function of the five free ones.
 
     Parameters
@@ -41,24 +67,28 @@ def order_law(stage: int, input_order: Literal["published", "derived"] = "publis
     stage
         1 or 2.
     input_order
-        ``"published"`` or ``"derived"``.
+        ``"published"`` or ``"derived"``, of the published form.
+    form
+        ``"lagrange"`` or ``"published"``, see :func:`flexible_link`; default lagrange, or published where an input
+        order is named.
 
     Returns
     -------
     dict
-        alpha, beta, gamma, mu of the hub (index 2*stage - 1) and of the deflection (2*stage), and ``input``, the order
+        alpha, beta, gamma, mu of the hub (index 2*stage - 1) and of the deflection (2*stage). The hub angle stands in
+        the deflection's equation with gamma_2 = alpha_2 - mu_2 + gamma_1 (15), above alpha_2 where gamma_1 exceeds
+        mu_2; in the published form with 2 gamma_1 - alpha_1 + alpha_2 - mu_2. That form also has ``input``, the order
         of the current in the deflection's equation: 0 as published in (23), alpha_2 - mu_2 + gamma_1 - alpha_1 as
         derived (the published elimination drops it).
 
     Raises
     ------
     ModelError
-        A stage that is neither 1 nor 2, an input order that is not known.
+        A stage that is neither 1 nor 2, a form or an input order that is not known or not of that form.
     """
     if stage not in (1, 2):
         raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")
-    if input_order not in ("published", "derived"):
-        raise ModelError(f"input_order = {input_order!r} is not known; use 'published' or 'derived'")
+    form, input_order = _form(form, input_order)
     h, d = 2 * stage - 1, 2 * stage
     law = {
         f"alpha{h}": f"alpha{h}",
@@ -67,42 +97,61 @@ def order_law(stage: int, input_order: Literal["published", "derived"] = "publis
         f"mu{h}": f"alpha{h} - alpha{d} + 2*mu{d} - gamma{h}",
         f"alpha{d}": f"alpha{d}",
         f"beta{d}": f"beta{d}",
-        f"gamma{d}": f"2*gamma{h} - alpha{h} + alpha{d} - mu{d}",
+        f"gamma{d}": f"alpha{d} - mu{d} + gamma{h}",
         f"mu{d}": f"mu{d}",
-        "input": f"alpha{d} - mu{d} + gamma{h} - alpha{h}" if input_order == "derived" else "0",
     }
+    if form == "published":
+        law[f"gamma{d}"] = f"2*gamma{h} - alpha{h} + alpha{d} - mu{d}"
+        law["input"] = f"alpha{d} - mu{d} + gamma{h} - alpha{h}" if input_order == "derived" else "0"
     return {name: Order.parse(text) for name, text in law.items()}
 
 
 def flexible_link(
     *,
-    stage: Literal[1, 2, "both"] = 1, input_order: Literal["published", "derived"] = "published",
-    coupling: Literal["simulated", "measured"] = "simulated", cross_stage: bool = False, friction: bool = False,
+    stage: Literal[1, 2, "both"] = 1, form: Form | None = None, input_order: InputOrder | None = None,
+    coupling: Literal["simulated", "measured"] | None = None, cross_stage: bool = False, friction: bool = False,
     laws: Sequence[Literal["orders", "coefficients"]] = ("orders", "coefficients"),
     parameters: Literal["effective", "table-3"] = "effective",
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
     offset: Literal["none", "constant", "ramp"] = "none",
 ) -> Structure:  # fmt: skip
-    """Make the paper's structure (22)-(25): two equations a stage.
+    """Make the physics of a flexible link: two equations a stage, of its hub and of its deflection.
 
     Parameters
     ----------
     stage
         1 (theta11, theta12, I1), 2 (theta21, theta22, I2) or both.
+    form
+        ``"lagrange"``, the default: the Euler-Lagrange equations (14)-(15) with (16), nothing eliminated. The
+        deflection hangs on the hub's motion alone, D^alpha_2 theta_12 = a_2 D^beta_2 theta_12 - D^(alpha_2 - mu_2 +
+        gamma_1) theta_11 + d_2 D^mu_2 theta_12 with a_2 = -K_s/J_2 and d_2 = -B_2/J_2: no current, no hub friction and
+        no motor constant in it, and a signal above its own highest order where gamma_1 exceeds mu_2. The hub's equation
+        is (17).
+        ``"published"``: (22)-(25) as printed. There the hub's acceleration is eliminated from the deflection's
+        equation, and with it a derivative of the current is dropped: with fractional orders that link bends the wrong
+        way (its deflection goes with the current where a real one goes against it). It is the paper's, for its tables.
     input_order
-        Order of the current in the deflection's equation, see :func:`order_law`. With ``"derived"`` alpha_2 (alpha_4)
-        is fixed at 2: it is seen only through the link's viscous friction.
+        Of the published form: order of the current in the deflection's equation, see :func:`order_law`. ``"derived"``
+        is the Lagrange form with the hub's acceleration eliminated and nothing dropped: the same free runs, but what
+        bends the link is then the small difference of large terms. Naming it chooses the published form.
     coupling
-        Whether free runs couple the two simulated outputs (from the currents alone) or take the other as measured.
+        ``"measured"``: each equation is driven by the other angle as it was measured, the default of the Lagrange form.
+        ``"simulated"``: both follow from the currents alone, the default of the published one; noise of the hub's angle
+        then drives nothing.
     cross_stage
         Adds the other stage's angles and current to every equation (order 0); with ``stage="both"`` those are
         modelled too.
     friction
-        Adds a Coulomb term c * sign(D theta_j1) to both equations; needs measured coupling.
+        Adds a Coulomb term c * sign(D theta_j1) to the hub's equation, in the published form to both; needs measured
+        coupling.
     laws
         ``"orders"``: orders obey :func:`order_law`, five are free. Without it each equation has its own four orders.
-        ``"coefficients"``: the coefficient law is stated in the structure. The equation-error estimators estimate the
-        eight coefficients freely and report how far they are from the law.
+        With the Lagrange form and with ``"derived"`` alpha_2 (alpha_4) is fixed at 2: it is seen only through the
+        link's viscous friction.
+        ``"coefficients"``: the coefficient law is stated in the structure, with the ratio r = (J_1 + J_2)/J_2 of the
+        published form or j = J_1/J_2 of the Lagrange form, where the coefficient -1 of the hub's motion is then known;
+        without it that is free, b_2. The equation-error estimators estimate the coefficients freely and report how far
+        they are from the law.
     parameters
         Named set that results are set beside.
     sensor_filter
@@ -119,15 +168,18 @@ def flexible_link(
     Raises
     ------
     ModelError
-        An argument that is not known.
+        An argument that is not known, or not used by that form.
     """
     if stage not in (1, 2, "both"):
         raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")
+    form, input_order = _form(form, input_order)
     for law in laws:
         if law not in ("orders", "coefficients"):
             raise ModelError(f"law {law!r} is not known; use 'orders', 'coefficients', both or ()")
     if parameters not in PARAMETERS:
         raise ModelError(f"parameters = {parameters!r} is not known; use {' or '.join(map(repr, PARAMETERS))}")
+    if coupling is None:
+        coupling = "measured" if form == "lagrange" else "simulated"
     if friction and coupling == "simulated":
         raise ModelError("friction=True makes the coupled free run non-linear; use coupling='measured'")
     stages: tuple[int, ...] = (1, 2) if stage == "both" else (stage,)
@@ -135,13 +187,17 @@ def flexible_link(
     coefficient_law: list[tuple[str, float, tuple[str, ...]]] = []
     reference: dict[str, float] = {}
     for j in stages:
-        equations += _stage(j, order_law(j, input_order), "orders" in laws, cross_stage, friction)
+        orders = order_law(j, form=form, input_order=input_order if form == "published" else None)
+        equations += _stage(j, form, orders, laws, cross_stage, friction)
         h, d = 2 * j - 1, 2 * j
-        coefficient_law += [
-            (f"{c}{d}", -1.0, (f"{c}{h}", *ratio))
-            for c, ratio in (("a", (f"r{j}",)), ("b", ()), ("d", (f"r{j}",)), ("g", ()))
-        ]
-        reference |= PARAMETERS[parameters][j].coefficients(j)
+        ratio = f"j{j}" if form == "lagrange" else f"r{j}"
+        tied: tuple[tuple[str, tuple[str, ...]], ...] = (("a", (ratio,)), ("d", (ratio,)))
+        if form == "published":
+            tied = (("a", (ratio,)), ("b", ()), ("d", (ratio,)), ("g", ()))
+        coefficient_law += [(f"{c}{d}", -1.0, (f"{c}{h}", *factors)) for c, factors in tied]
+        link = PARAMETERS[parameters][j]
+        known = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
+        reference |= {n: v for n, v in known.items() if any(n in e.coefficient_names for e in equations)}
     if sensor_filter == "stock":
         sensor_filter = SensorFilter.low_pass([f"theta{j}2" for j in stages])
     if not (sensor_filter is None or isinstance(sensor_filter, SensorFilter)):
@@ -149,21 +205,21 @@ def flexible_link(
     structure = Structure(
         equations=tuple(equations), coupling=coupling, sensor_filter=sensor_filter,
         coefficient_law=tuple(coefficient_law) if "coefficients" in laws else (), reference=reference,
-        name=f"flexible link, stage {stage}" if stage != "both" else "flexible link, both stages", hints=HINTS,
+        name=f"flexible link, stage {stage}" if stage != "both" else "flexible link, both stages", hints=_hints(form),
         offset=check_offset(offset),
     )  # fmt: skip
-    if input_order == "derived":
+    if form == "lagrange" or input_order == "derived":
         structure = structure.with_orders({f"alpha{2 * j}": 2.0 for j in stages})
     return structure
 
 
 def _stage(
-    stage: int, law: Mapping[str, Order], tied: bool, cross_stage: bool, friction: bool
+    stage: int, form: Form, law: Mapping[str, Order], laws: Sequence[str], cross_stage: bool, friction: bool
 ) -> tuple[Equation, Equation]:
     """Equations of the hub and of the deflection."""
     h, d = 2 * stage - 1, 2 * stage
     hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
-    other = 3 - stage
+    other, tied = 3 - stage, "orders" in laws
 
     def order(name: str) -> Order:
         return law[name] if tied else Order(0.0, ((name, 1.0),))
@@ -173,30 +229,38 @@ def _stage(
         if cross_stage:
             signals = [f"theta{other}1", f"theta{other}2", f"I{other}"]
             terms += [Term(s, Order(CROSS_ORDER), f"{c}{n}") for c, s in zip("pqs", signals, strict=True)]
-        if friction:
+        if friction and (n == h or form == "published"):
             terms.append(Term(f"coulomb_{hub}", Order(), f"c{n}"))
         return terms
 
-    def equation(output: str, n: int, drive: Order) -> Equation:
+    def equation(output: str, n: int, drive: Order | None) -> Equation:
         terms = [
             Term(deflection, order(f"beta{n}"), f"a{n}"),
             Term(hub, order(f"gamma{n}"), f"b{n}"),
             Term(deflection, order(f"mu{n}"), f"d{n}"),
-            Term(current, drive, f"g{n}"),
         ]
+        if drive is None and "coefficients" in laws:
+            # The hub's motion bends the link by as much as it turns it, whatever the link is made of.
+            terms[1] = Term(hub, order(f"gamma{n}"), -1.0, name=f"b{n}")
+        if drive is not None:
+            terms.append(Term(current, drive, f"g{n}"))
         return Equation(output, order(f"alpha{n}"), (*terms, *extra(n)))
 
-    return equation(hub, h, Order()), equation(deflection, d, law["input"] if tied else Order())
+    drive = None if form == "lagrange" else law["input"] if tied else Order()
+    return equation(hub, h, Order()), equation(deflection, d, drive)
 
 
 def link_model(
     *, stage: Literal[1, 2, "both"] = 1,
     parameters: Literal["effective", "table-3"] | Mapping[int, LinkParameters] = "effective",
     orders: Mapping[str, float] | None = None, coefficients: Mapping[str, float] | None = None,
-    input_order: Literal["published", "derived"] = "published",
+    form: Form = "published", input_order: InputOrder | None = None,
     coupling: Literal["simulated", "measured"] = "simulated",
 ) -> Model:  # fmt: skip
     """Make the arm with everything known: by default the integer-order model of the maker's manual.
+
+    With whole orders the forms are one model. With fractional ones use ``form="lagrange"``: the published form then
+    bends the link the wrong way.
 
     Parameters
     ----------
@@ -208,7 +272,7 @@ def link_model(
         Free orders of the law, by name; default the manual's integer ones.
     coefficients
         Coefficients to use instead of the parameters', by name.
-    input_order, coupling
+    form, input_order, coupling
         See :func:`flexible_link`.
 
     Returns
@@ -222,11 +286,12 @@ def link_model(
         A name that is not known, orders out of range.
     """
     named = parameters if isinstance(parameters, str) else "effective"
-    structure = flexible_link(stage=stage, input_order=input_order, coupling=coupling, parameters=named)
+    structure = flexible_link(stage=stage, form=form, input_order=input_order, coupling=coupling, parameters=named)
     values = dict(structure.reference)
     if not isinstance(parameters, str):
         for j, link in parameters.items():
-            values |= link.coefficients(j)
+            own = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
+            values |= {n: v for n, v in own.items() if n in structure.coefficient_names}
     values |= dict(coefficients or {})
     integer = {name: INTEGER_ORDERS.get(name.rstrip("0123456789"), 2.0) for name in structure.order_names}
     free = integer | dict(orders or {})

@@ -44,6 +44,13 @@ class LinkParameters:
             f"a{deflection}": -a * r, f"b{deflection}": -b, f"d{deflection}": 0.0 - d * r, f"g{deflection}": -g,
         }  # fmt: skip
 
+    def lagrange_coefficients(self, stage: int) -> dict[str, float]:
+        """Coefficients a, b, d, g of the hub's equation and a, b, d of the deflection's as (15) has them."""
+        hub, deflection = 2 * stage - 1, 2 * stage
+        own = {n: v for n, v in self.coefficients(stage).items() if n.endswith(str(hub))}
+        stiffness, friction = self.stiffness / self.link_inertia, self.link_friction / self.link_inertia
+        return own | {f"a{deflection}": -stiffness, f"b{deflection}": -1.0, f"d{deflection}": 0.0 - friction}
+
 
 #: Named parameter sets, by stage. "effective" reproduces the integer-order rows of the paper's Tables 4 and 5: the
 #: torque per ampere holds gear efficiency, gear ratio and torque constant. "table-3" is the paper's Table 3 as printed,

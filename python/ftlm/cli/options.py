@@ -108,7 +108,7 @@ class StructureOptions:
     only: Annotated[Text, Option(metavar="OUTPUT", help="Only the equation of this output.")] = None
     coupling: Annotated[
         Literal["measured", "simulated"] | None,
-        Option(help="What drives free runs of a flexible link or of several equations; default simulated."),
+        Option(help="What drives free runs; default measured of a flexible link as (15), simulated of others."),
     ] = None
     cross_stage: Annotated[bool, Option("--cross-stage", help="Add the other stage's angles and current.")] = False
     friction: Annotated[bool, Option("--friction", help="Add a Coulomb term.")] = False
@@ -116,9 +116,13 @@ class StructureOptions:
         Literal["none", "orders"] | None,
         Option(help="orders: search all equations under the order law; default none."),
     ] = None
+    form: Annotated[
+        Literal["lagrange", "published"] | None,
+        Option(help="Equation of the deflection: (15), or (23) as printed, see the manual; default lagrange."),
+    ] = None
     input_order: Annotated[
         Literal["published", "derived"] | None,
-        Option(help="Order of the current, see the manual; default published."),
+        Option(help="Order of the current in the published form, which it names; see the manual."),
     ] = None
     stock_filter: Annotated[bool, Option("--stock-filter", help="Deflections passed the stock 2 Hz low-pass.")] = False
     orders: Annotated[Texts, Option("--order", metavar="NAME=VALUE", help="Fix an order.")] = None
@@ -153,7 +157,8 @@ class StructureOptions:
         given = {
             "--coupling": self.coupling is not None and count == 1, "--cross-stage": self.cross_stage,
             "--friction": self.friction, "--laws": self.laws is not None,
-            "--input-order": self.input_order is not None, "--stock-filter": self.stock_filter,
+            "--form": self.form is not None, "--input-order": self.input_order is not None,
+            "--stock-filter": self.stock_filter,
         }  # fmt: skip
         wrong = [option for option, is_given in given.items() if is_given]
         if wrong:
@@ -170,7 +175,7 @@ class StructureOptions:
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use flexible-link:1, :2 or :both, or an equation")
         return flexible_link(
-            stage=stage, input_order=self.input_order or "published", coupling=self.coupling or "simulated",
+            stage=stage, form=self.form, input_order=self.input_order, coupling=self.coupling,
             cross_stage=self.cross_stage,
             friction=self.friction, laws=("orders", "coefficients") if self.laws == "orders" else (),
             sensor_filter="stock" if self.stock_filter else None,

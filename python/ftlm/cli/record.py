@@ -53,7 +53,8 @@ class LiveOptions:
                 raise ModelError(
                     f"--live {self.live!r} is not known; use flexible-link:1, flexible-link:2 or an equation"
                 )
-            structure = flexible_link(stage=stage, laws=("orders",), coupling="measured")
+            # A stream integrates what passes; (15) would differentiate the hub angle more often than the deflection.
+            structure = flexible_link(stage=stage, form="published", laws=("orders",), coupling="measured")
             if rig == "virtual":
                 arm = ArmParameters.of(parameters)
                 free = (arm.stage1 if stage == 1 else arm.stage2).orders(stage) | free

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from ftlm.base.checks import real_number
 from ftlm.base.errors import ModelError
-from ftlm.data.orders import MAX_ORDER, MIN_INPUT_ORDER, Order
+from ftlm.data.orders import MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER, Order
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,11 @@ class Equation:
     output
         Name of the output.
     order
-        Highest order, alpha.
+        Its highest order, alpha, in (0, 10].
     terms
-        Right-hand side.
+        Right-hand side. Orders of the output itself lie in [0, alpha), those of other signals in [-3, alpha + 1): the
+        link of an arm hangs on a hub that is differentiated more often than its own deflection. A command that holds
+        between samples stays at alpha or below, its jumps have no derivative.
     """
 
     output: str
@@ -109,8 +111,13 @@ class Equation:
             own, alpha, order = term.signal == self.output, self.order.constant, term.order.constant
             if own and not 0 <= order < alpha:
                 raise ModelError(f"own-output order {order:g} of {self.output} is outside [0, {alpha:g}); lower it")
-            if not own and not MIN_INPUT_ORDER <= order <= alpha:
-                raise ModelError(f"order {order:g} of {term.signal} is above alpha = {alpha:g}; lower it")
+            if not own and order < MIN_INPUT_ORDER:
+                raise ModelError(f"order {order:g} of {term.signal} is below {MIN_INPUT_ORDER:g}; raise it")
+            if not own and order >= alpha + MAX_EXCESS - 1e-9:
+                raise ModelError(
+                    f"order {order:g} of {term.signal} is {order - alpha:g} above alpha = {alpha:g} of {self.output}; "
+                    "an equation carries another signal less than one order above its own output: lower it"
+                )
 
     @property
     def signals(self) -> tuple[str, ...]:

@@ -14,6 +14,9 @@ from ftlm.base.errors import ModelError
 #: Highest order of an equation, and the lowest of an input: a threefold integration.
 MAX_ORDER = 10.0
 MIN_INPUT_ORDER = -3.0
+#: A signal's order stays below its equation's highest order and this: beyond, a measured signal would be differentiated
+#: more often than its samples carry.
+MAX_EXCESS = 1.0
 #: Highest order that a search tries of itself, where the structure holds none above it.
 SEARCHED_ORDER = 3.0
 #: What a person writes for the values of an order, see :func:`parse_values`.

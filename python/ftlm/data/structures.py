@@ -116,11 +116,19 @@ class Hints:
         some.
     freed
         Names of the orders that an equation taken out of an order law frees, by the coefficient of their term.
+    exceeds
+        What a ratio of the coefficient law exceeds by its physics; 1 where nothing is said, as a sum of inertias beside
+        one of them.
+    positive
+        Coefficients of one equation that the law ties to those of another and physics makes positive. Least squares may
+        take the one equation for the other; a start then has the other's coefficients by the law, with these signs.
     """
 
     highest: tuple[float, float] | None = None
     natural: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     freed: Mapping[str, str] = field(default_factory=dict)
+    exceeds: Mapping[str, float] = field(default_factory=dict)
+    positive: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -307,7 +315,8 @@ class Structure:
                 return term
             if term.signal not in modelled:
                 return replace(term, order=Order())
-            name = (self.hints or Hints()).freed.get(str(term.coefficient), f"nu_{output}_{k + 1}")
+            called = str(term.name or term.coefficient)
+            name = (self.hints or Hints()).freed.get(called, f"nu_{output}_{k + 1}")
             return replace(term, order=Order(0.0, ((name, 1.0),)))
 
         single = replace(own, terms=tuple(freed(k, t) for k, t in enumerate(own.terms)))

@@ -11,7 +11,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.data.orders import MAX_ORDER, SEARCHED_ORDER, Order
-from ftlm.data.structures import Structure, delay_name
+from ftlm.data.structures import Hints, Structure, delay_name
 from ftlm.solve.records import affine
 
 #: Own bounds of orders where the structure gives none.
@@ -73,13 +73,17 @@ class FreeProblem:
 
     def coordinates(self, start: Sequence[float], *, plain: bool) -> list[str]:
         """Logarithms where the start allows them."""
+        named = self.structure.coefficient_names
         ratios = {
-            f for _, factors in self.products.values() for f in factors if f not in self.structure.coefficient_names
+            f for _, factors in self.products.values() for f in factors if f not in named and self._exceeds(f) == 1
         }
-        return [
-            "plain" if plain or value == 0 else "excess" if name in ratios and value > 1 else "logarithm"
-            for name, value in zip(self.coefficients, start, strict=True)
-        ]
+
+        def coordinate(name: str, value: float) -> str:
+            if plain or value == 0:
+                return "plain"
+            return "excess" if name in ratios and value > self._exceeds(name) == 1 else "logarithm"
+
+        return [coordinate(n, v) for n, v in zip(self.coefficients, start, strict=True)]
 
     def laws(self, signals: Sequence[str]) -> list[Any]:
         """Equations with affine orders and monomial coefficients."""
@@ -134,7 +138,7 @@ class FreeProblem:
         return np.stack(rows)
 
     def free_from(self, estimated: Mapping[str, float]) -> list[float]:
-        """Free coefficients from freely estimated ones; ratios as the median of what the equations say, above 1."""
+        """Free coefficients from freely estimated ones; ratios as the median of what the equations can say."""
         out = []
         for name in self.coefficients:
             if name in estimated:
@@ -146,9 +150,14 @@ class FreeProblem:
                 product = float(np.prod(others))
                 if name in factors and product:
                     said.append(sign * estimated[dependent] / product)
-            usable = [s for s in said if math.isfinite(s) and 1.05 < s < 20]
-            out.append(float(np.median(usable)) if usable else 1.5)
+            least = self._exceeds(name)
+            usable = [s for s in said if math.isfinite(s) and least + 0.05 < s < 20]
+            out.append(float(np.median(usable)) if usable else least + 0.5)
         return out
+
+    def _exceeds(self, ratio: str) -> float:
+        """What a ratio of the coefficient law exceeds."""
+        return (self.structure.hints or Hints()).exceeds.get(ratio, 1.0)
 
 
 def _reach(structure: Structure, name: str, *, above: bool) -> float:

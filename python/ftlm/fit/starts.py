@@ -46,6 +46,8 @@ ZOOM_ROUNDS = 8
 ROWS_PER_FILTER = 400
 STARTS_PER_FILTER = 4
 APART = 0.35
+#: Ratios of a coefficient law at which a start takes one equation's coefficients from another's.
+LAW_RATIOS = (0.25, 1.0, 4.0)
 #: Points of a scan of resonances that become starts.
 SCANNED = 4
 #: Starts along the interval of a free delay: one for this phase of the frequency below which 90 % of the power lies,
@@ -151,6 +153,8 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, threads: int) -> l
         here: list[Attempt] = []
         for axes, apart in lattices:
             here += lattice_attempts(problem, structure, records, axes, apart, origin, here, threads)
+        if natural is not None and multiple in (PREFILTERS[0], None):
+            here += lawful_attempts(problem, structure, records, natural, origin, threads)
         attempts += here
     return attempts + scanned_attempts(runs, problem, structure, m, attempts)
 
@@ -175,6 +179,34 @@ def lattice_attempts(
         attempts.append(Attempt(values, problem.free_from(start.coefficients), origin, {}))
         if len(picked) >= STARTS_PER_FILTER:
             break
+    return attempts
+
+
+def lawful_attempts(
+    problem: FreeProblem, structure: Structure, records: list[Record], axes: Mapping[str, list[float]], origin: str,
+    threads: int,
+) -> list[Attempt]:  # fmt: skip
+    """Starts with one equation's coefficients from another's by the law, the rest of it by least squares.
+
+    The hub of an arm is overdamped: current and friction nearly cancel, and what is left of the hub's acceleration is
+    told as well by the link's own equation. Freely estimated, the hub's becomes the link's, stiffness reversed.
+    """
+    signs = (structure.hints or Hints()).positive
+    tied = {n: (free[0], free[1:]) for n, (_, free) in problem.products.items() if free and free[0] in signs}
+    if not tied:
+        return []
+    attempts = []
+    for row in lattice_rows(structure, records, axes, threads)[:STARTS_PER_FILTER]:
+        point = {n: [v] for n, v in row.orders.items()}
+        for ratio in LAW_RATIOS:
+            known = {free: abs(row.coefficients[n]) / ratio ** len(others) for n, (free, others) in tied.items()}
+            if not all(math.isfinite(v) and v for v in known.values()):
+                continue
+            for rest in lattice_rows(structure.with_coefficients(known), records, point, threads, keep=1):
+                values = dict.fromkeys(problem.coefficients, ratio) | rest.coefficients | known
+                orders = [row.orders[n] for n in problem.orders]
+                words = f"{origin}, by the law at {ratio:g}"
+                attempts.append(Attempt(orders, [values[n] for n in problem.coefficients], words, {}))
     return attempts
 
 

@@ -53,8 +53,9 @@ class PhysicalParameter:
 def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str, PhysicalParameter]:
     """Physical parameters of a link from coefficients under the coefficient law, once one a stage is known.
 
-    a = K_s/J_1, b = -B_1/J_1, d = B_2/J_1, g = K_tau/J_1 and r = (J_1 + J_2)/J_2 (paper (16)-(21)) fix five ratios of
-    six parameters. Standard errors follow from the joint covariance to first order; the known value is taken as exact.
+    a = K_s/J_1, b = -B_1/J_1, d = B_2/J_1, g = K_tau/J_1 and r = (J_1 + J_2)/J_2 (paper (16)-(21)), or j = J_1/J_2, fix
+    five ratios of six parameters. Standard errors follow from the joint covariance to first order; the known value is
+    taken as exact.
 
     Parameters
     ----------
@@ -89,7 +90,8 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
         if not 0 < amount < math.inf:
             raise ModelError(f"{name} = {value!r} is not positive")
         h = 2 * stage - 1
-        needed = [f"a{h}", f"b{h}", f"d{h}", f"g{h}", f"r{stage}"]
+        ratio = f"j{stage}" if f"j{stage}" in joint.coefficients else f"r{stage}"
+        needed = [f"a{h}", f"b{h}", f"d{h}", f"g{h}", ratio]
         missing = [n for n in needed if n not in joint.coefficients]
         if missing:
             raise ModelError(
@@ -97,7 +99,8 @@ def physical_parameters(joint: JointFit, known: Mapping[str, float]) -> dict[str
                 "laws=('orders', 'coefficients') and all terms free"
             )
         place = [joint.names.index(n) for n in needed]
-        centre = joint.values[place]
+        # J_1/J_2, or that and 1.
+        centre = joint.values[place] + np.array([0.0, 0.0, 0.0, 0.0, float(ratio.startswith("j"))])
         spread = joint.covariance[np.ix_(place, place)]
         values = _physical(centre, name, amount, stage)
         slopes = []

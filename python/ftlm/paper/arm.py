@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ from ftlm.base.errors import ModelError
 from ftlm.data.run import Run
 from ftlm.model.model import Model
 from ftlm.rig.experiment import record
+from ftlm.rig.parameters import ArmParameters
 
 StageNumber = Literal[1, 2]
 STAGES: tuple[StageNumber, StageNumber] = (1, 2)
@@ -30,12 +32,15 @@ PLANTS: dict[int, tuple[dict[str, float], dict[str, float]]] = {
 
 
 def demo_plant(stage: int) -> Model:
-    """The simulated arm of a stage: effective coefficients, fractional orders, coefficient law obeyed."""
+    """The arm of the paper's own equations (22)-(25) as printed: effective coefficients, fractional orders, their law.
+
+    Its links bend the wrong way, see :func:`ftlm.flexible_link`: it is what the paper's tables are set beside.
+    """
     orders, free = PLANTS[stage]
     h, d, r = 2 * stage - 1, 2 * stage, free["r"]
     law = {f"a{d}": -free[f"a{h}"] * r, f"b{d}": -free[f"b{h}"], f"d{d}": -free[f"d{h}"] * r, f"g{d}": -free[f"g{h}"]}
     coefficients = {name: value for name, value in free.items() if name != "r"} | law
-    return link_model(stage=1 if stage == 1 else 2, orders=orders, coefficients=coefficients)
+    return link_model(stage=1 if stage == 1 else 2, form="published", orders=orders, coefficients=coefficients)
 
 
 def truth_of(stage: int) -> dict[str, float]:
@@ -46,6 +51,8 @@ def truth_of(stage: int) -> dict[str, float]:
 
 def demo_run(shape: str, *, duration: float = 10.0, step: float = 0.002, noise: float = 1e-4, seed: int = 1) -> Run:
     """A run of the virtual rig under the paper's inputs: the linear arm, encoders and all, and noise on every angle.
+
+    The arm obeys the published equations (22)-(25), as the paper's identification assumes.
 
     Parameters
     ----------
@@ -75,7 +82,7 @@ def demo_run(shape: str, *, duration: float = 10.0, step: float = 0.002, noise: 
         raise ModelError(f"shape = {shape!r} is not known; use 'square' or 'sine'")
     recorded = record(
         input=shape, amplitude=AMPLITUDES[shape], duration=duration, limit=duration, rate=1.0 / step, seed=seed,
-        parameters="linear",
+        parameters=replace(ArmParameters.of("linear"), form="published"),
     )  # fmt: skip
     rng = np.random.default_rng([seed, list(AMPLITUDES).index(shape)])
     angles = [f"theta{stage}{k}" for stage in (1, 2) for k in (1, 2)]

@@ -110,7 +110,10 @@ def _derivative_section(found: Recomputed) -> Section:
     words = (
         "Eliminating the hub angle's highest derivative from (15) by (17) differentiates the current as well, by the "
         "order α₂ − μ₂ + γ₁ − α₁, which (19) and (21) leave out. It vanishes for whole orders. "
-        "flexible_link(input_order='derived') keeps it; a symbolic test derives both."
+        "flexible_link(input_order='derived') keeps it; a symbolic test derives both. Without it a fractional link "
+        "bends with the current, where a real one bends against it: the equations of this page are the paper's, and "
+        "its simulated runs are of an arm that obeys them, so that printed and recomputed numbers speak of one model. "
+        "For a real arm flexible_link() has (15) as it stands."
     )
     charts = [figures.derivative_chart(stage.derived) for stage in found.stages.values()]
     return Section("The dropped derivative", [words], figures=charts)

@@ -64,8 +64,8 @@ class StageWork:
     notes: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.measured = flexible_link(stage=self.number, coupling="measured", laws=())
-        self.coupled = flexible_link(stage=self.number)
+        self.measured = flexible_link(stage=self.number, form="published", coupling="measured", laws=())
+        self.coupled = flexible_link(stage=self.number, form="published")
         own = list(self.measured.signals)
         self.on = self.square.select(own)
         self.off = None if self.sine is None else self.sine.select(own)

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from ftlm import _core
-from ftlm.arm.link import order_law
+from ftlm.arm.link import Form, order_law
 from ftlm.base.checks import listed, nearest
 from ftlm.base.errors import DataError, ModelError
 from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
 
-#: Longest step of the simulation inside a sample [s]: deflections are then within 2e-5 of their range.
+#: Longest step of the simulation inside a sample [s]: deflections are then within 2e-4 of their deviation, of stage 1
+#: within 1e-5.
 SUBSTEP = 1e-4
 
 
@@ -49,16 +50,20 @@ class StageParameters:
         h, k = 2 * stage - 1, 2 * stage
         return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
 
-    def equations(self, stage: int) -> dict[str, Any]:
+    def equations(self, stage: int, form: Form = "lagrange") -> dict[str, Any]:
         """Orders and coefficients of both equations, as the core takes them."""
         h, k = 2 * stage - 1, 2 * stage
         free = self.orders(stage)
-        law = {name: order.at(free) for name, order in order_law(1 if stage == 1 else 2).items()}
+        law = {name: order.at(free) for name, order in order_law(stage, form=form).items()}
+        deflection = [-self.a * self.r, -self.b, -self.d * self.r, -self.g]
+        if form == "lagrange":
+            # J_1/J_2 is r - 1.
+            deflection = [-self.a * (self.r - 1.0), -1.0, -self.d * (self.r - 1.0), 0.0]
         return {
             "hub_orders": [law[f"{n}{h}"] for n in ("beta", "gamma", "mu")],
             "hub": [self.a, self.b, self.d, self.g],
             "deflection_orders": [law[f"{n}{k}"] for n in ("beta", "gamma", "mu")],
-            "deflection": [-self.a * self.r, -self.b, -self.d * self.r, -self.g],
+            "deflection": deflection,
             "coulomb": self.coulomb,
         }
 
@@ -85,6 +90,9 @@ class ArmParameters:
         Hub angle per count [rad].
     travel
         Hub angle at which a limit switch opens [rad].
+    form
+        ``"lagrange"``: links hang on their hubs, the Euler-Lagrange equations (15); ``"published"``: (23) and (25) as
+        printed, whose links bend the wrong way, for what is set beside the paper's own numbers.
     name
         What files call them.
     """
@@ -100,6 +108,7 @@ class ArmParameters:
     bits: int = 16
     encoder_scale: tuple[float, float] = ENCODER_SCALE
     travel: tuple[float, float] = (math.pi / 2, math.pi / 2)
+    form: Form = "lagrange"
     name: str = "effective"
 
     @classmethod
@@ -150,8 +159,8 @@ class ArmParameters:
     def arm(self, step: float, horizon: float) -> _core.VirtualArm:
         """The simulated arm at rest, for runs of at most `horizon` s in samples of `step` s."""
         links = {
-            "stages": [self.stage1.equations(1), self.stage2.equations(2)], "coupling": self.coupling,
-            "inertia_ratio": self.inertia_ratio,
+            "stages": [self.stage1.equations(1, self.form), self.stage2.equations(2, self.form)],
+            "coupling": self.coupling, "inertia_ratio": self.inertia_ratio, "published": self.form == "published",
         }  # fmt: skip
         sensors = {
             "strain_scale": STRAIN_SCALE, "strain_bias": self.strain_bias,
@@ -170,6 +179,11 @@ def _numbers(path: Path, where: str, table: Mapping[str, Any], kind: type[Any]) 
             raise ModelError(
                 f"{path.name}: {key!r} in {where} is not known{nearest(key, known)}; known are {listed(known)}"
             )
+        if key == "form":
+            if value not in ("lagrange", "published"):
+                raise ModelError(f"{path.name}: form = {value!r} is not known; use 'lagrange' or 'published'")
+            found[key] = value
+            continue
         pair = "tuple" in str(known[key])
         values = value if isinstance(value, list) else [value]
         good = all(isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) for v in values)
@@ -192,9 +206,9 @@ _STAGE2 = StageParameters(
     gamma=0.9, beta=0.2, mu=0.8, coulomb=0.1,
 )  # fmt: skip
 #: "effective": the maker's effective parameters with fractional damping, friction, coupling and noise. "linear": the
-#: same two stages apart, without friction, noise and quantisation of the gauges: Plants A and A2. "measured":
-#: stiffness, damping, torque and friction fitted to the spectra of two measured runs of the real arm (docs/rig.md),
-#: whose hubs are heavier and whose first link is softer than the maker's parameters say.
+#: same two stages apart, without friction, noise and quantisation of the gauges. "measured": stiffness, damping,
+#: torque and friction fitted to the spectra of two measured runs of the real arm (docs/rig.md), whose links are softer
+#: than the maker's parameters say; the second takes up part of what the stages do to each other beyond the mounting.
 SETS: dict[str, ArmParameters] = {
     "effective": ArmParameters(_STAGE1, _STAGE2),
     "linear": ArmParameters(
@@ -203,8 +217,8 @@ SETS: dict[str, ArmParameters] = {
         name="linear",
     ),
     "measured": ArmParameters(
-        replace(_STAGE1, a=208.0, b=-29.5, d=2.56, g=51.7, coulomb=0.18),
-        replace(_STAGE2, a=2190.0, b=-641.0, d=18.8, g=547.0, coulomb=0.01),
+        replace(_STAGE1, a=295.0, b=-73.7, d=1.74, g=134.0, coulomb=0.11),
+        replace(_STAGE2, a=509.0, b=-291.0, d=20.4, g=370.0, coulomb=0.009),
         name="measured",
     ),
 }  # fmt: skip

@@ -114,6 +114,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     needs them; over others stand straight lines, to which nothing may be fitted.
     """
     _check_known(run, structure)
+    _check_held(run, structure)
     initial = decided(run, structure)
     sensor = None
     if filtered and structure.sensor_filter is not None:
@@ -139,6 +140,20 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         initial,
         structure.offset,
     )
+
+
+def _check_held(run: Run, structure: Structure) -> None:
+    """Refuse the derivative of a jump: a held input above the order of the output that it drives."""
+    for item in structure.equations:
+        for term in item.terms:
+            if item.order.names or term.order.names or term.order.constant <= item.order.constant + 1e-9:
+                continue
+            if term.signal in run.inputs and run.intersample[term.signal] == "zoh":
+                raise ModelError(
+                    f"order {term.order.constant:g} of {term.signal} is above alpha = {item.order.constant:g} of "
+                    f"{item.output}, and run {run.name!r} holds {term.signal} between its samples: its jumps have no "
+                    "derivative; lower the order, or say intersample='foh' if it moves in between"
+                )
 
 
 def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool = True) -> list[Record]:

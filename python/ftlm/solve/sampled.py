@@ -248,6 +248,9 @@ def _read(
     start = np.zeros(len(names))
     for i, item in enumerate(model.equations):
         start[i] = terms[item.output].get(0.0, 0.0)
+        if rec.sensor is not None and structure.sensor_filter is not None:
+            # The whole equation passes the filter, and so does what its output starts from.
+            start[i] *= high_frequency_gain(structure.sensor_filter)
         for term in item.terms:
             if abs(term.order.constant - item.order.constant) > GRAIN:
                 continue

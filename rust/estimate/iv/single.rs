@@ -7,7 +7,7 @@ use super::common::{dot, long_run, unmoved, Settings, Solution};
 use super::filter::damped_inverse;
 use crate::equation::Structure;
 use crate::error::Result;
-use crate::kernels::block_pulse_kernel;
+use crate::excess;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel, SumOfProducts};
 use crate::small;
@@ -47,7 +47,7 @@ impl<'a> Shelf<'a> {
                 .clone()
                 .map(|(s, eta)| {
                     own(s).then(|| {
-                        let kernel = block_pulse_kernel(eta, record.m(), record.step());
+                        let kernel = excess::kernel(eta, record.m(), record.step());
                         let spectrum = Kernel::new(&kernel);
                         (kernel, spectrum)
                     })

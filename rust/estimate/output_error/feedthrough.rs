@@ -8,6 +8,7 @@ use super::experiment::Experiment;
 use super::model::{FreeModel, Point};
 use crate::equation::Structure;
 use crate::error::Result;
+use crate::excess::first;
 use crate::small;
 
 /// Orders closer than this are the same: the term integrates nothing.
@@ -195,12 +196,9 @@ impl Early {
             let entry = |i: usize, s: usize| (0..n).map(|j| inverse[i * n + j] * driving[j * signals + s]).sum::<f64>();
             Ok((0..n * signals).map(|at| entry(at / signals, at % signals)).collect())
         };
-        let first = solved(&|i, k| {
-            let eta = structures[i].order - structures[i].terms[k].order;
-            libm::pow(step, eta) / libm::tgamma(eta + 2.0)
-        })?;
+        let answered = solved(&|i, k| first(structures[i].order - structures[i].terms[k].order, step))?;
         let direct = solved(&|i, k| f64::from(u8::from(at_once[i][k])))?;
-        Ok(first.iter().zip(direct).map(|(first, direct)| first - direct).collect())
+        Ok(answered.iter().zip(direct).map(|(first, direct)| first - direct).collect())
     }
 
     fn at_once(model: &FreeModel, point: &Point) -> Vec<Vec<bool>> {

@@ -8,7 +8,7 @@ use crate::dense;
 use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimate::least_squares;
-use crate::kernels::kernel_with_derivative;
+use crate::excess::{kernel_and_slope, MAX_EXCESS};
 use crate::series::{Buffers, Kernel, Solver, SumOfProducts};
 
 /// Own-output orders closer to α than this make the equation say that the output equals itself.
@@ -95,14 +95,21 @@ impl FreeModel {
             let mut row = Vec::with_capacity(structure.terms.len());
             for (k, term) in structure.terms.iter().enumerate() {
                 let eta = structure.order - term.order;
-                let least = if term.signal == structure.output { LEAST_INTEGRATION } else { 0.0 };
+                let held = experiment.instants.get(term.signal).is_some_and(|instant| instant.held);
+                let least = if term.signal == structure.output {
+                    LEAST_INTEGRATION
+                } else if held {
+                    // The derivative of a jump is infinite.
+                    0.0
+                } else {
+                    LEAST_INTEGRATION - MAX_EXCESS
+                };
                 if eta < least {
-                    // Reported like a step too far, so that the search shortens it. An order a little below 0 is let
-                    // pass: under an order law the truth may lie on that edge, and estimates scatter to both sides.
+                    // Reported like a step too far, so that the search shortens it.
                     return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
                 }
                 let c = self.equations[i].terms[k].2.at(&point.coefficients);
-                let (kernel, slope) = kernel_with_derivative(eta, m, record.step());
+                let (kernel, slope) = kernel_and_slope(eta, m, record.step());
                 if let Some(j) = self.unknown(i, term.signal) {
                     matrix[i][j].iter_mut().zip(&kernel).for_each(|(a, v)| *a -= c * v);
                 } else {

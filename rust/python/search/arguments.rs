@@ -153,9 +153,14 @@ impl<'py> FromPyObject<'_, 'py> for LawArg {
 }
 
 /// The lattice of a stage from the values of its free orders.
-pub fn law_lattice(axes: &[Vec<f64>], laws: Vec<LawArg>, inputs: &[bool]) -> Result<LawLattice, Error> {
+pub fn law_lattice(
+    axes: &[Vec<f64>],
+    laws: Vec<LawArg>,
+    inputs: &[bool],
+    fixed: &[Vec<Option<f64>>],
+) -> Result<LawLattice, Error> {
     let equations: Vec<LawEquation> = laws.into_iter().map(|law| law.0).collect();
-    LawLattice::new(axes, &equations, inputs)
+    Ok(LawLattice::new(axes, &equations, inputs)?.with_known(fixed))
 }
 
 /// Counts under the names that people read.

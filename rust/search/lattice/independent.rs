@@ -2,6 +2,7 @@
 
 use crate::equation::{tidy, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
+use crate::excess::MAX_EXCESS;
 use crate::kernels::{MAX_ORDER, MIN_INPUT_ORDER};
 use crate::search::lattice::tuples::{Group, Slice};
 
@@ -94,15 +95,23 @@ impl Lattice {
                 members(signal).iter().map(|&k| values(&terms[k], lowest)).collect()
             })
             .collect();
+        let only = alphas.len() == 1;
         // First position in range of every axis, per α and signal.
         let firsts: Vec<Vec<Vec<usize>>> = alphas
             .iter()
             .map(|&alpha| {
-                let outside = |own: bool, v: f64| if own { v >= alpha - ORDER_GRAIN } else { v > alpha + ORDER_GRAIN };
-                axes.iter()
-                    .zip(&signals)
-                    .map(|(axes, &s)| axes.iter().map(|a| a.partition_point(|&v| outside(s == output, v))).collect())
-                    .collect()
+                // What is searched stays at alpha or below; an order that is asked for beside one alpha need not.
+                let highest = |own: bool, count: usize| match (own, only && count == 1) {
+                    (true, _) => alpha - ORDER_GRAIN,
+                    (false, false) => alpha + ORDER_GRAIN,
+                    (false, true) => alpha + MAX_EXCESS - ORDER_GRAIN,
+                };
+                let first = |own: bool, axis: &Vec<f64>| {
+                    let highest = highest(own, axis.len());
+                    axis.partition_point(|&v| if own { v >= highest } else { v > highest })
+                };
+                let group = |(axes, &s): (&Vec<Vec<f64>>, &usize)| axes.iter().map(|a| first(s == output, a)).collect();
+                axes.iter().zip(&signals).map(group).collect()
             })
             .collect();
         if let Some(group) = axes.iter().position(|group| group.len() > MAX_TERMS) {

@@ -2,6 +2,7 @@
 
 use crate::equation::{alpha_fits, order_fits, tidy, AffineOrder, Structure, Term, ORDER_GRAIN};
 use crate::error::{check_finite, Error, Result};
+use crate::excess::MAX_EXCESS;
 
 /// Most tuples of free orders of a stage; what a search costs follows from the distinct orders of its equations.
 pub const MAX_TUPLES: u128 = 5_000_000_000;
@@ -24,6 +25,8 @@ pub struct LawLattice {
     equations: Vec<LawEquation>,
     inputs: Vec<bool>,
     product: u64,
+    /// Output and place of terms whose coefficient is known.
+    known: Vec<(usize, usize)>,
 }
 
 impl LawLattice {
@@ -70,11 +73,28 @@ impl LawLattice {
         }
         let product = axes.iter().fold(1u128, |p, a| p.saturating_mul(a.len() as u128));
         match u64::try_from(product) {
-            Ok(count) if product <= MAX_TUPLES => {
-                Ok(Self { axes, equations: equations.to_vec(), inputs: inputs.to_vec(), product: count })
-            }
+            Ok(count) if product <= MAX_TUPLES => Ok(Self {
+                axes,
+                equations: equations.to_vec(),
+                inputs: inputs.to_vec(),
+                product: count,
+                known: Vec::new(),
+            }),
             _ => Err(Error::LatticeTooLarge { count: product, limit: MAX_TUPLES }),
         }
+    }
+
+    /// The same with terms of known coefficients, `fixed[e]` by term of equation e: these may exceed their equation's α.
+    ///
+    /// A term above α with a free coefficient is left out: it is a way to say that an output nearly equals itself.
+    #[must_use]
+    pub fn with_known(mut self, fixed: &[Vec<Option<f64>>]) -> Self {
+        let terms = self.equations.iter().zip(fixed).flat_map(|(equation, fixed)| {
+            let known = fixed.iter().enumerate().filter(|(_, value)| value.is_some());
+            known.map(|(k, _)| (equation.output, k))
+        });
+        self.known = terms.collect();
+        self
     }
 
     /// Refuses records of so many signals where an equation names another.
@@ -140,11 +160,17 @@ impl LawLattice {
     pub(crate) fn fits(&self, equation: &LawEquation, orders: &[f64]) -> bool {
         let alpha = orders[0];
         let input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
-        let fit = |&(signal, _): &(usize, AffineOrder), order: f64| {
-            order_fits(alpha, order, signal == equation.output, input(signal))
+        let fit = |k: usize, signal: usize, order: f64| {
+            let own = signal == equation.output;
+            order_fits(alpha, order, own, input(signal))
+                || !own
+                    && !input(signal)
+                    && order > alpha
+                    && order < alpha + MAX_EXCESS - ORDER_GRAIN
+                    && self.known.contains(&(equation.output, k))
         };
         alpha_fits(alpha)
-            && equation.terms.iter().zip(&orders[1..]).all(|(term, &order)| fit(term, order))
+            && equation.terms.iter().zip(&orders[1..]).enumerate().all(|(k, (term, &order))| fit(k, term.0, order))
             && equation.terms.iter().enumerate().all(|(a, (signal, _))| {
                 let before = equation.terms[..a].iter().zip(&orders[1..]);
                 before.into_iter().all(|((s, _), v)| s != signal || (v - orders[a + 1]).abs() > ORDER_GRAIN)

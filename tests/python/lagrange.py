@@ -1,0 +1,58 @@
+"""Synthetic truth in the Euler-Lagrange form: both stages under square, sine and multisine currents, from seeds."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+
+import ftlm
+from ftlm.paper.arm import PLANTS
+
+INPUTS = ("square", "sine", "multisine")
+ROWS, STEP = 5000, 0.002
+
+
+def truth(stage: int) -> dict[str, float]:
+    """True value of every free order and coefficient; alpha of the deflection is 2 by the form."""
+    orders, free = PLANTS[stage]
+    orders = {n: v for n, v in orders.items() if n != f"alpha{2 * stage}"}
+    return orders | {n: v for n, v in free.items() if n != "r"} | {f"j{stage}": free["r"] - 1.0}
+
+
+def structure(stage: int) -> ftlm.Structure:
+    """What is identified: both angles from the current alone, at rest."""
+    return replace(ftlm.flexible_link(stage=stage, coupling="simulated"), initial="rest")
+
+
+def model(stage: int) -> ftlm.Model:
+    """The arm with everything known; the deflection's coefficients by the law, written out."""
+    known, h, d = truth(stage), 2 * stage - 1, 2 * stage
+    made = structure(stage)
+    orders = {n: known[n] for n in made.order_names}
+    ratio = known[f"j{stage}"]
+    link = {f"{c}{d}": -known[f"{c}{h}"] * ratio for c in "ad"}
+    return ftlm.Model(made.with_orders(orders).with_coefficients({f"{c}{h}": known[f"{c}{h}"] for c in "abdg"} | link))
+
+
+def current(shape: str, rows: int = ROWS) -> np.ndarray:
+    """The paper's square and sine, and ten sines from 0.1 to 8.3 Hz; held over a sample [A]."""
+    t = np.arange(rows) * STEP
+    if shape == "square":
+        return np.where((np.arange(rows) % 1000) < 500, 0.3, -0.3)
+    if shape == "sine":
+        return 0.6 * np.sin(6.3 * t)
+    frequencies = (0.1, 0.3, 0.5, 0.9, 1.3, 2.1, 3.1, 4.3, 6.1, 8.3)
+    phases = np.random.default_rng(3).uniform(0, 2 * np.pi, len(frequencies))
+    return 0.12 * np.sum([np.sin(2 * np.pi * f * t + p) for f, p in zip(frequencies, phases, strict=True)], axis=0)
+
+
+@functools.cache
+def clean_run(stage: int, shape: str) -> ftlm.Run:
+    """Point samples without noise, converged to 1e-7."""
+    blank = ftlm.Run.from_arrays(
+        step=STEP, inputs={f"I{stage}": current(shape)},
+        outputs={f"theta{stage}{k}": np.zeros(ROWS) for k in (1, 2)}, name=shape,
+    )  # fmt: skip
+    return model(stage).simulate(blank, tolerance=1e-7)

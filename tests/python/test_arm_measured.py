@@ -1,0 +1,83 @@
+"""Runs of the real arm in two laboratories: the link's equation (15), fitted on one run, predicts the other's."""
+
+from __future__ import annotations
+
+import pytest
+
+import ftlm
+from measured import DATA, needs_data
+
+pytestmark = needs_data
+ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}
+CURRENTS = {"I1": "Im1_meas_A", "I2": "Im2_meas_A"}
+LINK = "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11"
+PUSHED = f"{LINK} + p D^2 theta21 + q theta22"
+GAUGE = f"{PUSHED} + s theta21 + r theta11"
+SPRING_POT = GAUGE.replace("a theta12", "a D^beta theta12")
+
+
+@pytest.fixture(scope="module")
+def runs() -> dict[str, ftlm.Run]:
+    """Both runs, thinned to 8 ms."""
+    out = {}
+    for name in ("psf", "lqr"):
+        run = ftlm.load(
+            DATA / f"two_link_{name}" / f"{name}.csv", time="t_s", inputs=CURRENTS, outputs=ANGLES,
+            units=dict.fromkeys(ANGLES, "deg"),
+        )  # fmt: skip
+        if name == "psf":
+            run = run.slice(1.1, 19.5)
+        out[name] = ftlm.Run.from_arrays(
+            step=4 * run.step, inputs={n: run[n][::4] for n in CURRENTS}, outputs={n: run[n][::4] for n in ANGLES},
+            units=run.units, name=name,
+        )  # fmt: skip
+    return out
+
+
+def predicted(words: ftlm.Structure, runs: dict[str, ftlm.Run], fitted: str) -> tuple[float, ftlm.Identification]:
+    """Fit in percent of the free run on the run that the model never saw."""
+    found = ftlm.identify(runs[fitted], words, method="output-error")
+    other = "lqr" if fitted == "psf" else "psf"
+    return found.model.compare(runs[other]).fit_percent["theta12"], found
+
+
+def stock(words: str) -> ftlm.Structure:
+    return ftlm.equation(words, sensor_filter=ftlm.SensorFilter.low_pass(["theta12"]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("words", "to_lqr", "to_psf"),
+    [(LINK, 61.9, 15.9), (PUSHED, 74.9, 71.6), (GAUGE, 76.0, 72.9), (SPRING_POT, 79.3, 76.9)],
+)
+def test_one_laboratorys_run_predicts_the_others(runs, words: str, to_lqr: float, to_psf: float) -> None:
+    for fitted, expected in (("psf", to_lqr), ("lqr", to_psf)):
+        fit, _ = predicted(stock(words), runs, fitted)
+        assert fit == pytest.approx(expected, abs=0.5), fitted
+
+
+@pytest.mark.slow
+def test_one_fractional_order_predicts_better_than_none(runs) -> None:
+    for fitted in ("psf", "lqr"):
+        whole, _ = predicted(stock(GAUGE), runs, fitted)
+        fractional, found = predicted(stock(SPRING_POT), runs, fitted)
+        assert fractional > whole + 2.0
+        low, high = found.joint.intervals["beta"]
+        assert 0.0 < low < high < 0.15
+
+
+def test_the_natural_call_is_the_links_equation(runs) -> None:
+    # Without the coefficient law the -1 of physics is free: the filter on one side only, it is found at -0.56.
+    natural = ftlm.flexible_link(stage=1, sensor_filter="stock", laws=()).equation("theta12")
+    natural = natural.with_orders({"beta2": 0.0, "gamma2": 2.0, "mu2": 1.0})
+    fit, found = predicted(natural, runs, "psf")
+    same, words = predicted(stock(LINK), runs, "psf")
+    assert fit == pytest.approx(same, abs=0.2)
+    assert found.coefficients["b2"] == pytest.approx(words.coefficients["b"], rel=1e-3)
+
+
+def test_a_filtered_equation_starts_where_its_filter_does(runs) -> None:
+    # The constant that the equation starts from passes the filter like all of it: the first sample is no step.
+    found = ftlm.identify(runs["psf"], stock(LINK), method="output-error").model.compare(runs["psf"])
+    assert abs(found.simulated["theta12"][0][0]) < 1e-3
+    assert found.fit_percent["theta12"] == pytest.approx(63.7, abs=0.5)
