@@ -15,7 +15,7 @@ fn checked(structure: &Structure) -> Result<(), Error> {
 #[test]
 fn orders_that_make_an_equation_pass() {
     for good in [
-        structure(0, 2.0, &[(0, 1.9), (0, 0.0), (1, 2.0), (1, 0.0), (2, 0.0), (2, -3.0), (2, 2.0)]),
+        structure(0, 2.0, &[(0, 1.9), (0, 0.0), (1, 2.0), (1, 0.0), (2, 0.0), (2, -3.0), (2, 2.0), (1, 2.9), (2, 2.9)]),
         structure(1, 3.0, &[(1, 2.99), (0, 3.0)]),
         structure(0, 0.05, &[]),
     ] {
@@ -38,11 +38,11 @@ fn orders_that_make_no_equation_are_named() {
     for order in [2.0, 2.5, -0.1, f64::NAN] {
         refused(&structure(0, 2.0, &[(2, 0.0), (0, order)]), "order of term 1", order, "[0, 2)");
     }
-    for order in [2.1, -0.1, f64::NAN] {
-        refused(&structure(0, 2.0, &[(1, order)]), "order of term 0", order, "[0, 2]");
+    for order in [3.0, 3.5, -0.1, f64::NAN] {
+        refused(&structure(0, 2.0, &[(1, order)]), "order of term 0", order, "[0, 3)");
     }
-    for order in [2.1, -3.1, f64::NAN] {
-        refused(&structure(0, 2.0, &[(2, order)]), "order of term 0", order, "[-3, 2]");
+    for order in [3.0, 3.5, -3.1, f64::NAN] {
+        refused(&structure(0, 2.0, &[(2, order)]), "order of term 0", order, "[-3, 3)");
     }
     for missing in [structure(3, 2.0, &[]), structure(0, 2.0, &[(3, 0.0)])] {
         match checked(&missing) {

@@ -149,7 +149,12 @@ fn models_that_cannot_be_solved_are_refused() {
     assert!(matches!(respond(one(&steep), &record, &[]), Err(Error::OutOfRange { .. })));
     // y0 = y1 + …, y1 = y0 + …: an algebraic loop of gain one.
     let algebraic = [equation(0, 1.0, &[(1, 1.0, 1.0)]), equation(1, 1.0, &[(0, 1.0, 1.0), (2, 0.0, 1.0)])];
-    assert_eq!(respond(&algebraic, &record, &[]), Err(Error::LeadingZero { leading: 0.0 }));
+    match respond(&algebraic, &record, &[]) {
+        Err(error @ Error::Structure { .. }) => {
+            assert!(error.to_string().starts_with("the leading matrix of the equations is singular"));
+        }
+        other => panic!("{other:?}"),
+    }
     // Gain one half is solvable, and no equations at all is no fault.
     let half = [equation(0, 1.0, &[(1, 1.0, 0.5)]), equation(1, 1.0, &[(0, 1.0, 1.0), (2, 0.0, 1.0)])];
     let found = respond(&half, &record, &[]).unwrap();
