@@ -63,6 +63,9 @@ def lower_orders(problem: FreeProblem, runs: Sequence[Run]) -> list[LowerOrder]:
     if not isinstance(initial, (str, History)):
         # A power of t that the equation of lower order integrates to would be a drive.
         initial = tuple(e for e in initial if e < highest.order.constant)
+    if any(not t.order.names and t.order.constant > highest.order.constant for t in rest if t.signal != item.output):
+        # Another signal would stand above the order of the lower equation: it cannot where it holds between samples.
+        return []
     try:
         lower = replace(item, order=highest.order, terms=rest)
         reduced = FreeProblem.of(replace(structure, equations=(lower,), initial=initial))

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
+from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss, Settings
 from ftlm.data.structures import History, Initial, Structure
@@ -31,6 +32,7 @@ from ftlm.search.job import run_job
 from ftlm.search.orders import make_job
 from ftlm.search.result import SearchResult
 from ftlm.search.store import Store
+from ftlm.solve.motion import decided_together
 from ftlm.solve.records import prepare
 
 #: Most pulses a run on which instrumental variables end where m is not given.
@@ -108,14 +110,13 @@ def by_output_error(
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
     record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False, gaps=True)[0]
-    joint = fit_any_start(
-        answers or task.runs, structure, record.initial, threads=threads, progress=progress, loss=loss
-    )
+    start = decided_together(task.runs, structure)
+    joint = fit_any_start(answers or task.runs, structure, start, threads=threads, progress=progress, loss=loss)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     if answers is not None:
         joint = instrumented(joint, problem, task.runs, answers)
     warnings = [*uncertain(joint, problem), *irregular(task.runs, joint, problem)]
-    if record.initial == "rest" and joint.initial != "rest":
+    if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
         structure = replace(structure, initial="history")
         warnings.append(
@@ -158,9 +159,10 @@ def by_lattice(
     at_orders = structure.with_orders(orders)
     fit = estimate_coefficients(task.runs, at_orders, settings, m)
     errors: Mapping[str, float] = fit.errors
-    if orders and fit.errors:
+    free = structure.with_orders({n: v for n, v in orders.items() if n in settled(task)})
+    if free.order_names and fit.errors:
         # At orders that are themselves estimates, those of the coefficients alone are too sure.
-        errors = errors_with_orders(task.runs, structure, {**orders, **fit.values}) or {}
+        errors = errors_with_orders(task.runs, free, {**orders, **fit.values}) or {}
     model = solved(task, method, at_orders.with_coefficients(fit.values), orders, fit.m, **settings.to_dict())
     edges = [(n, v) for search in searches.values() for n, v in search.edges.items()]
     return Fit(
@@ -175,6 +177,13 @@ def by_lattice(
         ],
         searches, errors,
     )  # fmt: skip
+
+
+def settled(task: Task) -> set[str]:
+    """Orders of which the lattice has one value, so that they are no estimates."""
+    parts = task.structure.parts().values() if task.structure.order_names else []
+    axes = [(task.lattice_of(part) or Lattice()).values(part) for part in parts]
+    return {n for values in axes for n, v in values.items() if len(v) == 1}
 
 
 def searched(

@@ -16,11 +16,11 @@ from ftlm.base.statistics import LEVEL, chi_squared
 from ftlm.data.equations import Term
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
-from ftlm.data.structures import Initial, Structure
+from ftlm.data.structures import Structure
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.uncertainty import covariance
-from ftlm.solve.motion import decided, together
+from ftlm.solve.motion import decided_together
 
 #: Pulses a sample interval where the fit does not say how many it needed.
 EVERY = 2
@@ -79,17 +79,11 @@ class OffsetTest:
         return f"none, since the runs ask for none ({self.figures})"
 
 
-def decided_initial(runs: Sequence[Run], structure: Structure) -> Initial:
-    """Initial terms of a fit of all runs together."""
-    starts = [decided(run, structure) for run in runs]
-    return together(starts) or starts[0]
-
-
 def at_point(
     runs: Sequence[Run], structure: Structure, values: Mapping[str, float], every: int
 ) -> tuple[Grid, Attempt]:
     """The output error at given numbers, each output weighing as its residuals ask for."""
-    problem = FreeProblem.of(replace(structure, initial=decided_initial(runs, structure)))
+    problem = FreeProblem.of(replace(structure, initial=decided_together(runs, structure)))
     orders, coefficients, delays = problem.split([values[n] for n in problem.names])
     start = Attempt(orders, coefficients, "given", {}, delays)
     grid = Grid(problem, runs, [1.0] * len(structure.outputs), every=every)
@@ -113,7 +107,7 @@ def offset_test(
     equations = tuple(
         replace(e, terms=(*e.terms, Term(one, Order(), n))) for e, n in zip(structure.equations, names, strict=True)
     )
-    extended = replace(structure, equations=equations, offset="none", initial=decided_initial(runs, structure))
+    extended = replace(structure, equations=equations, offset="none", initial=decided_together(runs, structure))
     try:
         whole = [run.with_outputs({one: np.ones(run.length)}) for run in runs]
         grid, here = at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)

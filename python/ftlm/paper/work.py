@@ -28,6 +28,7 @@ from ftlm.paper import printed
 from ftlm.paper.arm import StageNumber
 from ftlm.paper.records import RIVAL_ALPHA, WEAK_PRIOR, Candidate, Derived, Rival, Stage
 from ftlm.solve.free_run import explicit_euler
+from ftlm.solve.motion import starts_at_rest
 from ftlm.solve.records import default_m, prepare
 
 #: Instrumental variables are searched so many steps of the lattice around the orders of least squares: every candidate
@@ -69,6 +70,9 @@ class StageWork:
         own = list(self.measured.signals)
         self.on = self.square.select(own)
         self.off = None if self.sine is None else self.sine.select(own)
+        if not starts_at_rest(self.on, self.measured):
+            # The paper's equation errors have few terms; ten powers of t more would be combinations of them.
+            self.measured, self.coupled = (replace(s, initial="caputo") for s in (self.measured, self.coupled))
 
     def reproduced(self, genetic: Genetic | None) -> Stage:
         """Everything that section 5 says of a stage."""

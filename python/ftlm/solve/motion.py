@@ -11,6 +11,7 @@ wherever there is a doubt.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -84,6 +85,12 @@ def together(decisions: list[Initial]) -> Initial | None:
     if len(set(decisions)) < 2:
         return None
     return max(decisions, key=lambda d: (isinstance(d, tuple), d == "caputo", len(d)))
+
+
+def decided_together(runs: Sequence[Run], structure: Structure) -> Initial:
+    """Initial terms of a fit of all runs together."""
+    starts = [decided(run, structure) for run in runs]
+    return together(starts) or starts[0]
 
 
 def misfit(few: Floats, many: Floats, size: Floats, count: float) -> float:

@@ -114,7 +114,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     needs them; over others stand straight lines, to which nothing may be fitted.
     """
     _check_known(run, structure)
-    _check_held(run, structure)
+    check_held(run, structure)
     initial = decided(run, structure)
     sensor = None
     if filtered and structure.sensor_filter is not None:
@@ -142,7 +142,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     )
 
 
-def _check_held(run: Run, structure: Structure) -> None:
+def check_held(run: Run, structure: Structure) -> None:
     """Refuse the derivative of a jump: a held input above the order of the output that it drives."""
     for item in structure.equations:
         for term in item.terms:
