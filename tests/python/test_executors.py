@@ -168,7 +168,7 @@ def test_a_worker_keeps_few_searches_ready(run):
 def test_an_error_of_the_search_is_the_one_of_one_machine(run):
     with ThreadPoolExecutor(2) as pool:
         for here in (None, pool):
-            with pytest.raises(ModelError, match="order 0.7 of u is above alpha = 0.5"):
+            with pytest.raises(ModelError, match=r"order 0\.7 of u is above alpha = 0\.5"):
                 search(run, here, lattice=ftlm.Lattice(orders={"alpha": [0.5], "nu": [0.7], "beta": [0.1], "mu": [0]}))
 
 
