@@ -72,8 +72,9 @@ impl Points {
 
     /// Error of every candidate's free run, summed over the records: Σ|e|, or RMSE.
     ///
-    /// Infinite for orders that make no equation and for a free run that diverges. A candidate whose error exceeds
-    /// `limit` is left as soon as that is sure and is infinite, too. The same bits for any number of threads.
+    /// Infinite for orders that make no equation, for one above that of the output, and for a free run that diverges. A
+    /// candidate whose error exceeds `limit` is left as soon as that is sure and is infinite, too. The same bits for any
+    /// number of threads.
     ///
     /// # Errors
     /// A candidate of another length, coefficients that are not finite, threads that do not start,
@@ -85,7 +86,7 @@ impl Points {
     /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
     /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
     /// let record = Record::new(0.1, vec![output, input], None)?;
-    /// // D^α y = c u: α = 0.8 and c = 1 made y; an order of u above α makes no equation.
+    /// // D^α y = c u: α = 0.8 and c = 1 made y; an order of u above α is left out.
     /// let mut points = Points::new(vec![record], 0, vec![1], vec![false, true], Norm::L1)?;
     /// let point = |order: f64, of_input: f64| Point { order, orders: vec![of_input], coefficients: vec![1.0] };
     /// let errors = points.scores(&[point(0.8, 0.0), point(0.8, 0.9)], f64::INFINITY, 1, &Control::default())?;
@@ -102,7 +103,10 @@ impl Points {
             let terms = pairs.map(|(&signal, &order)| Term { signal, order }).collect();
             let structure = Structure { output: self.output, order: point.order, terms };
             let is_input = |s: usize| self.inputs.get(s).copied().unwrap_or(false);
-            structures.push(structure.check(self.records[0].len(), is_input).is_ok().then_some(structure));
+            let fits = structure.check(self.records[0].len(), is_input).is_ok();
+            // What holds between samples has no derivative at its jumps, and a candidate is to be judged as it will run.
+            let smooth = structure.terms.iter().all(|term| term.order <= structure.order);
+            structures.push((fits && smooth).then_some(structure));
         }
         let pool = pool(threads)?;
         self.fetch(&structures, &pool);
