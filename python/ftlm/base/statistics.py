@@ -16,6 +16,8 @@ REST_SIGMAS = 5.0
 REST_SHARE = 1e-3
 #: Median absolute deviation of a normal variable in units of its standard deviation.
 MAD = 0.6744897501960817
+#: Residuals below this share of an output's deviation are rounding and discretisation, of which nothing follows.
+ROUNDING = 3e-5
 #: Share of true models that a test is allowed to refuse.
 LEVEL = 0.01
 #: Half-widths of a 95 % and of a 99 % interval in standard deviations.
@@ -40,7 +42,7 @@ def noise_of(samples: Floats) -> float:
     if bends.size == 0:
         # No three neighbours were read: those that were stand closest.
         bends = np.diff(samples[~np.isnan(samples)], 2)
-    return float(np.median(np.abs(bends))) / MAD / float(np.sqrt(6.0)) if bends.size else 0.0
+    return robust_deviation(bends) / float(np.sqrt(6.0))
 
 
 def robust_deviation(values: Floats) -> float:
@@ -64,20 +66,19 @@ def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats
     return sums / np.maximum(pairs, 1.0), pairs
 
 
-def ljung_box(correlations: Floats, count: int) -> float:
-    """Ljung and Box's sum over autocorrelations at lags from 1 of a series of ``count`` samples."""
-    return count * (count + 2) * float(np.sum(correlations**2 / (count - np.arange(1, correlations.size + 1))))
+def autocorrelations(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
+    """Autocorrelations of series at lags from 0, sums over all of the power, and their pairs; NaN is not there."""
+    covariances, pairs = autocovariances(series, most)
+    power = covariances[0] * pairs[0]
+    return covariances * pairs / (power if power > 0 else 1.0), pairs
 
 
-def whiteness(covariances: Floats, pairs: Floats) -> float:
-    """Ljung and Box's sum from covariances at lags from 0 and the pairs that each is the mean of.
+def ljung_box(correlations: Floats, pairs: Floats) -> float:
+    """Ljung and Box's sum over autocorrelations at lags from 0, which stand for so many pairs each.
 
-    Where all values are there it is theirs; where some are not, each correlation has the variance of its own pairs.
+    Where some values are not there, each correlation has the variance of its own pairs.
     """
-    count = pairs[0]
-    # Sums over all of the power, as the statistic has them.
-    correlations = covariances[1:] * pairs[1:] / (covariances[0] * count)
-    return float((count + 2.0) * count * np.sum(correlations**2 / np.maximum(pairs[1:], 1.0)))
+    return float((pairs[0] + 2.0) * pairs[0] * np.sum(correlations[1:] ** 2 / np.maximum(pairs[1:], 1.0)))
 
 
 def chi_squared(degrees: int, level: float) -> float:
@@ -96,19 +97,16 @@ def chi_squared_99(degrees: int) -> float:
 
 def colour(series: Floats) -> float:
     """How much more a sum of the series scatters than one of white noise of its variance: 1 or above (Bartlett)."""
-    e = series - np.mean(series)
-    power = float(e @ e)
-    lags = min(int(4 * e.size ** (1.0 / 3.0)), e.size - 1)
-    if power == 0.0 or lags < 2:
+    lags = min(int(4 * series.size ** (1.0 / 3.0)), series.size - 1)
+    if lags < 2:
         return 1.0
-    return max(1.0, 1.0 + 2.0 * sum((1.0 - k / lags) * float(e[k:] @ e[:-k]) / power for k in range(1, lags)))
+    correlations = autocorrelations([series], lags - 1)[0][1:]
+    return max(1.0, 1.0 + 2.0 * float(np.sum((1.0 - np.arange(1, lags) / lags) * correlations)))
 
 
 def is_white(series: Floats, lags: int = 25) -> bool:
     """Ljung-Box test at 1 %: whether autocorrelations up to ``lags`` could be those of white noise."""
     if series.size <= lags + 1:
         return True
-    covariances, pairs = autocovariances([series], lags)
-    if not covariances[0] > 0 or pairs[0] <= lags + 1:
-        return True
-    return whiteness(covariances, pairs) <= chi_squared_99(lags)
+    correlations, pairs = autocorrelations([series], lags)
+    return bool(pairs[0] <= lags + 1) or ljung_box(correlations, pairs) <= chi_squared_99(lags)

@@ -142,13 +142,8 @@ class Equation:
         ModelError
             Orders out of range once they are numbers.
         """
-
-        def put(order: Order) -> Order:
-            constant = order.constant + sum(w * values[n] for n, w in order.weights if n in values)
-            return Order(round(constant, 9) + 0.0, tuple((n, w) for n, w in order.weights if n not in values))
-
-        terms = tuple(replace(t, order=put(t.order)) for t in self.terms)
-        return Equation(self.output, put(self.order), terms)
+        terms = tuple(replace(t, order=t.order.partly(values)) for t in self.terms)
+        return Equation(self.output, self.order.partly(values), terms)
 
     def with_coefficients(self, values: Mapping[str, float]) -> Equation:
         """Return the equation with these free coefficients replaced by values; others stay free.

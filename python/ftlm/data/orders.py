@@ -38,6 +38,11 @@ class Order:
     constant: float = 0.0
     weights: tuple[tuple[str, float], ...] = ()
 
+    def partly(self, values: Mapping[str, float]) -> Order:
+        """Return the order with these free orders replaced by values; others stay free."""
+        constant = self.constant + sum(w * values[n] for n, w in self.weights if n in values)
+        return Order(round(constant, 9) + 0.0, tuple((n, w) for n, w in self.weights if n not in values))
+
     @classmethod
     def parse(cls, text: str | float) -> Order:
         """Read ``0.5``, ``"alpha"`` or an affine expression such as ``"alpha1 - alpha2 + 2*mu2"``.

@@ -16,7 +16,7 @@ from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
-from ftlm.solve.motion import has_memory, history, misfit, needed, root_mean_square, together
+from ftlm.solve.motion import has_memory, history, misfit, missed, needed, together
 from ftlm.solve.sampled import FIRST_REFINEMENT, measured_samples, own_times, sampled
 
 #: A run whose first values look like rest is in motion where its residuals would ask for a history in this share of
@@ -78,12 +78,13 @@ def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
                 samples, found = sampled(model, run, FIRST_REFINEMENT, None, own_times(model, run))
             except FtlmError:
                 return False
-            ends.append(measured_samples(model, run, FIRST_REFINEMENT) - samples)
+            if not np.all(np.isfinite(samples)):
+                return False
+            ends.append(samples)
             terms += sum(map(len, found.values())) if start != "rest" else 0
-        if any(np.any(np.isinf(e)) for e in ends):
-            return False
+        measured = measured_samples(model, run, FIRST_REFINEMENT)
         size = np.nanstd([run[o] for o in structure.outputs], axis=1)
-        excess += misfit(root_mean_square(ends[0]), root_mean_square(ends[1]), size, run.length)
-        spread = max([spread, *map(colour, map(read, ends[1]))])
+        excess += misfit(missed(measured, ends[0]), missed(measured, ends[1]), size, run.length)
+        spread = max([spread, *map(colour, map(read, measured - ends[1]))])
     # Noise that is coloured is followed by slow terms in any run.
     return terms > 0 and excess / spread > chi_squared(terms, RARE)

@@ -32,7 +32,6 @@ from ftlm.search.job import run_job
 from ftlm.search.orders import make_job
 from ftlm.search.result import SearchResult
 from ftlm.search.store import Store
-from ftlm.solve.motion import decided_together
 from ftlm.solve.records import prepare
 
 #: Most pulses a run on which instrumental variables end where m is not given.
@@ -110,7 +109,7 @@ def by_output_error(
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
     record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False, gaps=True)[0]
-    start = decided_together(task.runs, structure)
+    start = record.initial
     joint = fit_any_start(answers or task.runs, structure, start, threads=threads, progress=progress, loss=loss)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     if answers is not None:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any, Literal
 
 from ftlm.base.errors import DataError, ModelError
+from ftlm.base.statistics import ROUNDING
 from ftlm.data.lattice import Lattice, check_lattice, check_lattice_names
 from ftlm.data.run import Run
 from ftlm.data.settings import LOSSES, METHODS, Loss, Settings, check_used
@@ -21,7 +22,7 @@ from ftlm.identification.judged import Task
 from ftlm.identification.offsets import with_decided_offset
 from ftlm.identification.reference import by_reference, driven_by
 from ftlm.identification.result import Identification
-from ftlm.identification.warnings import ROUNDING, discretisation, growing, unexcited
+from ftlm.identification.warnings import discretisation, growing, unexcited
 from ftlm.judge.comparison import Comparison, compared_samples, free_runs
 from ftlm.judge.criteria import InformationCriteria, information_criteria
 from ftlm.judge.metrics import finite

@@ -12,7 +12,7 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.colour import autoregression
 from ftlm.base.errors import FtlmError
-from ftlm.base.statistics import LEVEL, chi_squared
+from ftlm.base.statistics import LEVEL, ROUNDING, chi_squared
 from ftlm.data.equations import Term
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
@@ -20,17 +20,14 @@ from ftlm.data.structures import Structure
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.uncertainty import covariance
+from ftlm.judge.residuals import LAGS
 from ftlm.solve.motion import decided_together
 
 #: Pulses a sample interval where the fit does not say how many it needed.
 EVERY = 2
-#: Lags of the autoregression that stands for the colour of residuals.
-LAGS = 25
 #: Share of what an offset does that other unknowns must leave for it to be told from them.
 TOLD_APART = 1e-6
-#: What explains less of an output than this share of its deviation is rounding and discretisation; than that, nobody
-#: would miss it.
-ROUNDING = 3e-5
+#: What explains less of an output than this share of its deviation nobody would miss.
 VISIBLE = 1e-3
 #: Share of records without an offset in which one is spoken of that nobody asked for.
 UNASKED = 1e-4

@@ -16,13 +16,12 @@ from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.identification.estimate import Fit
 from ftlm.judge.feedback import past_columns
+from ftlm.judge.residuals import LAGS
 
 #: How many samples of a reference may stand by themselves, one for so many rows of the shortest run at least; those
 #: before are averaged over blocks, each wider by a factor.
 DENSE = (3, 6, 12, 25, 50, 100)
 ROWS_A_SAMPLE = 15
-#: Lags of the autoregression that stands for the colour of what the reference does not explain.
-LAGS = 25
 #: A first stage whose F is below this makes a weak instrument (Staiger and Stock, doi:10.2307/2171753).
 WEAK = 10.0
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
-from ftlm.base.statistics import is_white, robust_deviation
+from ftlm.base.statistics import ROUNDING, is_white, robust_deviation
 from ftlm.data.advice import excitation_for
 from ftlm.data.readings import read
 from ftlm.data.run import Run
@@ -29,8 +29,6 @@ INSEPARABLE = 0.995
 #: where it exceeds this much. However correlated two numbers are, both are usable if each is within a tenth: then its
 #: 95 % interval spans less than half its value, and an order's less than the steps of 0.5 in which mechanisms differ.
 VAGUE = 0.1
-#: Residuals below this share of an output are rounding and discretisation, of which nothing follows.
-ROUNDING = 3e-5
 #: Outliers are worth a word from so many on, and from this share of all residuals on.
 FEWEST_OUTLIERS = 3
 OUTLIERS = 2e-3

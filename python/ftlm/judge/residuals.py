@@ -17,7 +17,7 @@ from ftlm.base.arrays import Floats
 from ftlm.base.checks import whole_number
 from ftlm.base.colour import autoregression, is_constant, whitened
 from ftlm.base.errors import DataError, ModelError
-from ftlm.base.statistics import LEVEL, NORMAL_99, autocovariances, chi_squared_99, ljung_box, whiteness
+from ftlm.base.statistics import LEVEL, NORMAL_99, autocorrelations, chi_squared_99, ljung_box
 from ftlm.data.readings import bridged
 from ftlm.data.run import Run
 from ftlm.data.several import Runs, as_runs
@@ -390,13 +390,8 @@ def _lost(lags: NDArray[np.int64]) -> CorrelationTest:
 def _whiteness(series: list[Floats], count: int, lags: int) -> CorrelationTest:
     """Ljung and Box's sum against its limit."""
     limit = chi_squared_99(lags)
-    if any(np.isnan(e).any() for e in series):
-        covariances, pairs = autocovariances(series, lags)
-        power = covariances[0] if covariances[0] > 0 else 1.0
-        own, statistic = covariances / power, whiteness(covariances, pairs)
-    else:
-        own = _core.correlation(series, series, lags)[0][lags:]
-        statistic = ljung_box(own[1:], count)
+    own, pairs = autocorrelations(series, lags)
+    statistic = ljung_box(own, pairs)
     band = NORMAL_99 / math.sqrt(count)
     return CorrelationTest(np.arange(lags + 1), own, band, statistic, limit, passed=statistic <= limit)
 

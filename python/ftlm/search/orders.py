@@ -161,9 +161,9 @@ def make_job(
         )
     check_lattice(lattice)
     values = (lattice or Lattice()).values(equation)
-    known = equation.with_orders({n: v[0] for n, v in values.items() if len(v) == 1})
+    known = {n: v[0] for n, v in values.items() if len(v) == 1}
     for run in checked:
-        check_held(run, known)
+        check_held(run, equation, known)
     records = prepare(checked, equation, m, power_of_two=settings.needs_haar)
     units = {n: u for n, u in checked[0].units.items() if n in equation.signals}
     return Job(tuple(r.name for r in checked), units, equation, values, records, settings, _told(progress))

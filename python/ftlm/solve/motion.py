@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.statistics import chi_squared, is_rest, noise_of
+from ftlm.base.statistics import ROUNDING, chi_squared, is_rest, noise_of
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import History, Initial, Structure
@@ -38,8 +38,6 @@ WHOLE = 3
 #: runs. The usual share of 1 or 5 % would let a weak past through unseen, with intervals too short for its bias. Beside
 #: an offset, which explains a first value away from zero by itself and which a history would hide, it is less.
 DOUBT, DOUBT_BESIDE_OFFSET = 0.25, 0.02
-#: Residuals below this share of an output are rounding and discretisation, of which no test says anything.
-EXACT = 3e-5
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:
@@ -105,15 +103,17 @@ def misfit(few: Floats, many: Floats, size: Floats, count: float) -> float:
     count
         Samples of each output.
     """
-    seen = few > EXACT * size
+    seen = few > ROUNDING * size
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return float(np.nansum(np.where(seen, count * ((few / many) ** 2 - 1.0), 0.0)))
 
 
-def root_mean_square(residuals: Floats) -> Floats:
-    """Of each row, of what was read."""
+def missed(measured: Floats, simulated: Floats) -> Floats:
+    """Root mean square of what a free run misses of each row of what was read; infinite where it has no numbers."""
+    known = ~np.isnan(measured)
     with np.errstate(over="ignore", invalid="ignore"):
-        rows: Floats = np.sqrt(np.nanmean(residuals**2, axis=1))
+        power = np.sum(np.where(known, measured - simulated, 0.0) ** 2, axis=1) / np.sum(known, axis=1)
+    rows: Floats = np.sqrt(np.nan_to_num(power, nan=np.inf, posinf=np.inf))
     return rows
 
 

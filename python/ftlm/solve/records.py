@@ -142,15 +142,20 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     )
 
 
-def check_held(run: Run, structure: Structure) -> None:
-    """Refuse the derivative of a jump: a held input above the order of the output that it drives."""
+def check_held(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
+    """Refuse the derivative of a jump: a held input above the order of the output that it drives.
+
+    ``known`` holds free orders that have one value.
+    """
     for item in structure.equations:
+        alpha = item.order.partly(known or {})
         for term in item.terms:
-            if item.order.names or term.order.names or term.order.constant <= item.order.constant + 1e-9:
+            order = term.order.partly(known or {})
+            if alpha.names or order.names or order.constant <= alpha.constant + 1e-9:
                 continue
             if term.signal in run.inputs and run.intersample[term.signal] == "zoh":
                 raise ModelError(
-                    f"order {term.order.constant:g} of {term.signal} is above alpha = {item.order.constant:g} of "
+                    f"order {order.constant:g} of {term.signal} is above alpha = {alpha.constant:g} of "
                     f"{item.output}, and run {run.name!r} holds {term.signal} between its samples: its jumps have no "
                     "derivative; lower the order, or say intersample='foh' if it moves in between"
                 )

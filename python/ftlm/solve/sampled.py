@@ -20,7 +20,7 @@ from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Offset, SensorFilter, Structure, offset_exponents
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
-from ftlm.solve.motion import decided, misfit, needed, root_mean_square
+from ftlm.solve.motion import decided, misfit, missed, needed
 from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
@@ -135,7 +135,7 @@ def started(model: Solved, run: Run) -> Solved:
         return long
     more = sum(map(len, theirs.values())) - sum(map(len, ours.values()))
     size, count = np.nanstd(measured, axis=1), measured.shape[1]
-    excess = misfit(root_mean_square(measured - few), root_mean_square(measured - many), size, count)
+    excess = misfit(missed(measured, few), missed(measured, many), size, count)
     return long if needed(model.structure, excess, more) else short
 
 
