@@ -9,8 +9,6 @@ rest, or after a wait that lets a past fade). Seeds are 0 to ``--seeds`` less on
 from __future__ import annotations
 
 import argparse
-import platform
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -25,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 import motion
+from results import append, heading
 
 #: Half-width of a 95 % interval in standard errors.
 NORMAL_95 = 1.959963984540054
@@ -276,18 +275,13 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     arguments = parser.parse_args()
     measured = {"intervals": intervals, "bases": bases, "waits": waits}[arguments.what]
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    given = [f'"{a}"' if "|" in a or " " in a else a for a in sys.argv[1:] if a != "--write"]
-    command = " ".join(["python benches/history.py", *given])
-    lines = [f"`{command}`, commit {commit.stdout.strip()}, {platform.machine()}:", ""]
+    lines = [f"{heading()}:", ""]
     print(lines[0])
     for row in measured(arguments.plants.split("|"), arguments.seeds):
         lines.append(f"- {row}")
         print(lines[-1], flush=True)
     if arguments.write:
-        results = Path(__file__).with_name("RESULTS.md")
-        with results.open("a", encoding="utf-8") as file:
-            file.write("\n" + "\n".join(lines) + "\n")
+        append(lines)
 
 
 if __name__ == "__main__":

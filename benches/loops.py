@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
-import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -22,6 +20,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 import loops
+from results import append, heading
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -150,16 +149,13 @@ def main() -> None:
     rows: Iterable[str] = {"loops": closed, "instruments": instruments, "offsets": offsets, "cell": cell}[
         arguments.what
     ](arguments.seeds)
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    command = " ".join(["python benches/loops.py", *[a for a in sys.argv[1:] if a != "--write"]])
-    lines = [f"`{command}`, commit {commit.stdout.strip()}, {platform.machine()}, {os.cpu_count()} cores:", ""]
+    lines = [f"{heading()}:", ""]
     print(lines[0])
     for row in rows:
         lines.append(f"- {row}")
         print(lines[-1], flush=True)
     if arguments.write:
-        results = Path(__file__).with_name("RESULTS.md")
-        results.write_text(results.read_text().rstrip() + "\n\n" + "\n".join(lines) + "\n")
+        append(lines)
 
 
 if __name__ == "__main__":

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -27,6 +25,7 @@ from ftlm.fit.grid import Attempt, descend, experiment
 from ftlm.fit.joint import fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.records import record
+from results import append, heading
 
 #: Factors on the true coefficients and shifts of the true orders from which both start.
 FACTORS = np.array([1.3, 0.8, 1.5, 1.2])
@@ -128,9 +127,8 @@ def main() -> None:
     start = time.perf_counter()
     fit_output_error([run], structure, threads=cores, refine=False)
     waited = time.perf_counter() - start
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
     lines = [
-        f"`python benches/output_error.py`, commit {commit.stdout.strip()}, {platform.machine()}:",
+        f"{heading()}:",
         "",
         f"- P7, ten numbers, two outputs of 5 000 samples, 40 dB, same start: {own:.3f} s, "
         f"{ours.outcome['evaluations']} evaluations, one core; SciPy on NumPy {rival:.1f} s, "
@@ -143,8 +141,7 @@ def main() -> None:
     ]
     print("\n".join(lines))
     if arguments.write:
-        with Path(__file__).with_name("RESULTS.md").open("a", encoding="utf-8") as file:
-            file.write("\n" + "\n".join(lines) + "\n")
+        append(lines)
 
 
 if __name__ == "__main__":

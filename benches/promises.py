@@ -27,6 +27,7 @@ from ftlm import _core
 from ftlm.base.checks import available_threads
 from ftlm.data.settings import REFINEMENTS
 from ftlm.solve.records import record
+from results import append, commit, heading
 from search import fft_time, plant_a_run
 
 HERE = Path(__file__).parent
@@ -391,12 +392,6 @@ def memory(quick: bool) -> None:
         )  # fmt: skip
 
 
-def commit() -> str:
-    """Commit of the tree."""
-    found = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    return found.stdout.strip() or "unknown"
-
-
 def main() -> None:
     """Measure, judge, print; say how long each part took."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -417,7 +412,7 @@ def main() -> None:
     chosen = arguments.only.split(",") if arguments.only else list(parts)
     if unknown := [name for name in chosen if name not in parts]:
         parser.error(f"no part {unknown[0]!r}; parts are {', '.join(parts)}")
-    say(f"commit {commit()}, {platform.machine()}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f} at the start")
+    say(f"{heading()}, load {os.getloadavg()[0]:.1f} at the start")
     for name in chosen:
         start = time.perf_counter()
         parts[name]()
@@ -425,9 +420,7 @@ def main() -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     say(f"load {os.getloadavg()[0]:.1f} at the end; this process took at most {peak:.0f} MB")
     if write:
-        path = HERE / "RESULTS.md"
-        text = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
-        path.write_text(text.rstrip("\n") + "\n\n" + "\n".join(f"- {line}" for line in lines) + "\n", encoding="utf-8")
+        append([f"- {line}" for line in lines])
 
 
 if __name__ == "__main__":

@@ -9,20 +9,17 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter, lsim
 
 import ftlm
+from results import append, heading
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 
@@ -219,10 +216,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     arguments = parser.parse_args()
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    command = " ".join(["python benches/robust.py", *[a for a in sys.argv[1:] if a != "--write"]])
     lines = [
-        f"`{command}`, commit {commit.stdout.strip()}, {platform.machine()}: {ROWS} rows, {arguments.seeds} seeds, all "
+        f"{heading()}: {ROWS} rows, {arguments.seeds} seeds, all "
         "orders free", "",
         "| record | plant | covered by 95 % intervals, each number | largest mean z | error / that of white noise "
         "| cause named | s |", "| --- | --- | --- | --- | --- | --- | --- |",
@@ -246,8 +241,7 @@ def main() -> None:
                 )
                 print(lines[-1], flush=True)
     if arguments.write:
-        with Path(__file__).with_name("RESULTS.md").open("a", encoding="utf-8") as file:
-            file.write("\n" + "\n".join(lines) + "\n")
+        append(lines)
 
 
 if __name__ == "__main__":

@@ -6,12 +6,8 @@
 from __future__ import annotations
 
 import argparse
-import os
-import platform
-import subprocess
 import time
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +16,7 @@ import literal
 from ftlm.base.checks import available_threads
 from ftlm.paper.arm import demo_plant
 from ftlm.solve.records import record
+from results import append, heading
 
 #: Candidates that the literal algorithm is timed on; each takes seconds.
 LITERAL = 20
@@ -73,8 +70,7 @@ def main() -> None:
         lines.append(text)
         print(text, flush=True)
 
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    say(f"commit {commit.stdout.strip() or 'unknown'}, {platform.machine()}, {os.cpu_count()} cores, {threads} threads")
+    say(f"{heading()}, {threads} threads")
     fft = fft_time()
     say(f"one forward real FFT of 4096 (NumPy): {fft * 1e6:.1f} us")
 
@@ -125,9 +121,7 @@ def main() -> None:
     if worst > 1e-6:
         raise SystemExit("the literal algorithm and ours disagree")
     if write:
-        path = Path(__file__).with_name("RESULTS.md")
-        text = path.read_text(encoding="utf-8") if path.exists() else "# Results\n"
-        path.write_text(text + "\n" + "\n".join(f"- {line}" for line in lines) + "\n", encoding="utf-8")
+        append([f"- {line}" for line in lines])
 
 
 if __name__ == "__main__":

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
-import subprocess
 import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
@@ -28,6 +26,7 @@ from ftlm.fit.grid import Attempt, descend, experiment
 from ftlm.fit.joint import fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.paper.arm import demo_plant
+from results import append, heading
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -389,17 +388,13 @@ def main() -> None:
         "arm": lambda: arm(arguments.outputs.split(",")),
         "heating": heating,
     }[arguments.what]()
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    command = " ".join(["python benches/truth.py", *[a for a in sys.argv[1:] if a != "--write"]])
-    lines = [f"`{command}`, commit {commit.stdout.strip()}, {platform.machine()}, {workers()} cores:"]
+    lines = [f"{heading()}:", ""]
     print(lines[0])
     for row in rows:
         lines.append(f"- {row}")
         print(lines[-1], flush=True)
     if arguments.write:
-        results = Path(__file__).with_name("RESULTS.md")
-        with results.open("a", encoding="utf-8") as file:
-            file.write("\n" + "\n".join(lines) + "\n")
+        append(lines)
 
 
 if __name__ == "__main__":
