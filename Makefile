@@ -35,8 +35,9 @@ lint: $(VENV)/.built
 test-rust:
 	cargo test --release
 
+# A file is the work of one of two workers, so that what its tests share is made once.
 test-python: $(VENV)/.built
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile
 
 test-slow: $(VENV)/.built
 	$(BIN)/python -m pytest -m slow --timeout 7200

@@ -40,6 +40,9 @@ pub struct Equation {
     pub coefficients: Vec<f64>,
 }
 
+/// A power of t this close to that of an offset cannot be told from it.
+const STAND_IN: f64 = 0.05;
+
 /// How a record that does not start at rest is treated.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Initial {
@@ -214,6 +217,9 @@ impl Structure {
     }
 
     /// Exponents of the initial terms, distinct and ascending.
+    ///
+    /// Beside an offset, which is t^α, Caputo's powers within 0.05 of it are left out: an order just above a whole one
+    /// brings a power that just below it is not there, and t beside D^1.0003 is the offset by another name.
     #[must_use]
     pub fn initial_exponents(&self, initial: &Initial) -> Vec<f64> {
         let mut exponents = match initial.under() {
@@ -227,7 +233,11 @@ impl Structure {
                 all
             }
         };
-        exponents.extend(initial.offset_exponents(self.order));
+        let offset = initial.offset_exponents(self.order);
+        if *initial.under() == Initial::Caputo {
+            exponents.retain(|e| *e == 0.0 || offset.iter().all(|o| (e - o).abs() > STAND_IN));
+        }
+        exponents.extend(offset);
         exponents.sort_by(f64::total_cmp);
         exponents.dedup_by(|a, b| (*a - *b).abs() < ORDER_GRAIN);
         exponents

@@ -1,7 +1,11 @@
 """Fixtures that several test files share: reference files, the synthetic plants with their records, seeded noise."""
 
 import json
+import os
 from pathlib import Path
+
+# Workers of the suite share the processor's cores: threads of each would wait for one another. Read when NumPy loads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import pytest

@@ -311,7 +311,7 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
     mats = sorted(str(p) for p in run.glob("*.mat"))
     assert len(mats) == 6
     for cross in ((), ("--cross-stage",)):
-        options = ("--slice", "1.1:19.5", "--structure", "flexible-link:1", "--coupling", "measured",
+        options = ("--slice", "1.1:7.1", "--structure", "flexible-link:1", "--coupling", "measured",
                    "--method", "least-squares", "--step", "0.2", "--initial", "caputo", "--json", "--force",
                    *cross)  # fmt: skip
         found = [
@@ -324,8 +324,9 @@ def test_the_real_arm_from_csv_and_from_mat_files_is_one_model(tmp_path: Path) -
         for name, value in first["coefficients"].items():
             assert second["coefficients"][name] == pytest.approx(value, rel=1e-6)
         compared = ftlm_command(
-            "compare", "a.json", str(DATA / "two_link_lqr" / "lqr.csv"), "--columns", "csv.toml", cwd=tmp_path
-        )
+            "compare", "a.json", str(DATA / "two_link_lqr" / "lqr.csv"), "--columns", "csv.toml", "--slice", "0:6",
+            cwd=tmp_path,
+        )  # fmt: skip
         assert compared.returncode == 0, compared.stderr
         for words in ("equation error", "output error", "theta11", "theta12"):
             assert words in compared.stdout

@@ -17,6 +17,7 @@ import oracles
 from ftlm import cli
 from ftlm.fit.streaming import Streaming
 from ftlm.identification.local import offset_test
+from ftlm.solve.sampled import initial_exponents
 from measured import DATA, needs_data
 
 WORDS = "D^0.8 y = -a y + b u + c"
@@ -467,3 +468,42 @@ def test_the_offset_of_the_hub_ends_in_the_global_optimum(name, within):
     found = ftlm.identify(thin, structure)
     assert found.fit_percent["theta11"] == pytest.approx(reached, abs=0.3)
     assert reached == pytest.approx({"psf": 76.4, "lqr": 87.9}[name], abs=0.3)
+
+
+def raised_motor(seed):
+    """A motor of first order whose speed is read 5 rad/s too high, and so at its start."""
+    rng = np.random.default_rng([14, seed])
+    t, u = np.arange(800) * 0.01, np.repeat(rng.choice([-1.0, 1.0], 40), 20)
+    _, y, _ = lsim(([8.0], [0.15, 1.0]), u, t, interp=False)
+    return ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y + 5.0 + 0.02 * rng.standard_normal(800)})
+
+
+FIRST_ORDER = "D^alpha y = a y + b u"
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_an_offset_is_found_whichever_side_of_one_the_order_ends(seed):
+    # Just above one Caputo's terms hold t^1, which does what the offset does; just below one they do not.
+    found = ftlm.identify(raised_motor(seed), ftlm.equation(FIRST_ORDER, offset="auto"))
+    assert found.settings["offset_test"].startswith("constant")
+    assert found.settings["initial"] == "caputo"
+    assert found.comparison.offsets[0]["y"]["constant"] == pytest.approx(5 / 0.15, rel=0.01)
+    assert sorted(found.comparison.initial[0]["y"]) == pytest.approx([0.0, found.orders["alpha"]])
+    for name, true in {"alpha": 1.0, "a": -1 / 0.15, "b": 8 / 0.15}.items():
+        value = {**found.orders, **found.coefficients}[name]
+        assert abs(value - true) < 3.5 * found.standard_errors[name]
+
+
+def test_where_a_constant_does_what_a_past_was_taken_for_it_is_said():
+    found = ftlm.identify(raised_motor(0), ftlm.equation(FIRST_ORDER))
+    assert found.settings["initial"].startswith("history")
+    (said,) = [w for w in found.warnings if "unknown constant" in w]
+    assert "numbers fewer" in said
+    assert "offset='auto'" in said
+
+
+@pytest.mark.parametrize(("alpha", "left"), [(1.0003, [0.0]), (1.04, [0.0]), (1.2, [0.0, 1.0]), (1.98, [0.0, 1.0])])
+def test_powers_of_time_that_an_offset_is_are_left_out(alpha, left):
+    (item,) = ftlm.equation(f"D^{alpha} y = -2 y + u").equations
+    assert initial_exponents(item, "caputo", "constant") == pytest.approx([*left, alpha])
+    assert initial_exponents(item, "caputo", "none") == [0.0, 1.0]

@@ -408,7 +408,8 @@ def test_outliers_are_named_with_the_way_out_and_huber_ignores_them() -> None:
     run = struck(1)
     plain = ftlm.identify(run, ftlm.equation(FREE))
     (said,) = [w for w in plain.warnings if "huber" in w]
-    assert said.startswith("4 of 398 residuals of y lie beyond 5 times the usual one, first at row ")
+    assert said.startswith("4 of 398 residuals of y lie beyond 5 times the usual one and hold 99 % of their squares, ")
+    assert "first at row " in said
     robust = ftlm.identify(run, ftlm.equation(FREE), loss="huber")
     near_truth(robust)
     for name, error in plain.standard_errors.items():
@@ -421,6 +422,17 @@ def test_outliers_are_named_with_the_way_out_and_huber_ignores_them() -> None:
     y = noisy(1)[1]
     assert robust.joint.noise["y"] == pytest.approx(0.01 * np.std(y), rel=0.15)
     assert robust.fit_percent["y"] < 90
+
+
+def test_one_outlier_that_holds_most_of_the_squares_is_named() -> None:
+    u, y = noisy(3)
+    y[150] += 30 * np.std(y)
+    (said,) = [w for w in ftlm.identify(run_of(u, y), ftlm.equation(FREE)).warnings if "huber" in w]
+    assert said.startswith("1 of 398 residuals of y lies beyond 5 times the usual one and holds 100 % of their squares")
+    # One of four deviations more is not worth a word.
+    u, y = noisy(3)
+    y[150] += 0.06 * np.std(y)
+    assert not [w for w in ftlm.identify(run_of(u, y), ftlm.equation(FREE)).warnings if "huber" in w]
 
 
 def test_huber_is_the_minimum_of_its_loss() -> None:

@@ -18,6 +18,8 @@ REST_SHARE = 1e-3
 MAD = 0.6744897501960817
 #: Residuals below this share of an output's deviation are rounding and discretisation, of which nothing follows.
 ROUNDING = 3e-5
+#: Residuals beyond so many deviations count by their size: 95 % of the precision of squares under normal noise.
+BEND = 1.345
 #: Share of true models that a test is allowed to refuse.
 LEVEL = 0.01
 #: Half-widths of a 95 % and of a 99 % interval in standard deviations.
@@ -48,6 +50,22 @@ def noise_of(samples: Floats) -> float:
 def robust_deviation(values: Floats) -> float:
     """Deviation of normal values from the median of their sizes, which a few that are far off do not move."""
     return float(np.median(np.abs(values))) / MAD if values.size else 0.0
+
+
+def huber_excess(few: Floats, many: Floats) -> float:
+    """By how much Huber's loss of residuals exceeds that of residuals of a larger model, in units of their noise.
+
+    Where the smaller model is enough this is distributed as chi-squared, with as many degrees as the larger one has
+    numbers more, however far a few residuals lie (doi:10.1214/aoms/1177703732).
+    """
+    scale = robust_deviation(many) or float(np.sqrt(np.mean(many**2)))
+    if not np.all(np.isfinite(few)) or (scale == 0.0 and np.any(few)):
+        return float("inf")
+    one, other = (np.abs(e) / (scale or 1.0) for e in (few, many))
+    losses = [np.where(r <= BEND, r**2, BEND * (2.0 * r - BEND)) for r in (one, other)]
+    # Both means are those of the loss's slope and curvature; under normal noise their ratio is 0.86.
+    slope, curvature = np.mean(np.minimum(other, BEND) ** 2), np.mean(other <= BEND)
+    return float(np.sum(losses[0] - losses[1]) * curvature / slope) if slope > 0 else 0.0
 
 
 def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:

@@ -57,11 +57,30 @@ def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: L
     except FtlmError:
         # From here it has no finite free run, so it is not enough.
         return joint
+    return joint if asks_for_history(few, joint, runs, structure) else few
+
+
+def instead_of_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:
+    """A fit with Caputo's terms and a constant in each equation that leaves no more than one with a history, if any."""
+    asked = replace(structure, offset="constant")
+    values = dict(zip(joint.names, joint.values.tolist(), strict=True))
+    loss: Loss = "squares" if joint.robust is None else "huber"
+    try:
+        few = fit_output_error(runs, replace(asked, initial="caputo"), start=values, loss=loss)
+    except FtlmError:
+        return None
+    fewer = few.initial_terms < joint.initial_terms
+    return few if fewer and not asks_for_history(few, joint, runs, asked) else None
+
+
+def asks_for_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
+    """Whether a fit with few initial terms leaves more than one with a history."""
     outputs = structure.outputs
-    ours, theirs = (np.array([fit.noise[o] for o in outputs]) for fit in (few, joint))
-    size = np.array([np.nanstd(np.concatenate([run[o] for run in runs])) for o in outputs])
-    excess = misfit(ours, theirs, size, joint.samples / len(outputs))
-    return joint if needed(structure, excess, joint.initial_terms - few.initial_terms) else few
+    ours, theirs = (
+        [fit.noise[o] * np.concatenate([part[o] for part in fit.residuals]) for o in outputs] for fit in (few, many)
+    )
+    sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in outputs]
+    return needed(structure, misfit(ours, theirs, sizes), many.initial_terms - few.initial_terms)
 
 
 def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
@@ -80,11 +99,10 @@ def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
                 return False
             if not np.all(np.isfinite(samples)):
                 return False
-            ends.append(samples)
+            ends.append(missed(measured_samples(model, run, FIRST_REFINEMENT), samples))
             terms += sum(map(len, found.values())) if start != "rest" else 0
-        measured = measured_samples(model, run, FIRST_REFINEMENT)
-        size = np.nanstd([run[o] for o in structure.outputs], axis=1)
-        excess += misfit(missed(measured, ends[0]), missed(measured, ends[1]), size, run.length)
-        spread = max([spread, *map(colour, map(read, measured - ends[1]))])
+        sizes = np.nanstd([run[o] for o in structure.outputs], axis=1).tolist()
+        excess += misfit([*ends[0]], [*ends[1]], sizes)
+        spread = max([spread, *map(colour, map(read, ends[1]))])
     # Noise that is coloured is followed by slow terms in any run.
     return terms > 0 and excess / spread > chi_squared(terms, RARE)

@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.statistics import robust_deviation
+from ftlm.base.statistics import BEND, robust_deviation
 from ftlm.fit.grid import Attempt, Grid
 
-#: Residuals beyond so many deviations count by their size: 95 % of the precision of squares under normal noise.
-BEND = 1.345
 #: Residuals beyond so many deviations are outliers: of normal noise one in two millions is.
 FAR = 5.0
 #: Shares are settled when none moves by more than this.

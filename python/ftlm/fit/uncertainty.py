@@ -6,10 +6,9 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.colour import colour_covariances, coloured
-from ftlm.base.statistics import is_white, robust_deviation
+from ftlm.base.statistics import BEND, is_white, robust_deviation
 from ftlm.data.readings import read
 from ftlm.fit.grid import Attempt, Grid
-from ftlm.fit.robust import BEND
 
 #: Lags of the residuals' autocovariance that the robust covariance takes in, as a power of the sample count.
 LAG_POWER = 1.0 / 3.0

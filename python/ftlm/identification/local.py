@@ -16,12 +16,13 @@ from ftlm.base.statistics import LEVEL, ROUNDING, chi_squared
 from ftlm.data.equations import Term
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
-from ftlm.data.structures import Structure
+from ftlm.data.structures import History, Initial, Structure, offset_exponents
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.uncertainty import covariance
 from ftlm.judge.residuals import LAGS
 from ftlm.solve.motion import decided_together
+from ftlm.solve.sampled import initial_exponents
 
 #: Pulses a sample interval where the fit does not say how many it needed.
 EVERY = 2
@@ -104,7 +105,8 @@ def offset_test(
     equations = tuple(
         replace(e, terms=(*e.terms, Term(one, Order(), n))) for e, n in zip(structure.equations, names, strict=True)
     )
-    extended = replace(structure, equations=equations, offset="none", initial=decided_together(runs, structure))
+    initial = without_stand_ins(decided_together(runs, structure), structure, values)
+    extended = replace(structure, equations=equations, offset="none", initial=initial)
     try:
         whole = [run.with_outputs({one: np.ones(run.length)}) for run in runs]
         grid, here = at_point(whole, extended, {**values, **dict.fromkeys(names, 0.0)}, every)
@@ -148,6 +150,17 @@ def offset_test(
         for (a, b), w, s in zip(places, weights, sizes, strict=True)
     )
     return OffsetTest(statistic, count, float(along @ along) / total, size)
+
+
+def without_stand_ins(initial: Initial, structure: Structure, values: Mapping[str, float]) -> Initial:
+    """Caputo's terms at given numbers without powers of t that do what an offset does; others as they are."""
+    if initial != "caputo":
+        return initial
+    kept: set[float] = set()
+    for item in (e.with_orders({n: values[n] for n in e.order_names}) for e in structure.equations):
+        own = offset_exponents(item.order.constant, "constant").values()
+        kept |= set(initial_exponents(item, "caputo", "constant")) - {round(e, 9) for e in own}
+    return History(sorted(kept))
 
 
 def _blocks(grid: Grid) -> list[list[tuple[int, int]]]:

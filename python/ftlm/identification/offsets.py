@@ -9,7 +9,8 @@ import numpy as np
 
 from ftlm.base.errors import ModelError
 from ftlm.data.run import Run
-from ftlm.data.structures import Structure
+from ftlm.data.structures import History, Structure
+from ftlm.fit.history import instead_of_history
 from ftlm.identification.estimate import Fit
 from ftlm.identification.local import EVERY, OffsetTest, offset_test, unasked_offset
 
@@ -25,8 +26,10 @@ def with_decided_offset(runs: Sequence[Run], structure: Structure, estimate: Cal
     """
     if structure.offset != "auto":
         fit = estimate(structure)
-        test = tested(fit) if structure.offset == "none" and _small(fit.task.runs) else None
-        return replace(fit, warnings=[*fit.warnings, *unasked_offset(test, fit.model.outputs)])
+        if structure.offset != "none" or not _small(fit.task.runs):
+            return fit
+        said = unasked_offset(tested(fit), fit.model.outputs) or _in_place_of_a_past(fit)
+        return replace(fit, warnings=[*fit.warnings, *said])
     try:
         asked = replace(structure, offset="constant")
     except ModelError as error:
@@ -42,6 +45,22 @@ def with_decided_offset(runs: Sequence[Run], structure: Structure, estimate: Cal
         return _told(fit, test.decision)
     decision = "none: its test has no finite free run" if test is None else test.decision
     return _told(estimate(replace(structure, offset="none")), decision)
+
+
+def _in_place_of_a_past(fit: Fit) -> list[str]:
+    """Say where a constant explains what a history was taken for: powers of time do not go with the model, it would."""
+    joint, structure = fit.joint, fit.task.structure
+    if joint is None or structure.initial != "auto" or not isinstance(joint.initial, History):
+        return []
+    few = instead_of_history(joint, fit.task.runs, structure)
+    if few is None:
+        return []
+    less = joint.initial_terms - few.initial_terms
+    return [
+        f"what {', '.join(fit.model.outputs)} did before the runs is estimated with {joint.initial_terms} powers of "
+        f"time; an unknown constant in the equation explains as much with {less} numbers fewer: if a sensor's zero, a "
+        "load or a mean may be there, offset='auto' estimates it"
+    ]
 
 
 def same_as_offset(runs: Sequence[Run], structure: Structure) -> str | None:

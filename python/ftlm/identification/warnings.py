@@ -29,9 +29,11 @@ INSEPARABLE = 0.995
 #: where it exceeds this much. However correlated two numbers are, both are usable if each is within a tenth: then its
 #: 95 % interval spans less than half its value, and an order's less than the steps of 0.5 in which mechanisms differ.
 VAGUE = 0.1
-#: Outliers are worth a word from so many on, and from this share of all residuals on.
+#: Outliers are worth a word from so many on, and from this share of all residuals on; fewer, where they hold this share
+#: of the squares: they double the variance of every number then.
 FEWEST_OUTLIERS = 3
 OUTLIERS = 2e-3
+DECISIVE = 0.5
 #: Noise of this share of a step shakes an output over its steps; with less, residuals are the rounding itself.
 COARSE = 2.0
 #: Share of a step by which multiples of it may be off.
@@ -116,7 +118,8 @@ def _outliers(runs: Sequence[Run], joint: JointFit, output: str) -> str | None:
     """Residuals far beyond the usual ones, where nothing was done about them."""
     if joint.robust is not None:
         return None
-    usual = robust_deviation(read(np.concatenate([part[output] for part in joint.residuals])))
+    every = read(np.concatenate([part[output] for part in joint.residuals]))
+    usual = robust_deviation(every)
     far, first = 0, ""
     for run, part in zip(runs, joint.residuals, strict=True):
         rows = np.flatnonzero(np.abs(part[output]) > FAR * usual)
@@ -124,11 +127,15 @@ def _outliers(runs: Sequence[Run], joint: JointFit, output: str) -> str | None:
             # Compared rows begin behind the first one.
             first = f"first at row {int(rows[0]) + 1} of {run.name}"
         far += rows.size
-    count = sum(read(part[output]).size for part in joint.residuals)
-    if usual == 0.0 or far < max(FEWEST_OUTLIERS, OUTLIERS * count):
+    count = every.size
+    share = float(np.sum(every[np.abs(every) > FAR * usual] ** 2) / max(float(every @ every), 1e-300))
+    if usual == 0.0 or (share < DECISIVE and far < max(FEWEST_OUTLIERS, OUTLIERS * count)):
         return None
+    verb, held = ("lies", "holds") if far == 1 else ("lie", "hold")
+    power = f" and {held} {100 * share:.0f} % of their squares" if share >= DECISIVE else ""
     return (
-        f"{far} of {count} residuals of {output} lie beyond {FAR:g} times the usual one, {first}: outliers, or moments "
+        f"{far} of {count} residuals of {output} {verb} beyond {FAR:g} times the usual one{power}, {first}: "
+        f"{'an outlier' if far == 1 else 'outliers'}, or moments "
         "that the model does not explain; squares let them cost precision: loss='huber' weighs them down"
     )
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.statistics import ROUNDING, chi_squared, is_rest, noise_of
+from ftlm.base.statistics import ROUNDING, chi_squared, huber_excess, is_rest, noise_of
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import History, Initial, Structure
@@ -91,29 +91,31 @@ def decided_together(runs: Sequence[Run], structure: Structure) -> Initial:
     return together(starts) or starts[0]
 
 
-def misfit(few: Floats, many: Floats, size: Floats, count: float) -> float:
+def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
     """By how much residuals with few initial terms exceed those with many, in units of noise.
 
     Where the few are enough this is distributed as chi-squared, with as many degrees as there are terms more.
 
     Parameters
     ----------
-    few, many, size
-        Root mean square of the residuals, and deviation of what was measured, of each output.
-    count
-        Samples of each output.
+    few, many
+        Residuals of each output; infinite where a free run has no numbers, NaN where nothing was read.
+    sizes
+        Deviation of what was measured of each output.
     """
-    seen = few > ROUNDING * size
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return float(np.nansum(np.where(seen, count * ((few / many) ** 2 - 1.0), 0.0)))
+    excess = 0.0
+    for one, other, size in zip(few, many, sizes, strict=True):
+        there = ~np.isnan(one)
+        if float(np.sqrt(np.mean(one[there] ** 2))) > ROUNDING * size:
+            excess += huber_excess(one[there], other[there])
+    return excess
 
 
 def missed(measured: Floats, simulated: Floats) -> Floats:
-    """Root mean square of what a free run misses of each row of what was read; infinite where it has no numbers."""
-    known = ~np.isnan(measured)
-    with np.errstate(over="ignore", invalid="ignore"):
-        power = np.sum(np.where(known, measured - simulated, 0.0) ** 2, axis=1) / np.sum(known, axis=1)
-    rows: Floats = np.sqrt(np.nan_to_num(power, nan=np.inf, posinf=np.inf))
+    """What a free run misses of what was read; infinite where it has no numbers, NaN where nothing was read."""
+    with np.errstate(invalid="ignore"):
+        rows: Floats = measured - simulated
+    rows[~np.isnan(measured) & ~np.isfinite(rows)] = np.inf
     return rows
 
 

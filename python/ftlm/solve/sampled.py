@@ -28,6 +28,9 @@ from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_ser
 FIRST_REFINEMENT = 2
 #: Orders closer than this are one order.
 GRAIN = 1e-9
+#: A power of t this close to that of an offset cannot be told from it: an order just above a whole one brings a power
+#: that just below it is not there, and t^1 beside D^1.0003 is a constant force.
+STAND_IN = 0.05
 #: Orders of integration from which on a kink is as smooth as pulses follow.
 SMOOTH = 2.0
 #: Share of a response of an initial term that others must leave for it to be told from them.
@@ -65,9 +68,10 @@ def initial_exponents(item: Equation, initial: Initial, offset: Offset) -> list[
     found = {round(e, 9) for e in offset_exponents(alpha, offset).values()}
     if initial != "caputo":
         return sorted(found | ({round(e, 9) for e in initial} if not isinstance(initial, str) else set()))
+    left: set[float] = set()
     for lowest, order in [(0.0, alpha), *((alpha - t.order.constant, t.order.constant) for t in item.terms)]:
-        found |= {round(lowest + i, 9) for i in range(math.ceil(order - GRAIN))}
-    return sorted(found)
+        left |= {round(lowest + i, 9) for i in range(math.ceil(order - GRAIN))}
+    return sorted(found | {e for e in left if e == 0.0 or all(abs(e - o) > STAND_IN for o in found)})
 
 
 def refined(
@@ -134,8 +138,8 @@ def started(model: Solved, run: Run) -> Solved:
         # The coarse grid makes the equations unsolvable; finer ones need not.
         return long
     more = sum(map(len, theirs.values())) - sum(map(len, ours.values()))
-    size, count = np.nanstd(measured, axis=1), measured.shape[1]
-    excess = misfit(missed(measured, few), missed(measured, many), size, count)
+    sizes = np.nanstd(measured, axis=1).tolist()
+    excess = misfit([*missed(measured, few)], [*missed(measured, many)], sizes)
     return long if needed(model.structure, excess, more) else short
 
 
