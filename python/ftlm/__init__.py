@@ -22,6 +22,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.data.structures import SensorFilter, Structure
     from ftlm.files.load import load
     from ftlm.fit.genetic import Genetic
+    from ftlm.fit.interval import ProfileInterval
     from ftlm.fit.recursion import Trace, multi_innovation_trace
     from ftlm.identification.identify import identify
     from ftlm.identification.many import Identified, identify_many
@@ -51,9 +52,9 @@ __all__ = [
     "PARAMETERS", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation", "Estimate",
     "FeedbackTest", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria", "InternalError",
     "Lattice", "LinkParameters", "Metrics", "Model", "ModelError", "Order", "OutputResiduals", "PhysicalParameter",
-    "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow", "SensorFilter", "StoreStatus",
-    "Structure", "Term", "Trace", "__version__", "block_pulse_matrix", "compare", "equation", "explicit_euler",
-    "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse", "haar_matrix",
+    "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow", "SensorFilter",
+    "StoreStatus", "Structure", "Term", "Trace", "__version__", "block_pulse_matrix", "compare", "equation",
+    "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse", "haar_matrix",
     "haar_transform", "identify", "identify_many", "information_criteria", "lattice", "link_model", "load",
     "load_model", "metrics", "multi_innovation_trace", "operational_matrix", "order_law", "physical_parameters",
     "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status", "simulate",
@@ -76,6 +77,7 @@ _HOMES = {
         "data.structures": "SensorFilter Structure",
         "files.load": "load",
         "fit.genetic": "Genetic",
+        "fit.interval": "ProfileInterval",
         "fit.recursion": "Trace multi_innovation_trace",
         "identification.identify": "identify",
         "identification.many": "Identified identify_many",

@@ -193,9 +193,10 @@ pub fn output_error<'py>(
             "plain" => Ok(joint::Coordinate::Plain),
             "logarithm" => Ok(joint::Coordinate::Logarithm),
             "excess" => Ok(joint::Coordinate::ExcessLogarithm),
+            "held" => Ok(joint::Coordinate::Held),
             other => Err(Error::Structure {
                 what: format!("coordinate '{other}' is not known"),
-                remedy: "use plain, logarithm or excess".into(),
+                remedy: "use plain, logarithm, excess or held".into(),
             }),
         })
         .collect::<Result<Vec<_>, _>>()?;

@@ -52,6 +52,7 @@ GIVEN = {
     "store": ("store.ftlm", ["--store", "store.ftlm"]),
     "executor": (object(), None),
     "loss": ("huber", ["--loss", "huber"]),
+    "intervals": ("quadratic", ["--intervals", "quadratic"]),
     "reference": ("r", ["--reference", "r"]),
 }
 #: What belongs to every method: what is identified, on which grid, with how much of the machine.

@@ -498,3 +498,33 @@ fn a_fit_that_its_grid_stops_says_so() {
     let found = fit(&model, &[experiment], &point(&[], &[2.0]), settings).unwrap();
     assert_eq!(found.status, Status::Wall, "{:?}", found.point);
 }
+
+#[test]
+fn a_number_that_is_held_stays_and_the_others_are_the_optimum_beside_it() {
+    let experiments = [run(200, 1, &[], 0.05, 430)];
+    let free = two_link(true, Initial::Rest);
+    let whole = fit(&free, &experiments, &point(&START.0, &START.1), Settings::default()).unwrap();
+    let settings = Settings { evaluations: 200, tolerance: 1e-12 };
+    // A coefficient by its coordinate, an order by its bounds.
+    let (mut coefficient, mut order) = (free.clone(), free.clone());
+    coefficient.coordinates[3] = Coordinate::Held;
+    let mut start = whole.point.clone();
+    start.coefficients[3] *= 1.05;
+    let there = fit(&coefficient, &experiments, &start, settings).unwrap();
+    assert_eq!(there.point.coefficients[3].to_bits(), start.coefficients[3].to_bits());
+    let mut beside = whole.point.clone();
+    beside.orders[0] += 0.02;
+    order.order_bounds[0] = (beside.orders[0], beside.orders[0]);
+    let other = fit(&order, &experiments, &beside, settings).unwrap();
+    assert_eq!(other.point.orders[0].to_bits(), beside.orders[0].to_bits());
+    for (held, found) in [(6, there), (0, other)] {
+        assert_eq!(found.status, Status::Converged);
+        assert!(found.cost > whole.cost);
+        for (i, column) in found.jacobian.iter().enumerate() {
+            let along: f64 = column.iter().zip(&found.residuals).map(|(j, e)| j * e).sum();
+            let cosine = along.abs() / (norm(column) * norm(&found.residuals));
+            // The gradient is left along what is held, and nowhere else.
+            assert_eq!(cosine > 1e-4, i == held, "{held} {i} {cosine}");
+        }
+    }
+}

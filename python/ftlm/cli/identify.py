@@ -53,6 +53,10 @@ def identify(
         Literal["squares", "huber"] | None,
         Option(help="Of output error: huber, so that outliers decide nothing; default squares."),
     ] = None,
+    intervals: Annotated[
+        Literal["auto", "quadratic", "profile"] | None,
+        Option(help="Of output error: by profile likelihood for all numbers, or (default) where it matters."),
+    ] = None,
     threads: Threads = None,
     reference: Annotated[
         Text, Option(metavar="SIGNAL", help="What drives a closed loop from outside; also name it with -u.")
@@ -75,7 +79,7 @@ def identify(
         result = estimation.identify(
             runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
             genetic=genetic.settings(method), threads=threads, progress=progress, store=store,
-            loss=loss, reference=reference,
+            loss=loss, intervals=intervals, reference=reference,
         )  # fmt: skip
     if out is not None:
         result.model.save(out, force=force)

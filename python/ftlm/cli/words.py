@@ -17,7 +17,7 @@ OPTIONS = {
     "input_order": "--input-order",
     "friction": "--friction", "cross_stage": "--cross-stage", "tolerance": "--tolerance", "lags": "--lags",
     "delay": "--delay", "force": "--force", "offset": "--offset", "reference": "--reference",
-    "loss": "--loss", "missing": "--missing",
+    "loss": "--loss", "intervals": "--intervals", "missing": "--missing",
 }  # fmt: skip
 #: ``force=True (--force)``, where the option stands beside the argument already.
 _BESIDE = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")

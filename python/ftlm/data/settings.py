@@ -13,7 +13,9 @@ from ftlm.base.errors import ModelError
 Criterion = Literal["output-error", "equation-error"]
 Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
 Loss = Literal["squares", "huber"]
+Intervals = Literal["auto", "quadratic", "profile"]
 LOSSES = ("squares", "huber")
+INTERVALS = ("auto", "quadratic", "profile")
 METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic")
 _LATTICE = METHODS[1:4]
 #: The methods of `identify` that use an option; one that is not here (runs, structure, m, threads, progress) is of all.
@@ -21,6 +23,7 @@ USED_BY: dict[str, tuple[str, ...]] = {
     "lattice": METHODS[1:], "criterion": _LATTICE, "norm": METHODS[1:], "keep": _LATTICE,
     "innovation_length": ("multi-innovation",), "prior_covariance": ("multi-innovation",),
     "rows": ("multi-innovation",), "genetic": ("genetic",), "loss": METHODS[:1], "reference": METHODS[:1],
+    "intervals": METHODS[:1],
     "store": _LATTICE, "executor": _LATTICE,
 }  # fmt: skip
 #: What belongs to the search of orders: lattice methods use it only where an order is free.

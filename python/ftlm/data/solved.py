@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import msgspec
+from msgspec import UNSET, UnsetType
 
 from ftlm.base.checks import check_pulses
 from ftlm.base.errors import ModelError
@@ -34,6 +35,9 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Information criteria, where known.
     warnings
         What makes the model doubtful, in words.
+    intervals
+        95 % intervals by profile likelihood, of the values that have one; None for an end that is infinite. Those of
+        the others are ± 1.96 standard errors. Not set where no value has one.
     """
 
     method: str
@@ -44,6 +48,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     fit: dict[str, float | None] = {}
     information: dict[str, float | None] = {}
     warnings: tuple[str, ...] = ()
+    intervals: dict[str, tuple[float | None, float | None]] | UnsetType = UNSET
 
 
 @dataclass(frozen=True)

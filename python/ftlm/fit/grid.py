@@ -144,19 +144,30 @@ class Attempt:
 
 
 def descend(
-    problem: FreeProblem, experiments: list[Any], attempt: Attempt, *, evaluations: int, plain: bool = False
-) -> Attempt:
-    """Levenberg-Marquardt from an attempt."""
+    problem: FreeProblem, experiments: list[Any], attempt: Attempt, *, evaluations: int, plain: bool = False,
+    held: int | None = None, tolerance: float = TOLERANCE,
+) -> Attempt:  # fmt: skip
+    """Levenberg-Marquardt from an attempt; one of the numbers, by its place, may be held where it is."""
     structure, signals = problem.structure, problem.structure.signals
+    coordinates = problem.coordinates(attempt.coefficients, plain=plain)
+    bounds, ends = list(problem.bounds), [structure.free_delays[n] for n in problem.delays]
+    if held is not None:
+        coefficient = held - len(bounds)
+        if coefficient < 0:
+            bounds[held] = (attempt.orders[held],) * 2
+        elif coefficient < len(coordinates):
+            coordinates[coefficient] = "held"
+        else:
+            late = coefficient - len(coordinates)
+            ends[late] = (attempt.delays[late],) * 2
     outcome = _core.output_error(
-        experiments, problem.laws(signals), list(problem.bounds),
-        problem.coordinates(attempt.coefficients, plain=plain), structure.coupling == "simulated",
+        experiments, problem.laws(signals), bounds, coordinates, structure.coupling == "simulated",
         initial_tuple(structure.initial, structure.offset), attempt.orders, attempt.coefficients,
         [
-            (signals.index(n), structure.free_delays[n], delay)
-            for n, delay in zip(problem.delays, attempt.delays, strict=True)
+            (signals.index(n), own, delay)
+            for n, own, delay in zip(problem.delays, ends, attempt.delays, strict=True)
         ],
-        evaluations, TOLERANCE,
+        evaluations, tolerance,
     )  # fmt: skip
     orders, coefficients, delays = (list(outcome[n]) for n in ("orders", "coefficients", "delays"))
     return Attempt(orders, coefficients, attempt.origin, outcome, delays)
@@ -192,9 +203,15 @@ class Grid:
         """The same on half the step."""
         return replace(self, every=2 * self.every)
 
-    def descend(self, attempt: Attempt, evaluations: int, *, plain: bool = False) -> Attempt:
-        """Levenberg-Marquardt from an attempt."""
-        return descend(self.problem, self.experiments, attempt, evaluations=evaluations, plain=plain)
+    def descend(
+        self, attempt: Attempt, evaluations: int, *, plain: bool = False, held: int | None = None,
+        tolerance: float = TOLERANCE,
+    ) -> Attempt:  # fmt: skip
+        """Levenberg-Marquardt from an attempt; see :func:`descend`."""
+        return descend(
+            self.problem, self.experiments, attempt, evaluations=evaluations, plain=plain, held=held,
+            tolerance=tolerance,
+        )  # fmt: skip
 
     def lowest(self, attempt: Attempt, evaluations: int) -> Attempt:
         """Descend in logarithmic coordinates, then in plain ones, which may cross zero."""

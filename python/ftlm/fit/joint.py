@@ -22,6 +22,7 @@ from ftlm.data.settings import Loss
 from ftlm.data.structures import Initial, Structure, delay_name
 from ftlm.fit.extrapolation import feasible
 from ftlm.fit.grid import FINEST, Attempt, Grid
+from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.race import SAME_COST, finalists, race
 from ftlm.fit.robust import Robust, huber_shares, same_shares, scales
@@ -80,6 +81,12 @@ class JointFit:
         What a robust loss did; None for squares.
     shares
         With which share of its weight each sample counted under it, by run, a row an output.
+    on_grid
+        Parameters at the optimum of the finest grid, in the order of the covariance.
+    origin
+        Where the fit came from, if it had no starts of its own.
+    profiles
+        95 % intervals by profile likelihood, of the parameters that have one.
     """
 
     orders: dict[str, float]
@@ -99,12 +106,15 @@ class JointFit:
     initial_terms: int = 0
     robust: Robust | None = None
     shares: Sequence[Floats] | None = field(default=None, repr=False)
+    on_grid: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
+    origin: str = "the start that was given"
+    profiles: Mapping[str, ProfileInterval] = field(default_factory=dict)
 
     @property
     def choice(self) -> str:
         """Why this optimum, in words: which start led to it, and how far behind the next other one was."""
         if not self.starts:
-            return "from the start that was given"
+            return f"from {self.origin}"
         level, origin = self.starts[0]
         same = [v for v, _ in self.starts if v <= (1.0 + SAME_COST) * level]
         words = f"{len(same)} of {len(self.starts)} starts ended in the lowest optimum, first that of: {origin}"
@@ -140,10 +150,11 @@ class JointFit:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % interval of each parameter."""
+        """95 % interval of each parameter: by profile likelihood where there is one, else ± 1.96 standard errors."""
         errors = self.standard_errors
         pairs = zip(self.names, self.values.tolist(), strict=True)
-        return {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in pairs}
+        quadratic = {n: (v - NORMAL_95 * errors[n], v + NORMAL_95 * errors[n]) for n, v in pairs}
+        return {**quadratic, **{n: (p.low, p.high) for n, p in self.profiles.items()}}
 
     @property
     def correlation(self) -> Floats:
@@ -279,7 +290,7 @@ def joint_fit(optimum: Optimum, starts: list[tuple[float, str]]) -> JointFit:
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
         delays=dict(zip(problem.delays, delays, strict=True)), products=dict(problem.products),
         covariance=covariance(best, grid), residuals=residuals,
-        robust=None if grid.shares is None else Robust.of(grid, best), shares=grid.shares,
+        robust=None if grid.shares is None else Robust.of(grid, best), shares=grid.shares, on_grid=best.values,
         noise={o: level / w for (o, level), w in zip(levels.items(), grid.weights, strict=True)},
         cost=float(best.outcome["cost"]), samples=sum(read(e).size for part in residuals for e in part.values()),
         refinement=grid.every,

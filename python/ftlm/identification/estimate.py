@@ -15,7 +15,7 @@ import numpy as np
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
-from ftlm.data.settings import Loss, Settings
+from ftlm.data.settings import Intervals, Loss, Settings
 from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.coefficients import estimate_coefficients, step_bias
 from ftlm.fit.genetic import Genetic, genetic_search
@@ -23,6 +23,7 @@ from ftlm.fit.history import fit_any_start
 from ftlm.fit.instrument import instrumented
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
+from ftlm.identification.intervals import with_intervals
 from ftlm.identification.judged import Task
 from ftlm.identification.local import errors_with_orders
 from ftlm.identification.warnings import broken_law, irregular, uncertain
@@ -102,7 +103,7 @@ def loss_setting(joint: JointFit) -> dict[str, Any]:
 
 def by_output_error(
     task: Task, m: int | None, threads: int, progress: Told, answers: Sequence[Run] | None = None,
-    loss: Loss = "squares",
+    loss: Loss = "squares", intervals: Intervals = "auto",
 ) -> Fit:  # fmt: skip
     """Orders and coefficients together by joint output error; answers of the inputs to a reference are instruments."""
     # An order with one value is known.
@@ -112,9 +113,14 @@ def by_output_error(
     start = record.initial
     joint = fit_any_start(answers or task.runs, structure, start, threads=threads, progress=progress, loss=loss)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
+    lower: list[str] = []
     if answers is not None:
         joint = instrumented(joint, problem, task.runs, answers)
-    warnings = [*uncertain(joint, problem), *irregular(task.runs, joint, problem)]
+    else:
+        joint, lower = with_intervals(
+            joint, problem, task.runs, intervals, threads=threads, progress=progress, loss=loss
+        )
+    warnings = [*lower, *uncertain(joint, problem), *irregular(task.runs, joint, problem)]
     if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.
         structure = replace(structure, initial="history")

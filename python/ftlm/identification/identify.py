@@ -8,11 +8,13 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any, Literal
 
+from msgspec import UNSET
+
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.statistics import ROUNDING
 from ftlm.data.lattice import Lattice, check_lattice, check_lattice_names
 from ftlm.data.run import Run
-from ftlm.data.settings import LOSSES, METHODS, Loss, Settings, check_used
+from ftlm.data.settings import INTERVALS, LOSSES, METHODS, Intervals, Loss, Settings, check_used
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Estimate
 from ftlm.data.structures import Structure, check_offset
@@ -53,6 +55,7 @@ def identify(
     offset: Literal["none", "constant", "ramp", "auto"] | None = None,
     reference: str | None = None,
     loss: Loss | None = None,
+    intervals: Intervals | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
@@ -109,6 +112,11 @@ def identify(
         Of output error: ``"squares"`` (default), or ``"huber"``, which counts residuals beyond 1.345 of the usual ones
         by their size, so that outliers decide nothing; without any it has 95 % of the precision. Figures stay those of
         all samples.
+    intervals
+        Of output error: ``"quadratic"``, estimate ± 1.96 standard errors, true where the cost is a parabola;
+        ``"profile"``, by profile likelihood for every number, some ten to a hundred free runs each;
+        ``"auto"`` (default), by profile likelihood for the numbers for which two free runs each say that the quadratic
+        picture is off by over a tenth. See :meth:`ftlm.Identification.profile`.
 
     Returns
     -------
@@ -144,9 +152,16 @@ def identify(
     words = {n: value for n, value in words.items() if value is not None}
     if loss is not None and loss not in LOSSES:
         raise ModelError(f"loss = {loss!r} is not known; use {' or '.join(map(repr, LOSSES))}")
+    if intervals is not None and intervals not in INTERVALS:
+        raise ModelError(f"intervals = {intervals!r} is not known; use {' or '.join(map(repr, INTERVALS))}")
+    if intervals == "profile" and reference is not None:
+        raise ModelError(
+            "intervals='profile' needs a cost that has its minimum at the estimate, and reference= has none; use "
+            "intervals='quadratic', or leave it out"
+        )
     others = {
-        "loss": loss, "lattice": lattice, "genetic": genetic, "store": store, "executor": executor,
-        "reference": reference,
+        "loss": loss, "intervals": intervals, "lattice": lattice, "genetic": genetic, "store": store,
+        "executor": executor, "reference": reference,
     }  # fmt: skip
     given = [*(n for n, value in others.items() if value is not None), *words]
     estimator = "least-squares" if method in ("output-error", "genetic") else method
@@ -164,7 +179,7 @@ def identify(
     def estimate(asked: Structure) -> Fit:
         task = Task(tuple(several), asked, lattice)
         if method == "output-error":
-            return by_output_error(task, m, settings.threads, progress, answers, loss or "squares")
+            return by_output_error(task, m, settings.threads, progress, answers, loss or "squares", intervals or "auto")
         if method == "genetic":
             return by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress)
         return by_lattice(task, settings, m, progress, store, executor)
@@ -217,6 +232,7 @@ def _estimate(
     if joint is not None:
         values = dict(zip(joint.names, joint.values.tolist(), strict=True))
         errors = {n: finite(v) for n, v in joint.standard_errors.items()}
+    profiles = {} if joint is None else {n: (finite(p.low), finite(p.high)) for n, p in joint.profiles.items()}
     return Estimate(
         method=fit.method,
         runs=tuple(r.name for r in fit.task.runs),
@@ -226,4 +242,5 @@ def _estimate(
         fit={n: finite(f) for n, f in comparison.fit_percent.items()},
         information={} if criteria is None else {n: finite(getattr(criteria, n)) for n in ("aic", "aicc", "bic")},
         warnings=warnings,
+        intervals=profiles or UNSET,
     )

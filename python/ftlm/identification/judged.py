@@ -10,6 +10,7 @@ from ftlm.base.statistics import NORMAL_95
 from ftlm.data.lattice import Lattice, lattice_of
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
+from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.joint import JointFit
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.criteria import InformationCriteria
@@ -76,10 +77,20 @@ class Judged:
 
     @property
     def intervals(self) -> dict[str, tuple[float, float]]:
-        """95 % intervals by name, of what has standard errors."""
+        """95 % intervals by name, of what has standard errors.
+
+        Value ± 1.96 standard errors, or, where the quadratic picture fails for a number of a joint fit, those of the
+        profile likelihood: neither symmetric nor always finite.
+        """
         values = {**self.orders, **self.coefficients, **({} if self.joint is None else self.joint_values)}
         errors = self.standard_errors
-        return {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
+        quadratic = {n: (values[n] - NORMAL_95 * e, values[n] + NORMAL_95 * e) for n, e in errors.items()}
+        return {**quadratic, **{n: (p.low, p.high) for n, p in self.profiles.items()}}
+
+    @property
+    def profiles(self) -> dict[str, ProfileInterval]:
+        """95 % intervals by profile likelihood, where they are used; see :meth:`ftlm.Identification.profile`."""
+        return {} if self.joint is None else dict(self.joint.profiles)
 
     @property
     def delays(self) -> dict[str, float]:

@@ -63,7 +63,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
         # Negated so that a standard error that is not a number counts as too large.
         if name in unseen:
             continue
-        if not errors[name] <= high - low:
+        if not errors[name] <= high - low and not _bounded(joint, name):
             warnings.append(f"order {name} cannot be told from these runs: its standard error exceeds its bounds")
         elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
             warnings.append(f"order {name} = {value:g} is on its bound; widen it")
@@ -71,19 +71,21 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
         low, high = problem.structure.free_delays[signal]
         if delay_name(signal) in unseen:
             continue
-        if not errors[delay_name(signal)] <= high - low:
+        if not errors[delay_name(signal)] <= high - low and not _bounded(joint, delay_name(signal)):
             warnings.append(
                 f"the delay of {signal} cannot be told from these runs: its standard error exceeds its bounds"
             )
         elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
             warnings.append(f"the delay of {signal} = {value:g} s is on its bound; widen it")
     for name, value in joint.coefficients.items():
-        if name not in unseen and not errors[name] <= abs(value):
+        # Where the cost is no parabola, its profile knows better.
+        told = name in joint.profiles and 0.0 not in joint.profiles[name]
+        if name not in unseen and not errors[name] <= abs(value) and not told:
             warnings.append(
                 f"coefficient {name} = {value:.4g} is not different from 0 in these runs "
                 f"(standard error {errors[name]:.3g})"
             )
-    warnings += inseparable(joint)
+    warnings += inseparable(joint) + unbounded_ends(joint, unseen)
     coloured = sorted({o for run in joint.residuals for o, series in run.items() if not is_white(series)})
     if coloured:
         warnings.append(
@@ -91,6 +93,26 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             "standard errors allow for the colour, not for the bias of what is left out"
         )
     return warnings
+
+
+def _bounded(joint: JointFit, name: str) -> bool:
+    """Whether the profile of the likelihood has both ends of a number's interval."""
+    return name in joint.profiles and not joint.profiles[name].is_open
+
+
+def unbounded_ends(joint: JointFit, unseen: Sequence[str]) -> list[str]:
+    """Say which numbers have an interval without an end."""
+    sides = {
+        n: [s for s, end in (("below", p.low), ("above", p.high)) if math.isinf(end)]
+        for n, p in joint.profiles.items() if n not in unseen
+    }  # fmt: skip
+    words = [f"{n} {' or '.join(s)}" for n, s in sides.items() if s]
+    if not words:
+        return []
+    return [
+        f"these runs do not bound {', '.join(words)}: with all other numbers fitted anew the cost never rises by what "
+        "noise explains; fix a number, leave a term out, or record a richer input"
+    ]
 
 
 def irregular(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> list[str]:

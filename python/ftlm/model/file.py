@@ -19,8 +19,9 @@ from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
 
 #: Largest model file read: a model is a few kilobytes.
 MAX_MODEL_BYTES = 1 << 20
-#: Schema of a model that every version since the first reads, and of one that has an offset.
-SCHEMA, OFFSET_SCHEMA = 2, 3
+#: Schema of a model that every version since the first reads, of one that has an offset, and of one that has intervals
+#: by profile likelihood.
+SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA = 2, 3, 4
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -77,7 +78,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         # Written only where there is one, so that what has none is as it was.
         offset: Offset | UnsetType = UNSET if s.offset == "none" else s.offset
         return cls(
-            "ftlm-model", SCHEMA if offset is UNSET else OFFSET_SCHEMA, s.name,
+            "ftlm-model", schema_of(offset, model.estimate), s.name,
             [EquationFile.of(e) for e in s.equations], s.coupling, dict(s.delay),
             s.initial if isinstance(s.initial, str) else list(s.initial), s.sensor_filter, dict(model.units),
             dict(model.orders), model.m, dict(model.about), model.estimate, offset,
@@ -104,6 +105,13 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         return Solved(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 
+def schema_of(offset: Offset | UnsetType, estimate: Estimate | None) -> int:
+    """Schema of a model: the least that has all of it, so that what has less is as it was."""
+    if estimate is not None and estimate.intervals is not UNSET:
+        return PROFILE_SCHEMA
+    return SCHEMA if offset is UNSET else OFFSET_SCHEMA
+
+
 def write_model(model: Solved, path: str | os.PathLike[str], *, force: bool) -> Path:
     """Write a model as JSON, atomically."""
     data = msgspec.json.format(msgspec.json.encode(ModelFile.of(model)), indent=2)
@@ -128,7 +136,7 @@ def read_model(path: str | os.PathLike[str]) -> Solved:
         raise
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
-    latest = SCHEMA if read.offset is UNSET else OFFSET_SCHEMA
+    latest = schema_of(read.offset, read.estimate)
     if read.schema > latest or read.schema < 1:
         raise DataError(f"{file} has schema {read.schema}, this version reads up to {latest}; upgrade ftlm")
     try:

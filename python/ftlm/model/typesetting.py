@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from markupsafe import Markup
+from msgspec import UNSET
 
 from ftlm.base.statistics import NORMAL_95
 from ftlm.data.equations import Equation
@@ -13,7 +15,7 @@ from ftlm.data.solved import Solved
 from ftlm.data.structures import delay_name
 from ftlm.fit.joint import JointFit
 from ftlm.paint.table import Table
-from ftlm.paint.text import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_html
+from ftlm.paint.text import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_html, unbounded
 
 #: Decimals of an order in an equation; the model's file has them all.
 ORDER_DECIMALS = 4
@@ -107,16 +109,25 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
     reference = model.structure.reference
     errors: Mapping[str, float | None] = {}
     extra: Mapping[str, float] = {}
+    profiles: Mapping[str, tuple[float, float]] = {}
     if joint is not None:
         errors, extra = joint.standard_errors, joint.coefficients
+        profiles = {n: (p.low, p.high) for n, p in joint.profiles.items()}
     elif model.estimate is not None:
         errors, extra = model.estimate.standard_errors, model.estimate.values
+        saved = {} if model.estimate.intervals is UNSET else model.estimate.intervals
+        profiles = {
+            n: (-math.inf if low is None else low, math.inf if high is None else high)
+            for n, (low, high) in saved.items()
+        }
     known = any(e is not None for e in errors.values())
 
     def row(name: str, value: float, stated: float | None, place: str) -> list[Cell]:
         error = errors.get(name)
         half = None if error is None else NORMAL_95 * error
         ends: list[Cell] = [None, None] if half is None else [value - half, value + half]
+        if name in profiles:
+            ends = [v if math.isfinite(v) else unbounded(v) for v in profiles[name]]
         return [symbol_html(name), value, error, *ends, stated, place]
 
     rows = [row(n, v if known else Exact(v), None, "free order") for n, v in model.orders.items()]
@@ -139,6 +150,8 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "what it is"]
     if known:
         note = "A coefficient without an interval follows from the law. Intervals hold as far as the model does."
+        if profiles:
+            note += f" Those of {', '.join(map(symbol, profiles))} are by profile likelihood, the others symmetric."
     else:
         note = "No standard errors are given here: this table does not say how many of the digits mean something."
     left_out = ([] if known else [2, 3, 4]) + ([] if reference else [5])

@@ -16,13 +16,15 @@ pub enum Coordinate {
     Logarithm,
     /// ln(c − 1), for a ratio that exceeds 1.
     ExcessLogarithm,
+    /// It stays where it starts, as an order or a delay does between two equal bounds.
+    Held,
 }
 
 impl Coordinate {
     /// Whether a coefficient of this value can be moved in its coordinate.
     pub(super) fn holds(self, value: f64) -> bool {
         match self {
-            Self::Plain => value.is_finite(),
+            Self::Plain | Self::Held => value.is_finite(),
             Self::Logarithm => value != 0.0 && value.is_finite(),
             Self::ExcessLogarithm => value > 1.0 && value.is_finite(),
         }
@@ -36,6 +38,7 @@ impl Coordinate {
             Self::Plain => value + delta,
             Self::Logarithm => value * libm::exp(bounded),
             Self::ExcessLogarithm => 1.0 + (value - 1.0) * libm::exp(bounded),
+            Self::Held => value,
         }
     }
 
@@ -45,6 +48,7 @@ impl Coordinate {
             Self::Plain => 1.0,
             Self::Logarithm => value,
             Self::ExcessLogarithm => value - 1.0,
+            Self::Held => 0.0,
         }
     }
 }

@@ -1,0 +1,429 @@
+"""Profile likelihood: intervals where the cost around a joint fit's optimum is no parabola.
+
+For each value of one number all others are fitted anew; the interval holds the values at which the cost has risen by no
+more than noise explains (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al., doi:10.1093/bioinformatics/btp358).
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import FtlmError
+from ftlm.data.run import Run
+from ftlm.fit.extrapolation import feasible
+from ftlm.fit.grid import Attempt, Grid
+from ftlm.fit.interval import ProfileInterval
+from ftlm.fit.joint import JointFit
+from ftlm.fit.problem import FreeProblem
+from ftlm.fit.uncertainty import covariance, covariance_of
+
+#: The quadratic picture fails for a number where either end of its interval is off by more than this share, as one
+#: linear step of all others tells.
+BENT = 0.1
+#: An end is found where the root of the rise is as near to its threshold, and Newton's next step a smaller share of the
+#: way from the optimum.
+NEAR = 0.1
+FOUND = 0.02
+#: Evaluations of one refit, and refits an end at most.
+LAP = 120
+REFITS = 40
+#: An end that far out, in half-widths of the quadratic interval, is none: the cost does not rise.
+FARTHEST = 1e3
+#: The first step is that of the quadratic picture or the number itself, but not below this share of the former; a
+#: bracket is narrow where it is FOUND of the value inside it, or of this share of the way.
+LEAST_WAY = 0.01
+FINEST = 0.1
+#: Least and most growth of the way from the optimum in a step.
+LEAST_GROWTH, GROWTH = 1.1, 4.0
+#: Share of the threshold to which a refit is minimised, and by which a lower cost is another optimum.
+EXACT = 1e-4
+LOWER = 0.02
+#: The others are tried by powers of the number where one moves by more than this share of itself, to no more than this
+#: power.
+BY_POWERS, STEEPEST = 0.3, 4.0
+#: The cost levels off where its root rises by half of what it did before or less, and would stay this share below.
+LEVEL_OFF, BELOW = 0.5, 0.05
+#: A lower optimum is another fit where the sum of squares falls by more than this share of a standard error's.
+WORTH = 0.1
+#: How often the search goes on from a lower optimum that it came upon.
+DESCENTS = 5
+#: Directions in which other numbers move nothing, as a share of the largest.
+FLAT = 1e-12
+
+
+class _LowerError(Exception):
+    """A refit whose cost is below the optimum's."""
+
+    def __init__(self, attempt: Attempt) -> None:
+        super().__init__()
+        self.attempt = attempt
+
+
+@dataclass(frozen=True)
+class Valley:
+    """The cost of a joint fit around its optimum, on its last grid.
+
+    Parameters
+    ----------
+    grid, best
+        The grid, each output weighing as its residuals ask for, and the optimum there.
+    shift
+        From there to the estimate, the limit for step 0.
+    bread
+        Inverse of the cost's curvature.
+    errors, units
+        Standard errors, and by how much the sum of squares rises at one standard error of each: the noise's variance,
+        widened for coloured residuals, so that a parabola gives the quadratic interval.
+    """
+
+    grid: Grid
+    best: Attempt
+    shift: Floats
+    bread: Floats
+    errors: Floats
+    units: Floats
+
+    @classmethod
+    def of(cls, joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> Valley:
+        """The valley in which a fit ended."""
+        weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
+        grid = Grid(problem, runs, weights, joint.refinement, shares=joint.shares)
+        return cls.at(grid, joint.on_grid, joint.values - joint.on_grid)
+
+    @classmethod
+    def at(cls, grid: Grid, values: Floats, shift: Floats) -> Valley:
+        """The valley below a point."""
+        best = grid.descend(_attempt(grid, values), LAP, plain=True)
+        bread = covariance_of(np.asarray(best.outcome["jacobian"]), [], 1.0)
+        spread = np.diag(covariance(best, grid))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return cls(grid, best, shift, bread, np.sqrt(spread), spread / np.diag(bread))
+
+    @property
+    def names(self) -> list[str]:
+        """Everything that is free."""
+        return self.grid.problem.names
+
+    def seen(self, i: int) -> bool:
+        """Whether the runs see a number at all."""
+        return bool(0 < self.errors[i] < math.inf and 0 < self.units[i] < math.inf)
+
+    def rise(self, i: int, squares: float) -> float:
+        """By how many standard deviations a sum of squares is above the optimum's."""
+        return math.sqrt(max(squares - 2.0 * float(self.best.outcome["cost"]), 0.0) / float(self.units[i]))
+
+    def bent(self, i: int, width: float) -> float:
+        """By which share an end of the quadratic interval is off, as far as one evaluation at each end tells.
+
+        Both ends are moved along the direction of the conditional optimum; there all other numbers follow by one linear
+        step. Infinite where an end is out of bounds or has no finite free run.
+        """
+        if not self.seen(i):
+            return 0.0
+        worst = 0.0
+        for side in (-1.0, 1.0):
+            ends = self.best.values
+            ends[i] += side * width * self.errors[i]
+            low, high = self.grid.problem.all_bounds[i]
+            if not low <= ends[i] <= high:
+                return math.inf
+            try:
+                there = self._evaluated(i, self._along(i, self.best.values, self.bread[:, i], float(ends[i])))
+            except FtlmError:
+                return math.inf
+            left = _left(there, i)
+            with np.errstate(over="ignore"):
+                worst = max(worst, abs(self.rise(i, float(left @ left)) / width - 1.0))
+        return worst
+
+    def end(self, i: int, side: float, width: float, stop: threading.Event | None = None) -> End:
+        """The end of a number's interval on one side, by Newton's method between what is in and what is out.
+
+        At a refit the cost's slope along the number alone is the slope of the profile; the root of its rise is linear
+        where the cost is a parabola, so that one refit finds the end there.
+        """
+        start, sigma = float(self.best.values[i]), float(self.errors[i])
+        limit = self.grid.problem.all_bounds[i][0 if side < 0 else 1]
+        # In a valley without end standard errors are no measure of it.
+        first = min(sigma * width, max(abs(start), LEAST_WAY * sigma * width))
+        farthest = min(FARTHEST * first, abs(limit - start))
+        within, inside, outside = self.best, 0.0, math.inf
+        way, points, evaluations = min(first, farthest), [], 0
+        reached, gained = 0.0, math.inf
+        for _ in range(REFITS):
+            if not way > inside:
+                break
+            if stop is not None and stop.is_set():
+                raise KeyboardInterrupt
+            there, following = self.refitted(i, start + side * way, within), math.inf
+            rise = math.inf
+            if there is not None:
+                evaluations += int(there.outcome["evaluations"])
+                rise = self.rise(i, 2.0 * float(there.outcome["cost"]))
+                points.append((start + side * way + float(self.shift[i]), rise**2))
+                slope = side * _slope(there, i) / (float(self.units[i]) * rise) if rise > 0 else 0.0
+                following = way + (width - rise) / slope if slope > 0 else math.inf
+                near = abs(rise / width - 1.0) <= NEAR and abs(following - way) <= FOUND * way
+                if near and inside < following <= farthest:
+                    return End(start + side * following, points, evaluations)
+            if there is None or rise > width:
+                if way >= outside:
+                    # Followed closely, it is out as well: the profile jumps here, or the free run ends.
+                    break
+                outside = way
+            else:
+                inside, within = way, there
+                if way >= outside:
+                    # What stood for the outside was a refit that had lost its way.
+                    outside = math.inf
+                if way >= farthest:
+                    break
+            if math.isinf(outside):
+                gain, reached = rise - reached, rise
+                if gain <= LEVEL_OFF * gained and rise + gain < (1.0 - BELOW) * width and way > GROWTH * first:
+                    break
+                gained = gain
+                way = min(max(following, LEAST_GROWTH * way), GROWTH * way, farthest)
+            elif outside - inside <= FOUND * max(min(outside, abs(start + side * inside)), FINEST * outside):
+                way = outside
+            else:
+                margin = 0.05 * (outside - inside)
+                following = following if inside < following < outside else _middle(start, side, inside, outside)
+                way = min(max(following, inside + margin), outside - margin)
+        # An end between two points of which the outer one has a cost; else the cost never rose that far.
+        risen = math.isfinite(outside) and any(r >= width**2 for _, r in points)
+        return End(start + side * outside if risen else side * math.inf, points, evaluations)
+
+    def refitted(self, i: int, value: float, near: Attempt) -> Attempt | None:
+        """The optimum of all others at a value of one number, followed from a point nearby; None where there is none.
+
+        Raises
+        ------
+        _LowerError
+            It lies below the optimum.
+        """
+        rise = float(self.units[i])
+        least = 2.0 * float(self.best.outcome["cost"])
+        for point in self._starts(i, value, near):
+            try:
+                there = self._descended(i, point, LAP, EXACT * rise / max(least, rise))
+            except FtlmError:
+                continue
+            if 2.0 * float(there.outcome["cost"]) < least - LOWER * rise:
+                raise _LowerError(there)
+            return there
+        return None
+
+    def _starts(self, i: int, value: float, near: Attempt) -> list[Floats]:
+        """Where the others may be at a value of one number, the likeliest first.
+
+        Along the tangent, or, where that moves them by much, all or orders by powers of the number if that costs less:
+        valleys without end are bent like d mu = const, d + a = const.
+        """
+        values, tangent = near.values, _tangent(near, i)
+        orders = len(self.grid.problem.orders)
+        still = self._along(i, values, np.zeros_like(tangent), value)
+        points = [self._along(i, values, tangent, value), still]
+        moves = np.abs(tangent * (value - values[i])) > BY_POWERS * np.abs(values)
+        if value * values[i] > 0 and moves.any():
+            powers = tangent * values[i] / np.where(values, values, 1.0)
+            power = values * (value / values[i]) ** np.clip(powers, -STEEPEST, STEEPEST)
+            mixed = np.where(np.arange(values.size) < orders, power, values + tangent * (value - values[i]))
+            for towards in (power, mixed):
+                towards[i] = value
+                points.append(self._along(i, values, towards - values, value))
+        return sorted(points, key=lambda p: self._cost(i, p)) if len(points) > 2 else points
+
+    def _cost(self, i: int, values: Floats) -> float:
+        """Cost at a point; infinite where it has no finite free run."""
+        try:
+            return float(self._evaluated(i, values).outcome["cost"])
+        except FtlmError:
+            return math.inf
+
+    def _along(self, i: int, values: Floats, direction: Floats, value: float) -> Floats:
+        """A point with a value of one number, the others moved along, as far as bounds and orders allow."""
+        at = values.copy()
+        at[i] = value
+        if not direction[i]:
+            return at
+        towards = values + direction / direction[i] * (value - values[i])
+        towards[i] = value
+        point = feasible(self.grid.problem, at, towards)
+        point[i] = value
+        return point
+
+    def _evaluated(self, i: int, values: Floats) -> Attempt:
+        return self._descended(i, values, 1, EXACT)
+
+    def _descended(self, i: int, values: Floats, evaluations: int, tolerance: float) -> Attempt:
+        return self.grid.descend(_attempt(self.grid, values), evaluations, plain=True, held=i, tolerance=tolerance)
+
+
+@dataclass(frozen=True)
+class End:
+    """One end of an interval: its value on the grid, the points on the way, free runs."""
+
+    value: float
+    points: list[tuple[float, float]]
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class Profiles:
+    """Profile intervals of some numbers, and the lower optimum that the search for them may have come upon.
+
+    Parameters
+    ----------
+    intervals
+        By name.
+    lower
+        Values of everything free at an optimum that is lower than the fit's; None where there is none worth a fit.
+    """
+
+    intervals: dict[str, ProfileInterval]
+    lower: Floats | None = None
+
+
+def profiled(
+    valley: Valley, names: Sequence[str], level: float, *, threads: int = 1,
+    progress: Callable[[int, int], None] | None = None,
+) -> Profiles:  # fmt: skip
+    """Profile intervals of some of a fit's numbers.
+
+    Every end is followed from the optimum by itself, so that the figures do not depend on the number of threads. A
+    number that the runs do not see has the whole line for its interval.
+
+    Parameters
+    ----------
+    valley
+        Where the fit ended.
+    names
+        Numbers by name.
+    level
+        Probability between 0 and 1.
+    threads, progress
+        Threads, and what is called with (ends found, ends in all).
+
+    Raises
+    ------
+    KeyboardInterrupt
+        Ctrl-C, within one refit.
+    """
+    start = valley
+    for _ in range(DESCENTS):
+        ends = _ends(valley, names, level, threads, progress)
+        below = [e.attempt for e in ends.values() if isinstance(e, _LowerError)]
+        if not below:
+            break
+        least = min(below, key=lambda a: float(a.outcome["cost"]))
+        # What was the limit for step 0 of another optimum is none of this one.
+        valley = Valley.at(valley.grid, least.values, np.zeros_like(valley.shift))
+    fall = 2.0 * (float(start.best.outcome["cost"]) - float(valley.best.outcome["cost"]))
+    known = valley.units[np.isfinite(valley.units)]
+    lower = valley.best.values if known.size and fall > WORTH * float(np.median(known)) else None
+    found = {}
+    for name in names:
+        both = [e for e in (ends.get((name, side)) for side in (-1.0, 1.0)) if isinstance(e, End)]
+        if len(both) < 2:
+            found[name] = ProfileInterval(-math.inf, math.inf, level)
+            continue
+        i = valley.names.index(name)
+        first, last = valley.grid.problem.all_bounds[i]
+        low, high = (e.value + float(valley.shift[i]) for e in both)
+        low, high = (min(max(v, first), last) if math.isfinite(v) else v for v in (low, high))
+        points = tuple(sorted([*both[0].points, *both[1].points]))
+        found[name] = ProfileInterval(low, high, level, points, sum(e.evaluations for e in both))
+    return Profiles(found, lower)
+
+
+def _ends(
+    valley: Valley, names: Sequence[str], level: float, threads: int, progress: Callable[[int, int], None] | None
+) -> dict[tuple[str, float], End | _LowerError]:
+    """Both ends of every number that the runs see, or the lower optimum that the way there led to."""
+    width, stop = half_width(level), threading.Event()
+    asked = [(n, side) for n in names if valley.seen(valley.names.index(n)) for side in (-1.0, 1.0)]
+
+    def found(one: tuple[str, float]) -> End | _LowerError:
+        try:
+            return valley.end(valley.names.index(one[0]), one[1], width, stop)
+        except _LowerError as lower:
+            return lower
+
+    out: dict[tuple[str, float], End | _LowerError] = {}
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        try:
+            for one, end in zip(asked, pool.map(found, asked), strict=True):
+                out[one] = end
+                if progress is not None:
+                    progress(len(out), len(asked))
+        except BaseException:
+            stop.set()
+            pool.shutdown(cancel_futures=True)
+            raise
+    return out
+
+
+def bent_numbers(valley: Valley, level: float) -> list[str]:
+    """Numbers for which the quadratic picture fails, by two evaluations each."""
+    width = half_width(level)
+    return [n for i, n in enumerate(valley.names) if valley.bent(i, width) > BENT]
+
+
+def half_width(level: float) -> float:
+    """Half-width of an interval of this probability in standard deviations."""
+    return NormalDist().inv_cdf(0.5 + 0.5 * level)
+
+
+def _attempt(grid: Grid, values: Floats) -> Attempt:
+    orders, coefficients, delays = grid.problem.split(values.tolist())
+    return Attempt(orders, coefficients, "profile", {}, delays)
+
+
+def _middle(start: float, side: float, inside: float, outside: float) -> float:
+    """The middle of a bracket, by its ratio where the values differ by one."""
+    near, far = start + side * inside, start + side * outside
+    if near * far > 0:
+        return side * (math.copysign(math.sqrt(near * far), near) - start)
+    return 0.5 * (inside + outside)
+
+
+def _slope(attempt: Attempt, i: int) -> float:
+    """Half the derivative of the sum of squares with respect to one number."""
+    return float(np.asarray(attempt.outcome["jacobian"])[i] @ np.asarray(attempt.outcome["residuals"]))
+
+
+def _span(attempt: Attempt, i: int) -> tuple[Any, Floats]:
+    """Singular value decomposition of the other numbers' sensitivities, rows of unit length, and these lengths."""
+    others = np.delete(np.asarray(attempt.outcome["jacobian"]), i, axis=0)
+    # Far out, sensitivities may be so large that their squares are no numbers.
+    length = np.abs(others).max(axis=1, initial=0.0)
+    length = np.where(length > 0, length, 1.0)
+    length = length * np.maximum(np.linalg.norm(others / length[:, None], axis=1), 1.0)
+    left, sizes, right = np.linalg.svd(others / length[:, None], full_matrices=False)
+    kept = sizes > FLAT * sizes.max(initial=0.0)
+    return (left[:, kept], sizes[kept], right[kept]), length
+
+
+def _left(attempt: Attempt, i: int) -> Floats:
+    """Residuals once all other numbers follow by one linear step."""
+    residuals = np.asarray(attempt.outcome["residuals"])
+    (_, _, right), _ = _span(attempt, i)
+    return np.asarray(residuals - right.T @ (right @ residuals))
+
+
+def _tangent(attempt: Attempt, i: int) -> Floats:
+    """How all numbers move along the profile when one moves by 1."""
+    (left, sizes, right), length = _span(attempt, i)
+    along = np.asarray(attempt.outcome["jacobian"])[i]
+    others = -(left @ ((right @ along) / sizes)) / length
+    return np.insert(others, i, 1.0)

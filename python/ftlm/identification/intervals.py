@@ -1,0 +1,95 @@
+"""Intervals of a joint fit: which of them the quadratic picture gives, and which the profile of the likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from ftlm.base.checks import real_number
+from ftlm.base.errors import ConvergenceError, FtlmError, ModelError
+from ftlm.data.run import Run
+from ftlm.data.settings import Intervals, Loss
+from ftlm.fit.interval import ProfileInterval
+from ftlm.fit.joint import JointFit, fit_output_error
+from ftlm.fit.problem import FreeProblem
+from ftlm.fit.profile import Valley, bent_numbers, profiled
+from ftlm.identification.judged import Judged
+
+#: Level of the intervals that are printed.
+PRINTED = 0.95
+#: How often a fit goes on from a lower optimum that its intervals came upon.
+REFITS = 2
+
+
+def with_intervals(
+    joint: JointFit, problem: FreeProblem, runs: Sequence[Run], intervals: Intervals, *, threads: int = 1,
+    progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
+) -> tuple[JointFit, list[str]]:  # fmt: skip
+    """A joint fit with the intervals that were asked for, and what is to be said of them.
+
+    ``"auto"`` profiles the numbers for which the quadratic picture fails, ``"profile"`` all. Where that leads to an
+    optimum below the fit's, the fit is done again from there.
+    """
+    fitted = len(joint.names) + joint.initial_terms
+    # Where no more samples are left over than numbers were fitted, the residuals do not tell what noise explains.
+    if intervals == "quadratic" or (intervals == "auto" and joint.samples < 2 * fitted):
+        return joint, []
+    warnings: list[str] = []
+    for turn in range(REFITS + 1):
+        try:
+            valley = Valley.of(joint, problem, runs)
+        except FtlmError:
+            # No finite free run where the weights of the last descent are taken anew: what is known stays.
+            return joint, warnings
+        names = valley.names if intervals == "profile" else bent_numbers(valley, PRINTED)
+        found = profiled(valley, names, PRINTED, threads=threads, progress=progress)
+        if found.lower is None or turn == REFITS:
+            break
+        start = dict(zip(problem.names, found.lower.tolist(), strict=True))
+        tried, level = len(joint.starts), joint.noise
+        try:
+            again = fit_output_error(runs, problem.structure, threads=threads, start=start, loss=loss)
+        except FtlmError:
+            break
+        joint = replace(again, origin="a lower optimum that the search for its intervals came upon")
+        before, after = (", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise))
+        warnings = [
+            f"none of {tried} starts led to this optimum, but the search for intervals did (residuals {before} before, "
+            f"{after} now): there may be others"
+        ]
+    return replace(joint, profiles=found.intervals), warnings
+
+
+def valley_of(result: Judged) -> Valley:
+    """The cost around the optimum of a result by output error."""
+    if result.joint is None or result.task is None:
+        raise ModelError(f"method {result.method!r} has no likelihood to profile; identify by method='output-error'")
+    problem = FreeProblem.of(replace(result.task.structure, initial=result.joint.initial))
+    return Valley.of(result.joint, problem, result.task.runs)
+
+
+def profile(
+    result: Judged, names: Sequence[str], level: float, threads: int, progress: Callable[[int, int], None] | None
+) -> dict[str, ProfileInterval]:
+    """Profile intervals of a result's numbers; see :meth:`ftlm.Identification.profile`."""
+    if "reference" in result.settings:
+        raise ModelError(
+            "a fit with reference= is where residuals are orthogonal to instruments, and no minimum of a cost: it has "
+            "no profile; use its standard errors"
+        )
+    valley = valley_of(result)
+    unknown = [n for n in names if n not in valley.names]
+    if unknown:
+        others = f", nor {len(unknown) - 1} more" if len(unknown) > 1 else ""
+        raise ModelError(f"{unknown[0]!r}{others} is no free number of this fit; it has {', '.join(valley.names)}")
+    probability = real_number("level", level)
+    if not 0.0 < probability < 1.0:
+        raise ModelError(f"level = {level} is no probability between 0 and 1, such as 0.95")
+    asked = list(dict.fromkeys(names)) or valley.names
+    found = profiled(valley, asked, probability, threads=threads, progress=progress)
+    if found.lower is not None:
+        raise ConvergenceError(
+            "the profile leads to an optimum below this fit's, so its estimates are not the likeliest; identify again "
+            "with intervals='profile', which goes on from there"
+        )
+    return found.intervals

@@ -1,0 +1,405 @@
+"""Intervals by profile likelihood, beside closed forms and a naive profile by SciPy on plants simulated elsewhere."""
+
+from __future__ import annotations
+
+import json
+import math
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq, least_squares
+from scipy.signal import lfilter, lsim
+
+import ftlm
+from ftlm.fit import profile as profiling
+from ftlm.fit.grid import Attempt
+from ftlm.fit.profile import Valley, bent_numbers, half_width, profiled
+from ftlm.identification.intervals import valley_of
+from ftlm.identification.warnings import uncertain
+from ftlm.report.model_page import model_page
+from measured import DATA, needs_data
+
+THRESHOLD = 1.959963984540054**2
+STEP = 0.05
+
+
+def record(y: np.ndarray, u: np.ndarray, noise: float, seed: int, step: float = STEP, colour: float = 0.0) -> ftlm.Run:
+    """Noise of this share of the output's deviation, of this colour a sample."""
+    white = np.random.default_rng(seed).standard_normal(y.size + 200)
+    e = lfilter([math.sqrt(1.0 - colour**2)], [1.0, -colour], white)[200:]
+    return ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y + noise * np.std(y) * e}, step=step)
+
+
+def switched(rows: int, every: int, seed: int = 100) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.repeat(np.where(rng.random(rows // every + 1) < 0.5, -1.0, 1.0), every)[:rows]
+
+
+def quadratic(run: ftlm.Run, words: str, **options: object) -> ftlm.Identification:
+    return ftlm.identify(run, ftlm.equation(words, initial="rest"), intervals="quadratic", threads=1, **options)
+
+
+# ------------------------------------------------------------------------------------------------ closed forms
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.8])
+@pytest.mark.parametrize("loss", ["squares", "huber"])
+def test_the_profile_of_a_linear_problem_is_the_quadratic_interval(colour: float, loss: str) -> None:
+    u, rng = switched(300, 10), np.random.default_rng(1)
+    v = u[::-1] + rng.standard_normal(u.size)
+    ramps = [np.concatenate([[0.0], np.cumsum(x)[:-1]]) * STEP for x in (u, v)]
+    run = record(2.0 * ramps[0] - ramps[1], u, 0.1, 2, colour=colour)
+    run = ftlm.Run.from_arrays(inputs={"u": u, "v": v}, outputs={"y": run["y"]}, step=STEP)
+    found = quadratic(run, "D y = b u + c v", loss=loss)
+    exact = found.intervals
+    for name, own in found.profile(threads=1).items():
+        width = exact[name][1] - exact[name][0]
+        np.testing.assert_allclose((own.low, own.high), exact[name], atol=2e-4 * width)
+        assert len(own.points) == 2
+    # At another level, and the test by two evaluations says nothing against the picture.
+    (wide,) = found.profile("b", level=0.99).values()
+    assert wide.high - wide.low == pytest.approx(
+        2 * 2.5758293 * found.standard_errors["b"], rel=1e-3
+    )  # fmt: skip
+    assert bent_numbers(valley_of(found), 0.95) == []
+
+
+def test_the_profile_of_one_number_is_its_likelihood() -> None:
+    t = np.arange(40) * 0.25
+    answer = lambda a: np.expm1(a * t) / a  # noqa: E731 — D y = a y + 1 from rest
+    run = record(answer(-0.15), np.ones(t.size), 1.5, 3, 0.25)
+    found = quadratic(run, "D y = a y + 1 u")
+    squares = lambda a: float(np.sum((run["y"] - answer(a))[1:-1] ** 2))  # noqa: E731
+    best = least_squares(lambda a: (run["y"] - answer(a[0]))[1:-1], [-0.15], xtol=1e-12, ftol=1e-12).x[0]
+    limit = squares(best) * (1.0 + THRESHOLD / (t.size - 2 - 1))
+    ends = [brentq(lambda a: squares(a) - limit, *between) for between in ((best - 1.0, best), (best, best + 0.5))]
+    own = found.profile("a")["a"]
+    np.testing.assert_allclose((own.low, own.high), ends, atol=5e-3 * (ends[1] - ends[0]))
+    # The likelihood is skewed by more than that.
+    low, high = found.intervals["a"]
+    assert abs(low - ends[0]) + abs(high - ends[1]) > 0.04 * (ends[1] - ends[0])
+
+
+# --------------------------------------------------------------------------------------- a naive profile by SciPy
+
+
+def fast_pole(c: float, a: float, b: float, u: np.ndarray) -> np.ndarray:
+    """D^2 y = c D y + a y + b u under a held input."""
+    plant = ([[0.0, 1.0], [a, c]], [[0.0], [b]], [[1.0, 0.0]], 0)
+    return lsim(plant, u, np.arange(u.size) * STEP, interp=False)[1]
+
+
+def relaxation(alpha: float, a: float, b: float, u: np.ndarray) -> np.ndarray:
+    """D^alpha y = a y + b u by Grünwald and Letnikov's sum, ticks halved and extrapolated."""
+
+    def on_grid(fine: int) -> np.ndarray:
+        held, tick = np.repeat(u, fine), STEP / fine
+        size = 1 << (4 * held.size).bit_length()
+        radius = 1e-8 ** (1.0 / size)
+        z = radius * np.exp(-2j * np.pi * np.fft.rfftfreq(size))
+        answer = np.fft.irfft(b * z / (((1.0 - z) / tick) ** alpha - a), size)[: held.size]
+        answer = answer / radius ** np.arange(held.size)
+        half = 2 * size
+        return np.fft.irfft(np.fft.rfft(answer, half) * np.fft.rfft(held, half), half)[: held.size : fine]
+
+    return 2.0 * on_grid(16) - on_grid(8)
+
+
+def naive_rise(
+    answer: Callable[..., np.ndarray], run: ftlm.Run, centre: Sequence[float], i: int, value: float, near: np.ndarray
+) -> float:
+    """Rise of the sum of squares over the noise's variance, all numbers but one refitted by SciPy."""
+    u, y = run["u"], run["y"]
+
+    def left(others: np.ndarray, number: float | None) -> np.ndarray:
+        values = list(others) if number is None else [*others[:i], number, *others[i:]]
+        return (y - answer(*values, u))[1:-1]
+
+    tight = {"x_scale": "jac", "xtol": 1e-10, "ftol": 1e-10, "gtol": 1e-10}
+    whole = least_squares(left, centre, args=(None,), **tight)
+    rest = least_squares(left, np.delete(near, i), args=(value,), **tight)
+    variance = 2.0 * whole.cost / (y.size - 2 - len(centre))
+    return 2.0 * (rest.cost - whole.cost) / variance
+
+
+@pytest.mark.parametrize(
+    ("words", "answer", "truth", "noise"),
+    [
+        ("D^2 y = c D y + a y + b u", fast_pole, {"c": -26.0, "a": -25.0, "b": 25.0}, 0.1),
+        ("D^alpha y = a y + b u", relaxation, {"alpha": 0.6, "a": -0.8, "b": 1.0}, 1.1),
+    ],
+)
+def test_at_its_ends_the_cost_has_risen_by_the_threshold(
+    words: str, answer: Callable[..., np.ndarray], truth: dict[str, float], noise: float
+) -> None:
+    u = switched(300, 15)
+    run = record(answer(*truth.values(), u), u, noise, 4)
+    found = quadratic(run, words)
+    values = np.array([found.joint_values[n] for n in truth])
+    valley = valley_of(found)
+    asked = {n: valley.names.index(n) for n in truth}
+    bent = bent_numbers(valley, 0.95)
+    assert bent
+    for i, (name, own) in enumerate(found.profile(*truth).items()):
+        quadratic_ends = found.intervals[name]
+        off = max(abs(own.low - quadratic_ends[0]), abs(own.high - quadratic_ends[1]))
+        if name in bent:
+            assert off > 0.02 * (quadratic_ends[1] - quadratic_ends[0])
+        for end in (own.low, own.high):
+            assert math.isfinite(end)
+            near = valley.refitted(asked[name], end, valley.best)
+            assert near is not None
+            start = np.array([near.values[k] for k in asked.values()])
+            rise = naive_rise(answer, run, values, i, end, start)
+            assert math.sqrt(rise) == pytest.approx(math.sqrt(THRESHOLD), rel=0.03), (name, end)
+
+
+# ------------------------------------------------------------------------------------------------ a bent valley
+
+
+@pytest.fixture(scope="module")
+def bent() -> ftlm.Run:
+    """A fast pole that noise hides: c, a and b are known from one side alone."""
+    u = switched(200, 20)
+    return record(fast_pole(-26.0, -25.0, 25.0, u), u, 0.8, 3)
+
+
+@pytest.fixture(scope="module")
+def found(bent: ftlm.Run) -> ftlm.Identification:
+    return ftlm.identify(bent, ftlm.equation("D^2 y = c D y + a y + b u", initial="rest"), threads=1)
+
+
+def test_an_open_end_is_infinite_and_so_is_the_naive_cost_below_the_threshold(
+    bent: ftlm.Run, found: ftlm.Identification
+) -> None:
+    own = found.profiles["c"]
+    assert own.low == -math.inf
+    assert own.is_open
+    assert -26.0 in own
+    assert 0.0 not in own
+    far = 100.0 * found.coefficients["c"]
+    ratio = np.array([far, far * 1.0, -far * 1.0])
+    values = [found.coefficients[n] for n in "cab"]
+    assert naive_rise(fast_pole, bent, values, 0, far, ratio) < THRESHOLD
+    # Its own standard error reaches across 0.
+    assert found.standard_errors["c"] * 1.96 > abs(found.coefficients["c"])
+
+
+def test_terminal_json_frame_page_and_file_say_the_same(found: ftlm.Identification, tmp_path: Path) -> None:
+    own = found.profiles["c"]
+    assert found.intervals["c"] == (own.low, own.high)
+    assert found.joint is not None
+    assert found.joint.intervals["c"] == (own.low, own.high)
+    text = str(found)
+    assert f"−∞ to {own.high:.6g}" in text
+    assert "but those written out: by profile likelihood" in text
+    assert [w for w in found.warnings if "do not bound c below" in w]
+    assert not [w for w in found.warnings if "coefficient c = " in w]
+    document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
+    assert document["intervals"]["c"] == [None, own.high]
+    assert "c" in document["profiled"]
+    frame = found.to_frame()
+    assert (frame.loc["c", "low"], frame.loc["c", "high"]) == (own.low, own.high)
+    page = found.report(tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "by profile likelihood" in page
+    assert "−∞" in page
+    found.model.save(tmp_path / "model.json")
+    assert json.loads((tmp_path / "model.json").read_text())["schema"] == 4
+    read = ftlm.load_model(tmp_path / "model.json")
+    assert read.estimate is not None
+    assert read.estimate.intervals["c"] == (None, own.high)
+    assert "by profile likelihood" in model_page(read, tmp_path / "model.html").read_text(encoding="utf-8")
+
+
+def test_what_has_no_profile_is_written_as_before(bent: ftlm.Run, tmp_path: Path) -> None:
+    plain = quadratic(bent, "D^2 y = c D y + a y + b u")
+    assert plain.profiles == {}
+    assert "profile likelihood" not in str(plain)
+    plain.model.save(tmp_path / "model.json")
+    written = json.loads((tmp_path / "model.json").read_text())
+    assert written["schema"] == 2
+    assert "intervals" not in written["estimate"]
+    low, high = plain.intervals["c"]
+    assert high - low == pytest.approx(2 * 1.959964 * plain.standard_errors["c"])
+
+
+def test_the_same_ends_for_any_number_of_threads(found: ftlm.Identification) -> None:
+    one, four = (found.profile(threads=n) for n in (1, 4))
+    assert one == four
+    assert {n: (p.low, p.high) for n, p in one.items() if n in found.profiles} == {
+        n: (p.low, p.high) for n, p in found.profiles.items()
+    }
+
+
+def test_progress_counts_ends_and_stops_the_work(found: ftlm.Identification) -> None:
+    told: list[tuple[int, int]] = []
+    found.profile("c", "b", threads=1, progress=lambda done, total: told.append((done, total)))
+    assert told == [(k, 4) for k in range(1, 5)]
+
+    def interrupt(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        found.profile(threads=2, progress=interrupt)
+    stop = threading.Event()
+    stop.set()
+    with pytest.raises(KeyboardInterrupt):
+        valley_of(found).end(0, 1.0, half_width(0.95), stop)
+
+
+def test_numbers_that_are_known_well_are_not_profiled(bent: ftlm.Run) -> None:
+    u = bent["u"]
+    run = record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.01, 7)
+    well = ftlm.identify(run, ftlm.equation("D^2 y = c D y + a y + b u", initial="rest"), threads=1)
+    assert well.profiles == {}
+    asked = ftlm.identify(
+        run, ftlm.equation("D^2 y = c D y + a y + b u", initial="rest"), threads=1, intervals="profile"
+    )
+    for name, own in asked.profiles.items():
+        low, high = well.intervals[name]
+        np.testing.assert_allclose((own.low, own.high), (low, high), atol=0.05 * (high - low))
+
+
+def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
+    u = switched(200, 20)
+    run = record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.01, 8)
+    twice = ftlm.Run.from_arrays(inputs={"u": u, "v": u}, outputs={"y": run["y"]}, step=STEP)
+    structure = ftlm.equation("D^2 y = -0.8 D y + a y + b u + e v", initial="rest")
+    plain = quadratic(run, "D^2 y = -0.8 D y + a y + b u")
+    assert plain.joint is not None
+    assert plain.task is not None
+    task = replace(plain.task, runs=(twice,), structure=structure)
+    values = np.array([plain.coefficients["a"], 1.0, plain.coefficients["b"] - 1.0])
+    joint = replace(
+        plain.joint, coefficients=dict(zip("abe", values.tolist(), strict=True)), on_grid=values,
+        covariance=np.diag([1.0, np.inf, np.inf]),
+    )  # fmt: skip
+    seen = replace(plain, task=task, joint=joint).profile(threads=1)
+    assert (seen["b"].low, seen["e"].high) == (-math.inf, math.inf)
+    assert -4.0 in seen["a"]
+    assert not seen["a"].is_open
+
+
+def test_a_lower_optimum_on_the_way_is_gone_on_from(bent: ftlm.Run) -> None:
+    u = bent["u"]
+    plain = quadratic(record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9), "D^2 y = c D y + a y + b u")
+    valley = valley_of(plain)
+    names = list(plain.joint_values)
+    right = profiled(valley, names, 0.95).intervals
+    # As if the fit had ended a standard error beside the optimum.
+    orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
+    beside = valley.grid.descend(Attempt(orders, coefficients, "beside", {}, delays), 1, plain=True)
+    there = profiled(replace(valley, best=beside, shift=valley.shift), names, 0.95)
+    assert there.lower is not None
+    np.testing.assert_allclose(there.lower, valley.best.values, rtol=1e-3)
+    for name, own in there.intervals.items():
+        i = valley.names.index(name)
+        shifted = (right[name].low - valley.shift[i], right[name].high - valley.shift[i])
+        np.testing.assert_allclose((own.low, own.high), shifted, rtol=2e-3)
+
+
+def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    u = bent["u"]
+    run = record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9)
+    right = quadratic(run, "D^2 y = c D y + a y + b u")
+    at, calls = Valley.at.__func__, []
+
+    def beside(cls: type[Valley], grid: object, values: np.ndarray, shift: np.ndarray) -> Valley:
+        valley = at(cls, grid, values, shift)
+        calls.append(values)
+        if len(calls) > 1:
+            return valley
+        orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
+        off = valley.grid.descend(Attempt(orders, coefficients, "beside", {}, delays), 1, plain=True)
+        return replace(valley, best=off)
+
+    monkeypatch.setattr(profiling.Valley, "at", classmethod(beside))
+    again = ftlm.identify(
+        run, ftlm.equation("D^2 y = c D y + a y + b u", initial="rest"), threads=1, intervals="profile"
+    )
+    assert [w for w in again.warnings if "led to this optimum, but the search for intervals did" in w]
+    assert "from a lower optimum" in str(again)
+    for name, value in right.coefficients.items():
+        assert again.coefficients[name] == pytest.approx(value, rel=1e-4)
+
+
+def test_delays_and_orders_are_held_where_they_are_profiled() -> None:
+    u = switched(300, 20)
+    late = np.concatenate([np.zeros(3), u[:-3]])
+    run = record(fast_pole(-0.8, -4.0, 4.0, late), u, 0.02, 10)
+    structure = ftlm.equation("D^alpha y = -0.8 D y + a y + b u", initial="rest", delay={"u": (0.0, 0.5)})
+    found = ftlm.identify(run, structure, threads=1, intervals="profile")
+    for name, value in {"alpha": 2.0, "a": -4.0, "b": 4.0, "delay_u": 3 * STEP}.items():
+        own = found.profiles[name]
+        assert value in own
+        assert own.high - own.low < 10 * found.standard_errors[name]
+    valley = valley_of(found)
+    for i, name in enumerate(valley.names):
+        moved = float(valley.best.values[i]) + float(valley.errors[i])
+        refit = valley.refitted(i, moved, valley.best)
+        assert refit is not None
+        assert refit.values[i] == moved, name
+
+
+# ------------------------------------------------------------------------------------------------ refusals
+
+
+def test_what_has_no_profile_says_so(bent: ftlm.Run, found: ftlm.Identification) -> None:
+    structure = ftlm.equation("D^2 y = c D y + a y + b u", initial="rest")
+    with pytest.raises(ftlm.ModelError, match="'e', nor 1 more is no free number of this fit; it has c, a, b"):
+        found.profile("e", "f")
+    for level in (0.0, 1.0, 95, math.nan):
+        with pytest.raises(ftlm.ModelError, match="is no probability between 0 and 1"):
+            found.profile(level=level)
+    with pytest.raises(ftlm.ModelError, match="level = '95 %' is not a number"):
+        found.profile(level="95 %")  # type: ignore[arg-type]
+    least = ftlm.identify(bent, structure, method="least-squares")
+    with pytest.raises(ftlm.ModelError, match="'least-squares' has no likelihood to profile"):
+        least.profile()
+    with pytest.raises(ftlm.ModelError, match="intervals = 'likelihood' is not known; use 'auto' or"):
+        ftlm.identify(bent, structure, intervals="likelihood")  # type: ignore[arg-type]
+    with pytest.raises(ftlm.ModelError, match="intervals='profile' needs a cost"):
+        ftlm.identify(bent, structure, intervals="profile", reference="r")
+    looped = replace(found, settings={**found.settings, "reference": "r"})
+    with pytest.raises(ftlm.ModelError, match="no minimum of a cost"):
+        looped.profile()
+
+
+def test_warnings_follow_the_profile(found: ftlm.Identification) -> None:
+    assert found.joint is not None
+    problem = valley_of(found).grid.problem
+    before = uncertain(replace(found.joint, profiles={}), problem)
+    after = uncertain(found.joint, problem)
+    assert [w for w in before if w.startswith("coefficient c")]
+    assert not [w for w in after if w.startswith("coefficient c")]
+
+
+# ------------------------------------------------------------------------------------------------ a real run
+
+
+@needs_data
+@pytest.mark.slow
+def test_the_link_of_the_real_arm_is_bounded_from_one_side_alone() -> None:
+    """The deflection driven by the hub: D^mu near 0 and the spring trade for each other without end."""
+    run = ftlm.load(
+        DATA / "two_link_psf" / "psf.csv", time="t_s", inputs={"theta11": "th11_deg"}, outputs={"theta12": "th12_deg"},
+        units={"theta11": "deg", "theta12": "deg"}, intersample={"theta11": "foh"},
+    ).slice(1.1, 10.3)  # fmt: skip
+    thin = ftlm.Run.from_arrays(
+        step=4 * run.step, inputs={"theta11": run["theta11"][::4]}, outputs={"theta12": run["theta12"][::4]},
+        units=run.units, intersample={"theta11": "foh"},
+    )  # fmt: skip
+    words = "D^2 theta12 = d D^mu theta12 + a theta12 + b D^2 theta11"
+    link = ftlm.identify(thin, ftlm.equation(words, initial="caputo"), threads=1)
+    assert link.standard_errors["d"] > 100 * abs(link.coefficients["d"])
+    d, a, mu = (link.profiles[n] for n in ("d", "a", "mu"))
+    assert d.low == -math.inf
+    assert d.high < -1.0
+    assert a.high == math.inf
+    assert -200.0 < a.low < 0.0
+    assert 0.0 <= mu.low < 0.01
+    assert 0.1 < mu.high < 1.0
