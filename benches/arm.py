@@ -86,23 +86,25 @@ WORDS = {
     " + s theta21 + r theta11",
     "+ a spring-pot": "D^2 theta12 = a D^beta theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21 + q theta22"
     " + s theta21 + r theta11",
+    "the same, b = -1": "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21 + q theta22"
+    " + s theta21 + r theta11",
+    "the same, b = -1, a spring-pot": "D^2 theta12 = a D^beta theta12 + d D theta12 - D^2 theta11 + p D^2 theta21"
+    " + q theta22 + s theta21 + r theta11",
+    "inertial, b = -1": "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21 + q D^2 theta22",
     "theta22, whole orders": "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12",
+    "theta22, b = -1": "D^2 theta22 = a theta22 + d D theta22 - D^2 theta21 + p D^2 theta11 + q D^2 theta12",
+    "theta22, hub angles": "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12"
+    " + e theta21 + f theta11",
 }
 
 
 def measured() -> None:
     """Fitted on each run and on both; judged on each by the free run with the other angles as measured."""
     runs = {n: arm_run(n) for n in ("psf", "lqr")}
-    low_pass = ftlm.SensorFilter.low_pass
     structures = {}
     for name, text in WORDS.items():
-        output = text.split()[1]
-        # A deflection that drives the equation passed the filter already; it is taken as it is, or filtered once more.
-        structures[name] = ftlm.equation(text, sensor_filter=low_pass([output]))
-        if "theta12" in text and "theta22" in text:
-            structures[f"{name}, all filtered alike"] = ftlm.equation(
-                text, sensor_filter=low_pass(["theta12", "theta22"])
-            )
+        seen = [s for s in ("theta12", "theta22") if s in text]
+        structures[name] = ftlm.equation(text, sensor_filter=ftlm.SensorFilter.low_pass(seen))
     link = ftlm.flexible_link(stage=1, sensor_filter="stock").equation("theta12")
     whole = {"beta2": 0.0, "gamma2": 2.0, "mu2": 1.0}
     free_b = ftlm.flexible_link(stage=1, sensor_filter="stock", laws=()).equation("theta12")
@@ -110,6 +112,8 @@ def measured() -> None:
     structures["flexible_link, whole, b free"] = free_b.with_orders(whole)
     structures["flexible_link, orders free, b = -1"] = link
     structures["flexible_link, orders free, b free"] = free_b
+    pushed = ftlm.flexible_link(stage=2, cross_stage="inertial", sensor_filter="stock").equation("theta22")
+    structures["flexible_link, inertial, theta22"] = pushed.with_orders({"beta4": 0.0, "gamma4": 2.0, "mu4": 1.0})
     for name, words in structures.items():
         output = words.outputs[0]
         for used in (("psf",), ("lqr",), ("psf", "lqr")):

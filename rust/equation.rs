@@ -60,6 +60,15 @@ pub enum Initial {
         /// Whether the constant grows in proportion to time as well.
         ramp: bool,
     },
+    /// A sensor filter that is not at rest when the record starts. What the filter makes of signals from then on lacks
+    /// what it still holds of the time before: free motions of the filter, which are its answers to an impulse and to
+    /// derivatives of one.
+    Filtered {
+        /// How the record starts otherwise, an offset included; not again filtered.
+        under: Box<Initial>,
+        /// Number of these answers.
+        states: u8,
+    },
 }
 
 impl Equation {
@@ -120,11 +129,27 @@ impl Initial {
         }
     }
 
-    /// How the record starts, an offset left aside.
+    /// The same where signals passed a filter of this relative degree that was not at rest; 0 for one that was.
+    ///
+    /// ```
+    /// use ftlm::equation::{Initial, Structure};
+    /// let plant = Structure { output: 0, order: 1.0, terms: vec![] };
+    /// assert_eq!(plant.initial_exponents(&Initial::Caputo.with_states(2)), [-2.0, -1.0, 0.0]);
+    /// ```
+    #[must_use]
+    pub fn with_states(self, states: u8) -> Self {
+        match (self, states) {
+            (whole, 0) => whole,
+            (Self::Filtered { under, .. }, _) => Self::Filtered { under, states },
+            (whole, _) => Self::Filtered { under: Box::new(whole), states },
+        }
+    }
+
+    /// How the record starts, an offset and a filter left aside.
     #[must_use]
     pub fn under(&self) -> &Self {
         match self {
-            Self::Offset { under, .. } => under.under(),
+            Self::Offset { under, .. } | Self::Filtered { under, .. } => under.under(),
             other => other,
         }
     }
@@ -138,7 +163,10 @@ impl Initial {
     /// Whether exponents depend on the orders of the equation.
     #[must_use]
     pub fn follows_orders(&self) -> bool {
-        matches!(self, Self::Caputo | Self::Offset { .. })
+        match self {
+            Self::Filtered { under, .. } => under.follows_orders(),
+            other => matches!(other, Self::Caputo | Self::Offset { .. }),
+        }
     }
 
     /// Powers of t that an offset is, integrated under this α.
@@ -146,8 +174,15 @@ impl Initial {
         match self {
             Self::Offset { ramp: true, .. } => vec![tidy(alpha), tidy(alpha + 1.0)],
             Self::Offset { ramp: false, .. } => vec![tidy(alpha)],
+            Self::Filtered { under, .. } => under.offset_exponents(alpha),
             _ => Vec::new(),
         }
+    }
+
+    /// Exponents that stand for an impulse, −1, and its derivatives, −2 and on.
+    pub(crate) fn impulses(&self) -> impl Iterator<Item = f64> {
+        let states = if let Self::Filtered { states, .. } = self { *states } else { 0 };
+        (1..=states).map(|k| -f64::from(k))
     }
 
     /// Refuses exponents whose power of t has no mean over the first pulse.
@@ -223,7 +258,7 @@ impl Structure {
     #[must_use]
     pub fn initial_exponents(&self, initial: &Initial) -> Vec<f64> {
         let mut exponents = match initial.under() {
-            Initial::Rest | Initial::Offset { .. } => Vec::new(),
+            Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => Vec::new(),
             Initial::Powers(powers) => powers.clone(),
             Initial::Caputo => {
                 let mut all: Vec<f64> = whole_below(self.order).collect();
@@ -238,6 +273,7 @@ impl Structure {
             exponents.retain(|e| *e == 0.0 || offset.iter().all(|o| (e - o).abs() > STAND_IN));
         }
         exponents.extend(offset);
+        exponents.extend(initial.impulses());
         exponents.sort_by(f64::total_cmp);
         exponents.dedup_by(|a, b| (*a - *b).abs() < ORDER_GRAIN);
         exponents

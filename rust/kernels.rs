@@ -284,7 +284,8 @@ pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
     weights
 }
 
-/// Pulse means of `t^exponent`, k = 1 … m, exact to a few ε (exponent > −1).
+/// Pulse means of `t^exponent`, k = 1 … m, exact to a few ε (exponent > −1); of δ and its derivatives, as differences over
+/// the first pulses, for the exponents −1, −2, ….
 ///
 /// ```
 /// let means = ftlm::kernels::power_means(1.0, 3, 2.0);
@@ -293,6 +294,13 @@ pub fn grunwald_letnikov_weights(alpha: f64, m: usize) -> Vec<f64> {
 #[must_use]
 #[allow(clippy::cast_precision_loss)]
 pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+    if exponent <= -1.0 && exponent.fract() == 0.0 {
+        // Differences of the first pulses stand at their middle; half their span further back is one more difference.
+        let order = -exponent - 1.0;
+        let (first, next) = (grunwald_letnikov_weights(order, m), grunwald_letnikov_weights(order + 1.0, m));
+        let scale = libm::pow(step, exponent);
+        return first.iter().zip(&next).map(|(a, b)| scale * (a + 0.5 * (order + 1.0) * b)).collect();
+    }
     let a = exponent + 1.0;
     let scale = libm::pow(step, exponent) / a;
     (1..=m)

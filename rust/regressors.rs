@@ -97,6 +97,12 @@ impl Record {
         Self::new(self.step, self.signals.iter().map(filtered).collect(), Some(known))
     }
 
+    /// Whether signals and initial terms went through a sensor filter.
+    #[must_use]
+    pub fn is_filtered(&self) -> bool {
+        self.filter.is_some()
+    }
+
     /// Number of pulses.
     #[must_use]
     pub fn m(&self) -> usize {
@@ -147,7 +153,8 @@ impl Record {
         series::multiply(&kernel(eta, self.m(), self.step), &self.signals[signal], self.m())
     }
 
-    /// Pulse means of the initial term t^exponent, t in seconds, through the sensor filter where there is one.
+    /// Pulse means of the initial term t^exponent, t in seconds, through the sensor filter where there is one; of an
+    /// impulse and its derivatives for −1, −2, ….
     ///
     /// ```
     /// # use ftlm::regressors::Record;

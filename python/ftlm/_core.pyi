@@ -68,7 +68,9 @@ _Structure: TypeAlias = tuple[int, float, Sequence[tuple[int, float]]]
 #: a structure and one coefficient a term
 _Equation: TypeAlias = tuple[_Structure, Sequence[float]]
 #: (whether Caputo's powers, else these exponents; terms of an offset: 1 a constant, 2 a ramp too)
-_Initial: TypeAlias = tuple[bool, Sequence[float]] | tuple[bool, Sequence[float], int]
+_Initial: TypeAlias = (
+    tuple[bool, Sequence[float]] | tuple[bool, Sequence[float], int] | tuple[bool, Sequence[float], int, int]
+)
 #: (criterion, norm, p or 0 for least squares, K0, Haar rows, keep, threads, early stopping)
 _Options: TypeAlias = tuple[str, str, int, float, bool, int, int, bool, int]
 #: (output, values of alpha, [(signal, values, interchangeable), ...])

@@ -16,6 +16,8 @@ pub type EquationArg = (StructureArg, Vec<f64>);
 /// (whether Caputo's powers, else these exponents).
 #[derive(FromPyObject)]
 pub enum InitialArg {
+    /// With offset and the number of impulses that a filter holds.
+    Filtered(bool, Vec<f64>, u8, u8),
     /// With offset: 0 none, 1 a constant, 2 a constant and a ramp.
     Offset(bool, Vec<f64>, u8),
     Plain(bool, Vec<f64>),
@@ -65,9 +67,10 @@ pub fn equations(arguments: Vec<EquationArg>, signals: usize, inputs: &[bool]) -
 }
 
 pub fn initial(argument: InitialArg) -> PyResult<Initial> {
-    let (caputo, powers, offset) = match argument {
-        InitialArg::Offset(caputo, powers, offset) => (caputo, powers, offset),
-        InitialArg::Plain(caputo, powers) => (caputo, powers, 0),
+    let (caputo, powers, offset, states) = match argument {
+        InitialArg::Filtered(caputo, powers, offset, states) => (caputo, powers, offset, states),
+        InitialArg::Offset(caputo, powers, offset) => (caputo, powers, offset, 0),
+        InitialArg::Plain(caputo, powers) => (caputo, powers, 0, 0),
     };
     let powers = Initial::Powers(powers);
     powers.check()?;
@@ -76,7 +79,7 @@ pub fn initial(argument: InitialArg) -> PyResult<Initial> {
         Initial::Powers(powers) if powers.is_empty() => Initial::Rest,
         powers => powers,
     };
-    Ok(under.with_offset(offset)?)
+    Ok(under.with_offset(offset)?.with_states(states))
 }
 
 /// A row-major matrix as an array.

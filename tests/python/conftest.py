@@ -47,7 +47,11 @@ def plant(plants):
         described = plants[name]
         coefficients = {t["name"]: t["coefficient"] for e in described["equations"] for t in e["terms"]}
         return ftlm.link_model(
-            stage=described["stage"], orders=described["free_orders"], coefficients=coefficients, **options
+            stage=described["stage"],
+            orders=described["free_orders"],
+            coefficients=coefficients,
+            form="published",
+            **options,
         )
 
     return make

@@ -293,7 +293,7 @@ BAD = {
     ),
     "filter of nothing": (
         MODEL,
-        "filtered output 'z' does not occur",
+        "filtered signal 'z' does not occur",
         lambda: ftlm.equation("D y = a y", sensor_filter=ftlm.SensorFilter.low_pass(["z"])),
     ),
     "unknown initial terms": (

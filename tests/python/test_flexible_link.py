@@ -199,8 +199,12 @@ def test_stock_sensor_filter(stage, outputs):
 
 def test_sensor_filter_follows_its_output_into_one_equation():
     structure = ftlm.flexible_link(form="published", stage="both", sensor_filter="stock")
-    assert structure.equation("theta11").sensor_filter.outputs == ("theta12",)
-    assert structure.equation("theta22").sensor_filter.outputs == ("theta22",)
+    assert structure.equation("theta11").sensor_filter.signals == ("theta12",)
+    assert structure.equation("theta22").sensor_filter.signals == ("theta22",)
+    # A deflection that drives a stage passed the filter as well as the one that is modelled.
+    pushed = ftlm.flexible_link(stage=2, cross_stage="inertial", sensor_filter="stock")
+    assert pushed.sensor_filter.signals == ("theta12", "theta22")
+    assert ftlm.flexible_link(stage=1, cross_stage=True, sensor_filter="stock").equation("theta12").behind_filter
     uncoupled = ftlm.equation("D y = a y; D z = b z", sensor_filter=ftlm.SensorFilter.low_pass(["z"]))
     assert uncoupled.equation("y").sensor_filter is None
 
@@ -216,7 +220,7 @@ def test_sensor_filter_follows_its_output_into_one_equation():
         ({"laws": "orders"}, "law 'o' is not known"),
         ({"parameters": "table-4"}, "parameters = 'table-4' is not known; use 'effective' or 'table-3'"),
         ({"sensor_filter": "low-pass"}, "sensor_filter = 'low-pass' is not known; use 'stock' or a SensorFilter"),
-        ({"sensor_filter": ftlm.SensorFilter.low_pass(["theta22"])}, "filtered output 'theta22' does not occur"),
+        ({"sensor_filter": ftlm.SensorFilter.low_pass(["theta22"])}, "filtered signal 'theta22' does not occur"),
     ],
 )
 def test_options_that_are_not_known_are_refused(options, message):
@@ -232,7 +236,7 @@ def test_options_that_are_not_known_are_refused(options, message):
 
 
 def test_manual_model_is_the_integer_rows_of_the_paper():
-    model = ftlm.link_model(stage=1)
+    model = ftlm.link_model(stage=1, form="published")
     assert model.orders == {"alpha1": 2.0, "beta2": 0.0, "alpha2": 2.0, "gamma1": 1.0, "mu2": 1.0}
     assert model.coefficients == ftlm.PARAMETERS["effective"][1].coefficients(1)
     assert model.units == {"theta11": "rad", "theta12": "rad", "I1": "A"}
@@ -242,9 +246,22 @@ def test_manual_model_is_the_integer_rows_of_the_paper():
     assert model.about == {"origin": "parameters effective"}
 
 
+def test_the_manuals_model_is_one_in_either_form():
+    lagrange, published = ftlm.link_model(stage="both"), ftlm.link_model(stage="both", form="published")
+    assert lagrange.structure.coupling == "simulated"
+    assert [str(e) for e in lagrange.equations][1].startswith("D^2 theta12 = -234.444 theta12 - 1 D^2 theta11")
+    w = np.geomspace(0.1, 100.0, 20)
+    theirs = published.frequency_response(w)
+    assert np.max(np.abs(lagrange.frequency_response(w) - theirs)[theirs != 0] / np.abs(theirs[theirs != 0])) < 1e-10
+    with pytest.raises(ftlm.ModelError, match="input_order = 'derived' is not used by form='lagrange'"):
+        ftlm.link_model(form="lagrange", input_order="derived")
+
+
 def test_models_of_other_parameters_orders_and_coefficients():
     link = ftlm.LinkParameters(6.0, 2.0, 4.0, 1.0, 0.5, 3.0)
-    model = ftlm.link_model(stage=2, parameters={2: link}, orders={"gamma3": 0.9}, coefficients={"g3": 7.0})
+    model = ftlm.link_model(
+        stage=2, parameters={2: link}, orders={"gamma3": 0.9}, coefficients={"g3": 7.0}, form="published"
+    )
     assert model.coefficients == link.coefficients(2) | {"g3": 7.0}
     assert model.orders["gamma3"] == 0.9
     assert model.orders["mu4"] == 1.0

@@ -76,6 +76,89 @@ def test_the_hub_is_carried_above_the_deflections_own_order(stage: int) -> None:
     assert alone.equations[0].terms[1].fixed == -1.0
 
 
+@pytest.mark.parametrize("velocities", [False, True])
+def test_inertial_coupling_follows_from_the_energies_of_the_planar_arm(velocities: bool) -> None:
+    # Every signal as a power of s: kinetic energy in the absolute rates of (8), Lagrange's equation of each angle.
+    s, h, m1, m2, n1, n2, k1, k2, d1, d2, f1, f2, t1, t2 = sp.symbols("s H J11 J12 J21 J22 K1 K2 D1 D2 F1 F2 T1 T2")
+    alpha1, gamma1, beta2, mu2, alpha3, gamma3, beta4, mu4 = sp.symbols(
+        "alpha1 gamma1 beta2 mu2 alpha3 gamma3 beta4 mu4"
+    )
+    if velocities:
+        gamma1, gamma3 = mu2, mu4
+    x = dict(zip(("theta11", "theta12", "theta21", "theta22", "I1", "I2"), sp.symbols("x1:7"), strict=True))
+    names = ("theta11", "theta12", "theta21", "theta22")
+    own = dict(zip(names, (gamma1, mu2, gamma3, mu4), strict=True))
+    highest = dict(zip(names, (alpha1, 2, alpha3, 2), strict=True))
+    rates = sp.symbols("w1:5")
+    of = [sum(s ** own[n] * x[n] for n in names[: i + 1]) for i in range(4)]
+    energy = sum(j * w**2 for j, w in zip((m1, m2, n1, n2), rates, strict=True)) / 2 + h * rates[1] * rates[3]
+    momenta = [sp.diff(energy, w).subs(dict(zip(rates, of, strict=True))) for w in rates]
+
+    def lagrange(i: int) -> sp.Expr:
+        # The rate of angle i stands in all absolute rates from the i-th on.
+        return s ** (highest[names[i]] - own[names[i]]) * sum(momenta[i:])
+
+    link = {
+        1: lagrange(1) + k1 * s**beta2 * x["theta12"] + d1 * s**mu2 * x["theta12"],
+        3: lagrange(3) + k2 * s**beta4 * x["theta22"] + d2 * s**mu4 * x["theta22"],
+    }
+    hub = {
+        0: lagrange(0) + f1 * s**gamma1 * x["theta11"] - t1 * x["I1"],
+        2: lagrange(2) + f2 * s**gamma3 * x["theta21"] - t2 * x["I2"],
+    }
+    carried = m2 + n1 + n2 + 2 * h
+    inertia = {0: m1, 1: carried, 2: n1, 3: n2}
+    sides = {i: link[i] / inertia[i] for i in link}
+    for i, equation in hub.items():
+        raised = s ** (highest[names[i]] - own[names[i]] - highest[names[i + 1]] + own[names[i + 1]])
+        sides[i] = (equation - raised * link[i + 1]) / inertia[i]
+    values = {
+        "a1": k1 / m1, "b1": -f1 / m1, "d1": d1 / m1, "g1": t1 / m1, "j1": m1 / carried,
+        "a3": k2 / n1, "b3": -f2 / n1, "d3": d2 / n1, "g3": t2 / n1, "j2": n1 / n2,
+        "p2": -(n1 + n2 + h) / carried, "q2": -(n2 + h) / carried, "p3": sp.Integer(-1), "p4": -(n2 + h) / n2,
+    }  # fmt: skip
+    laws = ("orders", "coefficients", "velocities") if velocities else ("orders", "coefficients")
+    built = ftlm.flexible_link(stage="both", cross_stage="inertial", laws=laws)
+    for name, sign, factors in built.coefficient_law:
+        values[name] = sp.nsimplify(sign) * sp.prod([values[f] for f in factors])
+
+    def power(order: ftlm.Order) -> sp.Expr:
+        return sp.nsimplify(order.constant) + sum(sp.nsimplify(w) * sp.Symbol(n) for n, w in order.weights)
+
+    for i, item in enumerate(built.equations):
+        right = sum(
+            (sp.nsimplify(t.fixed) if t.fixed is not None else t.factor * values[t.coefficient])
+            * s ** power(t.order) * x[t.signal]
+            for t in item.terms
+        )  # fmt: skip
+        left = s ** power(item.order) * x[item.output] - right
+        assert sp.simplify(sp.powsimp(sp.expand(left - sides[i]))) == 0, item.output
+
+
+def test_inertial_coupling_has_its_words_and_orders() -> None:
+    alone = ftlm.flexible_link(stage=1, cross_stage="inertial", cross_sensitivity=True)
+    assert str(alone).splitlines()[1] == (
+        "D^2 theta12 = a2 D^beta2 theta12 - 1.0 D^(gamma1-mu2+2) theta11 + d2 D^mu2 theta12"
+        " + p2 D^2 theta21 + q2 D^2 theta22 + e2 theta11 + f2 theta21"
+    )
+    assert alone.equations[0] == ftlm.flexible_link(stage=1).equations[0]
+    second = ftlm.flexible_link(stage=2, cross_stage="inertial")
+    assert {n: f for n, _, f in second.coefficient_law if n[0] == "q"} == {"q3": ("p3",), "q4": ("p4",)}
+    assert "q4" in second.equation("theta22").coefficient_names
+    tied = ftlm.flexible_link(stage=1, laws=("orders", "coefficients", "velocities"))
+    assert tied.order_names == ("alpha1", "mu2", "beta2")
+    assert tied.equations[1].terms[1].order == ftlm.Order(2.0)
+    assert ftlm.flexible_link(cross_stage="torques") == ftlm.flexible_link(cross_stage=True)
+    for options, words in [
+        ({"cross_stage": "inertia"}, "cross_stage = 'inertia' is not known"),
+        ({"cross_stage": "inertial", "form": "published"}, "cross_stage='inertial' follows from the energies"),
+        ({"laws": ("velocities",)}, "law 'velocities' ties two orders of form='lagrange' under the order law"),
+        ({"laws": ("orders", "velocities"), "form": "published"}, "law 'velocities' ties two orders"),
+    ]:
+        with pytest.raises(ftlm.ModelError, match=words):
+            ftlm.flexible_link(**options)
+
+
 def test_forms_and_their_options() -> None:
     assert ftlm.flexible_link(input_order="derived") == ftlm.flexible_link(form="published", input_order="derived")
     with pytest.raises(ftlm.ModelError, match="input_order = 'derived' is not used by form='lagrange'"):

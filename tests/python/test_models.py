@@ -471,7 +471,7 @@ def test_filters_that_are_none_are_refused(numerator, denominator, message):
 
 
 def test_filtered_outputs_must_occur():
-    with pytest.raises(ftlm.ModelError, match="filtered output 'z' does not occur in the equation; known: y, u"):
+    with pytest.raises(ftlm.ModelError, match="filtered signal 'z' does not occur in the equation; known: y, u"):
         ftlm.equation("D y = a y + b u", sensor_filter=SensorFilter.low_pass(["z"]))
 
 

@@ -24,7 +24,7 @@ ORDERS = {"gamma1": 0.95, "beta2": 0.1, "mu2": 0.85}
 def run_of(shape, name, *, seed, seconds=4.0, step=0.004):
     t = np.arange(round(seconds / step) + 1) * step
     inputs = {"I1": shape(t)}
-    clean = ftlm.link_model(orders=ORDERS, coefficients={"d1": 6.63, "d2": -9.1}).simulate(
+    clean = ftlm.link_model(orders=ORDERS, coefficients={"d1": 6.63, "d2": -9.1}, form="published").simulate(
         ftlm.Run.from_arrays(step=step, inputs=inputs, outputs={"theta11": t}, units={"I1": "A"})
     )
     noise = np.random.default_rng(seed)
@@ -412,7 +412,7 @@ def test_parameters_stand_beside_the_stated_ones(identified):
 
 
 def paper_rows(identified):
-    integer = ftlm.link_model()
+    integer = ftlm.link_model(form="published")
     infinite = ftlm.Metrics(math.inf, math.inf, math.inf, -math.inf)
     rows = []
     for output in ("theta11", "theta12"):

@@ -296,7 +296,7 @@ def test_explicit_euler_of_the_manual_model(drive):
     # The paper's baseline: 2 ms steps, both stages.
     for stage, name in ((1, "A"), (2, "A2")):
         run = drive(name, samples=1001)
-        manual = ftlm.link_model(stage=stage)
+        manual = ftlm.link_model(stage=stage, form="published")
         euler, exact = ftlm.explicit_euler(manual, run), manual.simulate(run, tolerance=1e-5)
         hub = f"theta{stage}1"
         assert ftlm.metrics(exact[hub], euler[hub]).fit > 90

@@ -120,7 +120,7 @@ def test_options_of_a_search_need_a_free_order(small_run):
 @pytest.mark.parametrize(
     "words",
     [["--friction"], ["--cross-stage"], ["--laws", "orders"], ["--laws", "none"], ["--coupling", "measured"],
-     ["--input-order", "derived"], ["--stock-filter"]],
+     ["--input-order", "derived"], ["--stock-filter"], ["--inertial"], ["--cross-sensitivity"]],
 )  # fmt: skip
 @pytest.mark.parametrize("command", ["identify", "search"])
 def test_options_of_the_flexible_link_are_refused_with_an_equation(command, words, saved):

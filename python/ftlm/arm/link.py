@@ -29,6 +29,10 @@ NATURAL = {"alpha": (2.0,), "gamma": (0.9, 1.0), "beta": (0.0, 0.15), "mu": (0.8
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 Form: TypeAlias = Literal["lagrange", "published"]
 InputOrder: TypeAlias = Literal["published", "derived"]
+CrossStage: TypeAlias = Literal["torques", "inertial"] | bool
+Law: TypeAlias = Literal["orders", "coefficients", "velocities"]
+#: What is known of the arm.
+LAWS = ("orders", "coefficients", "velocities")
 
 
 def _hints(form: Form) -> Hints:
@@ -59,7 +63,9 @@ def _form(form: Form | None, input_order: InputOrder | None) -> tuple[Form, Inpu
     return form, input_order
 
 
-def order_law(stage: int, input_order: InputOrder | None = None, *, form: Form | None = None) -> dict[str, Order]:
+def order_law(
+    stage: int, input_order: InputOrder | None = None, *, form: Form | None = None, velocities: bool = False
+) -> dict[str, Order]:
     """Every order of a stage's two equations as a function of the five free ones.
 
     Parameters
@@ -71,6 +77,9 @@ def order_law(stage: int, input_order: InputOrder | None = None, *, form: Form |
     form
         ``"lagrange"`` or ``"published"``, see :func:`flexible_link`; default lagrange, or published where an input
         order is named.
+    velocities
+        Whether gamma_1 = mu_2, so that D^gamma_1 theta_11 and D^mu_2 theta_12, which (8) adds, are velocities of one
+        kind; the hub angle then stands in the deflection's equation (15) with alpha_2 itself.
 
     Returns
     -------
@@ -103,14 +112,17 @@ def order_law(stage: int, input_order: InputOrder | None = None, *, form: Form |
     if form == "published":
         law[f"gamma{d}"] = f"2*gamma{h} - alpha{h} + alpha{d} - mu{d}"
         law["input"] = f"alpha{d} - mu{d} + gamma{h} - alpha{h}" if input_order == "derived" else "0"
+    if velocities:
+        law = {name: text.replace(f"gamma{h}", f"mu{d}") for name, text in law.items()}
     return {name: Order.parse(text) for name, text in law.items()}
 
 
 def flexible_link(
     *,
     stage: Literal[1, 2, "both"] = 1, form: Form | None = None, input_order: InputOrder | None = None,
-    coupling: Literal["simulated", "measured"] | None = None, cross_stage: bool = False, friction: bool = False,
-    laws: Sequence[Literal["orders", "coefficients"]] = ("orders", "coefficients"),
+    coupling: Literal["simulated", "measured"] | None = None, cross_stage: CrossStage = False, friction: bool = False,
+    cross_sensitivity: bool = False, hub: bool = True,
+    laws: Sequence[Law] = ("orders", "coefficients"),
     parameters: Literal["effective", "table-3"] = "effective",
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
     offset: Literal["none", "constant", "ramp"] = "none",
@@ -139,11 +151,23 @@ def flexible_link(
         ``"simulated"``: both follow from the currents alone, the default of the published one; noise of the hub's angle
         then drives nothing.
     cross_stage
-        Adds the other stage's angles and current to every equation (order 0); with ``stage="both"`` those are
-        modelled too.
+        ``"torques"`` (or True) adds the other stage's angles and current to every equation (order 0).
+        ``"inertial"``, of the Lagrange form, adds what the energies of the planar arm give, linearised: hub 2 sits on
+        the tip of link 1, so the accelerations of stage 2 push back on link 1 (p_2 D^2 theta_21 + q_2 D^2 theta_22) and
+        those of stage 1 carry hub 2 and link 2 with them (p_3, p_4 of theta_11, q_3, q_4 of theta_12); hub 1 feels
+        stage 2 through its link alone. With ``stage="both"`` the other stage is modelled too, and velocities add up as
+        in (8): theta_21 stands in the equation of theta_12 with alpha_2 - mu_2 + gamma_3, and so on. Of a stage alone
+        these terms are of the order of their equation, alpha_2, alpha_3 or alpha_4.
     friction
         Adds a Coulomb term c * sign(D theta_j1) to the hub's equation, in the published form to both; needs measured
         coupling.
+    cross_sensitivity
+        Adds hub angles as they are (order 0) to the deflection's equation: strain gauges and cables make a measured
+        deflection follow the hub's angle. e_2 theta_11 in that of theta_12, and with ``cross_stage="inertial"``
+        f_2 theta_21.
+    hub
+        False leaves the hub's equation out: a deflection driven by the measured hub, whose friction nobody knows. No
+        ratio of inertias is left to tie coefficients.
     laws
         ``"orders"``: orders obey :func:`order_law`, five are free. Without it each equation has its own four orders.
         With the Lagrange form and with ``"derived"`` alpha_2 (alpha_4) is fixed at 2: it is seen only through the
@@ -151,11 +175,15 @@ def flexible_link(
         ``"coefficients"``: the coefficient law is stated in the structure, with the ratio r = (J_1 + J_2)/J_2 of the
         published form or j = J_1/J_2 of the Lagrange form, where the coefficient -1 of the hub's motion is then known;
         without it that is free, b_2. The equation-error estimators estimate the coefficients freely and report how far
-        they are from the law.
+        they are from the law. With inertial coupling it says besides that the tip of link 1 carries stage 2 by the sum
+        of its angles: q_3 = p_3 and q_4 = p_4.
+        ``"velocities"``: gamma_1 = mu_2 (gamma_3 = mu_4), see :func:`order_law`; of the Lagrange form under
+        ``"orders"``.
     parameters
         Named set that results are set beside.
     sensor_filter
-        ``"stock"`` for the 2 Hz low-pass that the arm's stock real-time model puts on both deflections, or a filter.
+        ``"stock"`` for the 2 Hz low-pass that the arm's stock real-time model puts on both deflections, whether they
+        are modelled or drive a model, or a filter.
     offset
         ``"constant"`` or ``"ramp"``: an unknown constant (and a ramp) in each equation, one a run, such as the current
         that it takes to hold the arm still; see :func:`ftlm.equation`.
@@ -174,37 +202,60 @@ def flexible_link(
         raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")
     form, input_order = _form(form, input_order)
     for law in laws:
-        if law not in ("orders", "coefficients"):
+        if law not in LAWS:
             raise ModelError(f"law {law!r} is not known; use 'orders', 'coefficients', both or ()")
+    if "velocities" in laws and (form != "lagrange" or "orders" not in laws):
+        raise ModelError(
+            "law 'velocities' ties two orders of form='lagrange' under the order law; use it with laws=('orders', …)"
+        )
+    if cross_stage not in (False, True, "torques", "inertial"):
+        raise ModelError(f"cross_stage = {cross_stage!r} is not known; use False, 'torques' or 'inertial'")
+    if cross_stage == "inertial" and form != "lagrange":
+        raise ModelError("cross_stage='inertial' follows from the energies, as form='lagrange' does; use that form")
     if parameters not in PARAMETERS:
         raise ModelError(f"parameters = {parameters!r} is not known; use {' or '.join(map(repr, PARAMETERS))}")
     if coupling is None:
         coupling = "measured" if form == "lagrange" else "simulated"
     if friction and coupling == "simulated":
         raise ModelError("friction=True makes the coupled free run non-linear; use coupling='measured'")
+    if not hub and (form != "lagrange" or coupling == "simulated" or friction):
+        raise ModelError(
+            "hub=False leaves the deflection to the measured hub: it needs form='lagrange' and coupling='measured', "
+            "and knows no friction=True"
+        )
     stages: tuple[int, ...] = (1, 2) if stage == "both" else (stage,)
     equations: list[Equation] = []
     coefficient_law: list[tuple[str, float, tuple[str, ...]]] = []
     reference: dict[str, float] = {}
     for j in stages:
-        orders = order_law(j, form=form, input_order=input_order if form == "published" else None)
-        equations += _stage(j, form, orders, laws, cross_stage, friction)
+        named = input_order if form == "published" else None
+        orders = order_law(j, form=form, input_order=named, velocities="velocities" in laws)
+        made = _stage(j, form, orders, laws, friction)
+        if cross_stage:
+            made = _pushed(made, j, laws, stage == "both") if cross_stage == "inertial" else _twisted(made, j)
+        if cross_sensitivity:
+            made = (made[0], _followed(made[1], j, other=cross_stage == "inertial"))
+        equations += made if hub else made[1:]
         h, d = 2 * j - 1, 2 * j
         ratio = f"j{j}" if form == "lagrange" else f"r{j}"
         tied: tuple[tuple[str, tuple[str, ...]], ...] = (("a", (ratio,)), ("d", (ratio,)))
         if form == "published":
             tied = (("a", (ratio,)), ("b", ()), ("d", (ratio,)), ("g", ()))
         coefficient_law += [(f"{c}{d}", -1.0, (f"{c}{h}", *factors)) for c, factors in tied]
+        if cross_stage == "inertial" and j == 2:
+            # Both angles of stage 1 turn what stands on its tip.
+            coefficient_law += [(f"q{n}", 1.0, (f"p{n}",)) for n in (h, d)]
         link = PARAMETERS[parameters][j]
         known = link.lagrange_coefficients(j) if form == "lagrange" else link.coefficients(j)
         reference |= {n: v for n, v in known.items() if any(n in e.coefficient_names for e in equations)}
     if sensor_filter == "stock":
-        sensor_filter = SensorFilter.low_pass([f"theta{j}2" for j in stages])
+        seen = {s for e in equations for s in e.signals}
+        sensor_filter = SensorFilter.low_pass([s for s in ("theta12", "theta22") if s in seen])
     if not (sensor_filter is None or isinstance(sensor_filter, SensorFilter)):
         raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or a SensorFilter")
     structure = Structure(
         equations=tuple(equations), coupling=coupling, sensor_filter=sensor_filter,
-        coefficient_law=tuple(coefficient_law) if "coefficients" in laws else (), reference=reference,
+        coefficient_law=tuple(coefficient_law) if "coefficients" in laws and hub else (), reference=reference,
         name=f"flexible link, stage {stage}" if stage != "both" else "flexible link, both stages", hints=_hints(form),
         offset=check_offset(offset),
     )  # fmt: skip
@@ -214,24 +265,19 @@ def flexible_link(
 
 
 def _stage(
-    stage: int, form: Form, law: Mapping[str, Order], laws: Sequence[str], cross_stage: bool, friction: bool
+    stage: int, form: Form, law: Mapping[str, Order], laws: Sequence[str], friction: bool
 ) -> tuple[Equation, Equation]:
     """Equations of the hub and of the deflection."""
     h, d = 2 * stage - 1, 2 * stage
     hub, deflection, current = f"theta{stage}1", f"theta{stage}2", f"I{stage}"
-    other, tied = 3 - stage, "orders" in laws
+    tied = "orders" in laws
 
     def order(name: str) -> Order:
         return law[name] if tied else Order(0.0, ((name, 1.0),))
 
     def extra(n: int) -> list[Term]:
-        terms = []
-        if cross_stage:
-            signals = [f"theta{other}1", f"theta{other}2", f"I{other}"]
-            terms += [Term(s, Order(CROSS_ORDER), f"{c}{n}") for c, s in zip("pqs", signals, strict=True)]
-        if friction and (n == h or form == "published"):
-            terms.append(Term(f"coulomb_{hub}", Order(), f"c{n}"))
-        return terms
+        rubs = friction and (n == h or form == "published")
+        return [Term(f"coulomb_{hub}", Order(), f"c{n}")] if rubs else []
 
     def equation(output: str, n: int, drive: Order | None) -> Equation:
         terms = [
@@ -250,17 +296,65 @@ def _stage(
     return equation(hub, h, Order()), equation(deflection, d, drive)
 
 
+def _added(item: Equation, terms: Sequence[Term]) -> Equation:
+    """An equation with more terms, before those of friction."""
+    rubs = tuple(t for t in item.terms if t.signal.startswith("coulomb_"))
+    return Equation(item.output, item.order, (*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
+
+
+def _twisted(made: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:
+    """Torques of the other stage: its angles and its current as they are."""
+    other, first = 3 - stage, 2 * stage - 1
+    signals = (f"theta{other}1", f"theta{other}2", f"I{other}")
+    hub, deflection = (
+        _added(item, [Term(s, Order(CROSS_ORDER), f"{c}{n}") for c, s in zip("pqs", signals, strict=True)])
+        for n, item in enumerate(made, first)
+    )
+    return hub, deflection
+
+
+def _pushed(
+    made: tuple[Equation, Equation], stage: int, laws: Sequence[str], both: bool
+) -> tuple[Equation, Equation]:  # fmt: skip
+    """Inertia of the other stage, by the energies of the planar arm with the absolute rates of (8) in them.
+
+    T = (J_11 w_1^2 + J_12 w_2^2 + J_21 w_3^2 + J_22 w_4^2)/2 + H w_2 w_4 with w_1 = D theta_11, w_2 = w_1 + D theta_12,
+    w_3 = w_2 + D theta_21, w_4 = w_3 + D theta_22, J_12 with all masses beyond link 1 at its tip and H the product of
+    that arm with the moment of mass of link 2. Of hub 1 less link 1 nothing of stage 2 is left.
+    """
+    h, d, other = 2 * stage - 1, 2 * stage, 3 - stage
+    oh, od = 2 * other - 1, 2 * other
+    rates = (f"mu{od}" if "velocities" in laws else f"gamma{oh}", f"mu{od}")
+    law = both and "orders" in laws
+
+    def terms(n: int, damping: str) -> list[Term]:
+        orders = [Order.parse(f"alpha{n} - {damping} + {rate}" if law else f"alpha{n}") for rate in rates]
+        return [
+            Term(f"theta{other}{k}", order, f"{c}{n}") for k, c, order in zip((1, 2), "pq", orders, strict=True)
+        ]  # fmt: skip
+
+    hub, deflection = made
+    # The order of D that makes of the rate of a hub its acceleration is alpha_3 - gamma_3, of a link alpha_2 - mu_2.
+    own = f"mu{d}" if "velocities" in laws else f"gamma{h}"
+    return hub if stage == 1 else _added(hub, terms(h, own)), _added(deflection, terms(d, f"mu{d}"))
+
+
+def _followed(item: Equation, stage: int, *, other: bool) -> Equation:
+    """Hub angles in the measured deflection."""
+    signals = (f"theta{stage}1", f"theta{3 - stage}1")[: 1 + other]
+    return _added(item, [Term(s, Order(), f"{c}{2 * stage}") for c, s in zip("ef", signals, strict=False)])
+
+
 def link_model(
     *, stage: Literal[1, 2, "both"] = 1,
     parameters: Literal["effective", "table-3"] | Mapping[int, LinkParameters] = "effective",
     orders: Mapping[str, float] | None = None, coefficients: Mapping[str, float] | None = None,
-    form: Form = "published", input_order: InputOrder | None = None,
+    form: Form | None = None, input_order: InputOrder | None = None,
     coupling: Literal["simulated", "measured"] = "simulated",
 ) -> Model:  # fmt: skip
     """Make the arm with everything known: by default the integer-order model of the maker's manual.
 
-    With whole orders the forms are one model. With fractional ones use ``form="lagrange"``: the published form then
-    bends the link the wrong way.
+    With whole orders the forms are one model. With fractional ones the published form bends the link the wrong way.
 
     Parameters
     ----------
@@ -273,7 +367,7 @@ def link_model(
     coefficients
         Coefficients to use instead of the parameters', by name.
     form, input_order, coupling
-        See :func:`flexible_link`.
+        See :func:`flexible_link`; both angles follow from the current by default.
 
     Returns
     -------
@@ -286,7 +380,10 @@ def link_model(
         A name that is not known, orders out of range.
     """
     named = parameters if isinstance(parameters, str) else "effective"
-    structure = flexible_link(stage=stage, form=form, input_order=input_order, coupling=coupling, parameters=named)
+    form, order = _form(form, input_order)
+    structure = flexible_link(
+        stage=stage, form=form, input_order=order if form == "published" else None, coupling=coupling, parameters=named
+    )
     values = dict(structure.reference)
     if not isinstance(parameters, str):
         for j, link in parameters.items():

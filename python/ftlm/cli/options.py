@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,14 +10,14 @@ from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
-from ftlm.arm.link import flexible_link
+from ftlm.arm.link import Law, flexible_link
 from ftlm.base.errors import DataError, ModelError
 from ftlm.cli.words import delays, interval, numbers, pairs
 from ftlm.data.language import equation
 from ftlm.data.lattice import Lattice, lattice
 from ftlm.data.run import Run
 from ftlm.data.settings import Criterion
-from ftlm.data.structures import START_WORDS, Structure, check_initial
+from ftlm.data.structures import START_WORDS, SensorFilter, Structure, check_initial
 from ftlm.files.load import load
 from ftlm.fit.genetic import Genetic
 
@@ -28,7 +29,11 @@ Texts = list[str] | None
 Files = Annotated[list[str], Argument(metavar="FILE...", help="csv or .mat files; several files are several runs.")]
 SavedModel = Annotated[str, Argument(metavar="MODEL", help="A saved model.")]
 StructureText = Annotated[
-    str, Option("--structure", help="flexible-link:1, flexible-link:2, flexible-link:both, or an equation in words.")
+    str,
+    Option(
+        "--structure",
+        help="flexible-link:1, :2 or :both; arm:1, :2 or :both (deflections of a real arm); or an equation in words.",
+    ),
 ]
 LatticeStep = Annotated[float, Option("--step", help="Step of the order lattice.")]
 BlockPulses = Annotated[int | None, Option("--m", help="Block pulses a run; default 2048, or what the runs carry.")]
@@ -111,10 +116,18 @@ class StructureOptions:
         Option(help="What drives free runs; default measured of a flexible link as (15), simulated of others."),
     ] = None
     cross_stage: Annotated[bool, Option("--cross-stage", help="Add the other stage's angles and current.")] = False
+    inertial: Annotated[
+        bool, Option("--inertial", help="Add the other stage's accelerations, by the energies of the arm.")
+    ] = False
+    cross_sensitivity: Annotated[
+        bool, Option("--cross-sensitivity", help="Deflections follow hub angles through gauge and cable, too.")
+    ] = False
     friction: Annotated[bool, Option("--friction", help="Add a Coulomb term.")] = False
     laws: Annotated[
-        Literal["none", "orders"] | None,
-        Option(help="orders: search all equations under the order law; default none."),
+        Literal["none", "orders", "velocities"] | None,
+        Option(
+            help="orders: search all equations under the order law; velocities: with gamma = mu besides; default none."
+        ),
     ] = None
     form: Annotated[
         Literal["lagrange", "published"] | None,
@@ -125,6 +138,12 @@ class StructureOptions:
         Option(help="Order of the current in the published form, which it names; see the manual."),
     ] = None
     stock_filter: Annotated[bool, Option("--stock-filter", help="Deflections passed the stock 2 Hz low-pass.")] = False
+    filtered: Annotated[
+        Texts, Option("--filtered", metavar="SIGNAL", help="Signal of equations in words that passed a low-pass.")
+    ] = None
+    low_pass: Annotated[
+        Text, Option("--low-pass", metavar="HZ[:DAMPING]", help="That low-pass; default 2:0.9, the arm's stock one.")
+    ] = None
     orders: Annotated[Texts, Option("--order", metavar="NAME=VALUE", help="Fix an order.")] = None
     fixed: Annotated[Texts, Option(metavar="NAME=VALUE", help="Fix a coefficient.")] = None
     delay: Annotated[Texts, Option(metavar="INPUT=SECONDS", help="Delay of an input; LEAST:LARGEST is estimated.")] = (
@@ -140,8 +159,10 @@ class StructureOptions:
         """The structure that `text` names, with what the options say of it."""
         if text.startswith("flexible-link"):
             built = self._flexible_link(text)
+        elif re.fullmatch(r"arm(:\w*)?", text):
+            built = self._arm(text)
         else:
-            built = equation(text)
+            built = equation(text, sensor_filter=self._sensor())
             self._check_equation(len(built.equations))
             if len(built.equations) > 1:
                 built = replace(built, coupling=self.coupling or "simulated")
@@ -154,11 +175,8 @@ class StructureOptions:
 
     def _check_equation(self, count: int) -> None:
         """Refuse what only the flexible link has, for that many equations in words."""
-        given = {
-            "--coupling": self.coupling is not None and count == 1, "--cross-stage": self.cross_stage,
-            "--friction": self.friction, "--laws": self.laws is not None,
-            "--form": self.form is not None, "--input-order": self.input_order is not None,
-            "--stock-filter": self.stock_filter,
+        given = self._of_the_link() | {
+            "--coupling": self.coupling is not None and count == 1,
         }  # fmt: skip
         wrong = [option for option, is_given in given.items() if is_given]
         if wrong:
@@ -169,15 +187,66 @@ class StructureOptions:
                 "out, or use --structure flexible-link:1, :2 or :both"
             )
 
+    def _of_the_link(self) -> dict[str, bool]:
+        """Whether options are given that only the flexible link has."""
+        return {
+            "--cross-stage": self.cross_stage, "--inertial": self.inertial,
+            "--cross-sensitivity": self.cross_sensitivity, "--friction": self.friction,
+            "--laws": self.laws is not None, "--form": self.form is not None,
+            "--input-order": self.input_order is not None, "--stock-filter": self.stock_filter,
+        }  # fmt: skip
+
+    def _sensor(self) -> SensorFilter | None:
+        """The low-pass that signals of equations in words passed."""
+        if not self.filtered:
+            if self.low_pass is not None:
+                raise ModelError("--low-pass is of signals that --filtered names; name them, or leave it out")
+            return None
+        frequency, _, damping = (self.low_pass or "2:0.9").partition(":")
+        try:
+            return SensorFilter.low_pass(self.filtered, float(frequency), float(damping or 0.9))
+        except ValueError:
+            raise ModelError(f"--low-pass {self.low_pass!r} is not HZ or HZ:DAMPING, such as 2:0.9") from None
+
+    def _arm(self, text: str) -> Structure:
+        """Deflections of the arm that exists: whole orders but that of the link's elasticity, driven by all angles."""
+        given = self._of_the_link() | {"--coupling": self.coupling is not None}
+        given |= {"--filtered": bool(self.filtered), "--low-pass": self.low_pass is not None}
+        wrong = [option for option, is_given in given.items() if is_given]
+        if wrong:
+            raise ModelError(
+                f"{', '.join(wrong)}: --structure {text} has its own; leave {'it' if len(wrong) == 1 else 'them'} out, "
+                "or use --structure flexible-link:1, :2 or :both"
+            )
+        stages: dict[str, Literal[1, 2, "both"]] = {"1": 1, "2": 2, "both": "both", "": "both"}
+        stage = stages.get(text.partition(":")[2])
+        if stage is None:
+            raise ModelError(f"--structure {text!r} is not known; use arm:1, :2 or :both")
+        built = flexible_link(
+            stage=stage, hub=False, cross_stage="inertial", cross_sensitivity=True, sensor_filter="stock",
+            laws=("orders", "coefficients", "velocities"),
+        )  # fmt: skip
+        return built.with_orders({n: 1.0 for n in built.order_names if n.startswith("mu")})
+
     def _flexible_link(self, text: str) -> Structure:
         stages: dict[str, Literal[1, 2, "both"]] = {"1": 1, "2": 2, "both": "both"}
         stage = stages.get(text.partition(":")[2])
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use flexible-link:1, :2 or :both, or an equation")
+        if self.filtered or self.low_pass:
+            raise ModelError(
+                "--filtered and --low-pass are of equations in words; the flexible link has --stock-filter"
+            )
+        if self.cross_stage and self.inertial:
+            raise ModelError("--cross-stage adds torques, --inertial accelerations of the other stage; use one of them")
+        laws: dict[str, Sequence[Law]] = {
+            "none": (), "orders": ("orders", "coefficients"), "velocities": ("orders", "coefficients", "velocities"),
+        }  # fmt: skip
         return flexible_link(
             stage=stage, form=self.form, input_order=self.input_order, coupling=self.coupling,
-            cross_stage=self.cross_stage,
-            friction=self.friction, laws=("orders", "coefficients") if self.laws == "orders" else (),
+            cross_stage="inertial" if self.inertial else self.cross_stage, cross_sensitivity=self.cross_sensitivity,
+            friction=self.friction,
+            laws=laws[self.laws or "none"],
             sensor_filter="stock" if self.stock_filter else None,
         )  # fmt: skip
 

@@ -15,7 +15,8 @@ OPTIONS = {
     "units": "--unit", "columns": "--columns", "intersample": "--intersample", "inputs": "-u", "outputs": "-y",
     "coupling": "--coupling", "initial": "--initial", "laws": "--laws", "form": "--form",
     "input_order": "--input-order",
-    "friction": "--friction", "cross_stage": "--cross-stage", "tolerance": "--tolerance", "lags": "--lags",
+    "friction": "--friction", "cross_stage": "--cross-stage", "cross_sensitivity": "--cross-sensitivity",
+    "tolerance": "--tolerance", "lags": "--lags",
     "delay": "--delay", "force": "--force", "offset": "--offset", "reference": "--reference",
     "loss": "--loss", "intervals": "--intervals", "missing": "--missing",
 }  # fmt: skip

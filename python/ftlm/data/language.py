@@ -48,7 +48,7 @@ def equation(
         use. ``"auto"``: rest where the outputs start at zero, else Caputo's where orders are whole or where the run
         asks for no more, else a history.
     sensor_filter
-        Known filter that some outputs went through.
+        Known filter that some signals were measured through, inputs or outputs; see :class:`ftlm.SensorFilter`.
     offset
         ``"constant"``: an unknown constant on the right-hand side of each equation, as ``+ c`` says in words;
         ``"ramp"``: a constant and a constant times t; ``"none"``. One each run, estimated with the coefficients and

@@ -30,22 +30,38 @@ START_WORDS = ("auto", "rest", "caputo", "history")
 
 
 class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A known rational filter that some measured outputs went through.
+    """A known rational filter that some signals were measured through.
+
+    It belongs to signals, inputs and outputs alike, for it commutes with every equation. Where an equation is driven by
+    a filtered signal, all of its signals are taken behind the filter: a filtered one as it was measured, any other one
+    put through it, the output that the equation is compared with included. A free run in which all outputs follow from
+    unfiltered signals is the machine's own motion, and only its filtered outputs pass the filter before they are
+    compared. See :attr:`Structure.behind_filter`.
 
     Parameters
     ----------
-    outputs
-        Names of the outputs that are measured through it.
+    signals
+        Names of the signals that were measured through it, at least one.
     numerator, denominator
         (coefficient, order) pairs of sums of coefficient * D^order.
+
+    Raises
+    ------
+    ModelError
+        No signal, one named twice, a term that is none, or a numerator of higher order than the denominator.
     """
 
-    outputs: tuple[str, ...]
+    signals: tuple[str, ...]
     numerator: tuple[tuple[float, float], ...]
     denominator: tuple[tuple[float, float], ...]
 
     def __post_init__(self) -> None:
         """Refuse a filter that is none."""
+        if not self.signals:
+            raise ModelError("sensor filter: it names no signal; name those that were measured through it")
+        twice = next((s for i, s in enumerate(self.signals) if s in self.signals[:i]), None)
+        if twice is not None:
+            raise ModelError(f"sensor filter: it names {twice} twice; a signal passes it once")
         for part, terms in (("numerator", self.numerator), ("denominator", self.denominator)):
             for coefficient, order in terms:
                 if not (math.isfinite(coefficient) and 0 <= order <= MAX_ORDER):
@@ -63,11 +79,31 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 "denominator; a filter that can be built is proper"
             )
 
+    @property
+    def relative_degree(self) -> int:
+        """By how many whole orders the denominator exceeds the numerator: derivatives of an impulse that it answers."""
+        bottom, top = (
+            max((order for coefficient, order in part if coefficient), default=0.0)
+            for part in (self.denominator, self.numerator)
+        )
+        return int(bottom - top + 1e-9)
+
     @classmethod
-    def low_pass(cls, outputs: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
-        """Second-order low-pass of ``frequency`` [Hz]; the default is that of the arm's stock real-time model."""
+    def low_pass(cls, signals: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
+        """Second-order low-pass of ``frequency`` [Hz]; the default is that of the arm's stock real-time model.
+
+        Raises
+        ------
+        ModelError
+            No signals, or a frequency or damping that is not positive.
+        """
+        if isinstance(signals, str):
+            raise ModelError(f"sensor filter: signals = {signals!r} is one text; give a list of names, [{signals!r}]")
+        for name, value in (("frequency", frequency), ("damping", damping)):
+            if not 0 < real_number(f"{name} of the sensor filter", value) < math.inf:
+                raise ModelError(f"{name} of the sensor filter = {value} is not positive; give 2.0 [Hz] and 0.9, say")
         omega = 2 * math.pi * frequency
-        return cls(tuple(outputs), ((omega**2, 0.0),), ((1.0, 2.0), (2 * damping * omega, 1.0), (omega**2, 0.0)))
+        return cls(tuple(signals), ((omega**2, 0.0),), ((1.0, 2.0), (2 * damping * omega, 1.0), (omega**2, 0.0)))
 
 
 def check_initial(initial: str | Iterable[float]) -> Initial:
@@ -151,7 +187,7 @@ class Structure:
     initial
         Initial terms, see :func:`equation`.
     sensor_filter
-        Known filter that some outputs were measured through.
+        Known filter that some signals were measured through, inputs or outputs.
     coefficient_law
         Optional law that ties the coefficients: (name, sign, factors) with coefficient = sign * product of factors.
     reference
@@ -204,7 +240,7 @@ class Structure:
             if delay_name(name) in names or delay_name(name) in self.order_names:
                 raise ModelError(f"{delay_name(name)} is the delay of {name}; call the coefficient otherwise")
         if self.sensor_filter is not None:
-            check_known("filtered output", self.sensor_filter.outputs, self.signals)
+            check_known("filtered signal", self.sensor_filter.signals, self.signals)
         self._check_offset()
 
     def _check_offset(self) -> None:
@@ -231,6 +267,30 @@ class Structure:
     def signals(self) -> tuple[str, ...]:
         """Outputs first, then every other signal."""
         return tuple(dict.fromkeys([e.output for e in self.equations] + [s for e in self.equations for s in e.signals]))
+
+    @property
+    def behind_filter(self) -> bool:
+        """Whether equations and free runs are those of filtered signals, every unfiltered one put through the filter.
+
+        So it is where a filtered signal drives an equation: another output with measured coupling, or what is not
+        modelled. What such a structure compares and returns is filtered, in all of its equations.
+        """
+        followed = self.outputs if self.coupling == "simulated" else ()
+        return any(s not in followed and self.measured_through(s) for s in self.signals)
+
+    def filter_states(self, initial: Initial) -> int:
+        """How many free motions of the filter stand beside decided initial terms where signals pass it.
+
+        What was not measured through the filter is put through it from the start of the run on, so what the filter
+        still holds of the time before is unknown: its answers to an impulse and to derivatives of one. None from rest,
+        nor beside exponents that are given.
+        """
+        moves = initial == "caputo" or isinstance(initial, History)
+        return self.sensor_filter.relative_degree if moves and self.sensor_filter is not None else 0
+
+    def measured_through(self, signal: str) -> bool:
+        """Whether a signal was measured through the sensor filter."""
+        return self.sensor_filter is not None and signal in self.sensor_filter.signals
 
     @property
     def order_names(self) -> tuple[str, ...]:
@@ -404,8 +464,8 @@ def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:
 
 
 def narrowed(sensor: SensorFilter | None, signals: Sequence[str]) -> SensorFilter | None:
-    """Return the filter of those outputs that are left, or None."""
+    """Return the filter of those signals that are left, or None."""
     if sensor is None:
         return None
-    outputs = tuple(o for o in sensor.outputs if o in signals)
-    return SensorFilter(outputs, sensor.numerator, sensor.denominator) if outputs else None
+    left = tuple(s for s in sensor.signals if s in signals)
+    return SensorFilter(left, sensor.numerator, sensor.denominator) if left else None

@@ -14,7 +14,7 @@ from ftlm.data.equations import Equation
 from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Initial, Structure
-from ftlm.solve.records import InitialTuple, Record, initial_tuple, named_coefficients, prepare, structure_tuple
+from ftlm.solve.records import InitialTuple, Record, named_coefficients, prepare, structure_tuple
 
 #: Most steps of refined instrumental variables, and the relative change of a coefficient that ends them.
 REFINEMENTS = 40
@@ -65,7 +65,7 @@ def _linear(
     """One equation and its records as the estimators that are linear in the coefficients take them."""
     first = records[0]
     fixed, structure = [t.fixed for t in item.terms], structure_tuple(item, first.signals)
-    return [r.core() for r in records], structure, list(first.inputs), fixed, initial_tuple(first.initial, first.offset)
+    return [r.core() for r in records], structure, list(first.inputs), fixed, first.start
 
 
 def _multi_innovation(item: Equation, records: list[Record], settings: Settings, prior: float) -> list[float]:
@@ -80,7 +80,7 @@ def _instrumental(fit: CoefficientFit, structure: Structure, records: list[Recor
 
     Equations that drive each other are simulated together, so that every instrument follows from the inputs alone.
     """
-    initial, inputs = initial_tuple(records[0].initial, records[0].offset), list(records[0].inputs)
+    initial, inputs = records[0].start, list(records[0].inputs)
     groups = [structure.equations] if structure.coupling == "simulated" else [(e,) for e in structure.equations]
     for group in groups:
         outputs = ", ".join(e.output for e in group)

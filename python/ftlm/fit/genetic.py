@@ -18,7 +18,7 @@ from ftlm.data.equations import Equation
 from ftlm.data.lattice import Lattice
 from ftlm.data.orders import Order
 from ftlm.data.structures import Structure
-from ftlm.solve.records import Record, initial_tuple, lattice_tuple
+from ftlm.solve.records import Record, lattice_tuple
 
 #: Orders are coded in steps of this, the digits that the paper prints and fewer; regressors are then shared.
 RESOLUTION = 0.001
@@ -242,7 +242,7 @@ def genetic_search(
             f"the genetic baseline knows no offset, and offset = {records[0].offset!r}; "
             "use method='output-error', or offset='none'"
         )
-    if initial_tuple(records[0].initial) != (False, []):
+    if records[0].start != (False, []):
         raise ModelError(
             "the genetic baseline knows no initial terms and needs runs that start at rest; "
             "slice the runs, or give the structure initial='rest'"

@@ -43,22 +43,17 @@ def experiment(
     if rows != run.length:
         run = run.slice(None, rows * run.step - run.step / 2)
     intervals = (rows - 1) // decimation
-    coupled = structure.coupling == "simulated"
-    rec = record(run, structure, intervals * every, filtered=not coupled)
+    rec = record(run, structure, intervals * every, filtered=structure.behind_filter)
     if has_own_times(run, problem.structure):
         return _at_own_times(run, structure, rec, weights, decimation, shares)
     samples = []
     for output in structure.outputs:
-        measured_through = structure.sensor_filter is not None and output in structure.sensor_filter.outputs
-        if rec.sensor is None or measured_through:
+        if rec.sensor is None or structure.measured_through(output):
             samples.append(run[output][::decimation])
         else:
             # The equation is compared in filtered signals, so this output passes the filter too.
             samples.append(_core.point_samples(rec.of(output))[::every])
-    filtered = None
-    if coupled and structure.sensor_filter is not None:
-        applies = [o in structure.sensor_filter.outputs for o in structure.outputs]
-        filtered = (sensor_series(structure, rec.m, rec.step), applies)
+    filtered = _output_filter(structure, rec)
     instants = [_instant(run, structure, rec, name, every, decimation) for name in structure.signals]
     measured, counted = _counted(np.stack(samples), slice(1, -1), shares)
     return rec.core(), every, measured, filtered, list(weights), instants, counted, None
@@ -74,15 +69,19 @@ def _at_own_times(
     measured, counted = _counted(
         np.stack([compared_values(run, structure, o)[kept] for o in structure.outputs]), slice(None), shares
     )
-    filtered = None
-    if structure.sensor_filter is not None:
-        applies = [o in structure.sensor_filter.outputs for o in structure.outputs]
-        filtered = (sensor_series(structure, rec.m, rec.step), applies)
+    filtered = _output_filter(structure, rec)
     signals = [at.values(name) for name in structure.signals]
     # What was not read everywhere drives nothing.
     instants = [(None if v is None or np.isnan(v).any() else v, False) for v in signals]
     own = (at.places, [at.jumps(name) for name in structure.signals])
     return rec.core(), 1, measured, filtered, list(weights), instants, counted, own
+
+
+def _output_filter(structure: Structure, rec: Record) -> tuple[Floats | None, list[bool]] | None:
+    """The filter that simulated outputs pass before they are compared; None where all signals are behind it already."""
+    if structure.sensor_filter is None or rec.sensor is not None:
+        return None
+    return sensor_series(structure, rec.m, rec.step), [structure.measured_through(o) for o in structure.outputs]
 
 
 def _counted(samples: Floats, compared: slice, shares: Floats | None) -> tuple[Floats, Floats | None]:
@@ -103,8 +102,7 @@ def _instant(
     None where it has no jump or corner of its own at the samples: behind a sensor filter, or made of other signals; nor
     where it was not read throughout, for then it drives nothing.
     """
-    measured_through = structure.sensor_filter is not None and name in structure.sensor_filter.outputs
-    if name not in run or name in run.missing or (rec.sensor is not None and not measured_through):
+    if name not in run or name in run.missing or (rec.sensor is not None and not structure.measured_through(name)):
         return None, False
     held = name in run.inputs and run.intersample[name] == "zoh"
     values, delay = run[name], structure.delay.get(name, 0.0)
@@ -149,6 +147,7 @@ def descend(
 ) -> Attempt:  # fmt: skip
     """Levenberg-Marquardt from an attempt; one of the numbers, by its place, may be held where it is."""
     structure, signals = problem.structure, problem.structure.signals
+    states = structure.filter_states(structure.initial) if structure.behind_filter else 0
     coordinates = problem.coordinates(attempt.coefficients, plain=plain)
     bounds, ends = list(problem.bounds), [structure.free_delays[n] for n in problem.delays]
     if held is not None:
@@ -162,7 +161,7 @@ def descend(
             ends[late] = (attempt.delays[late],) * 2
     outcome = _core.output_error(
         experiments, problem.laws(signals), bounds, coordinates, structure.coupling == "simulated",
-        initial_tuple(structure.initial, structure.offset), attempt.orders, attempt.coefficients,
+        initial_tuple(structure.initial, structure.offset, states), attempt.orders, attempt.coefficients,
         [
             (signals.index(n), own, delay)
             for n, own, delay in zip(problem.delays, ends, attempt.delays, strict=True)

@@ -16,7 +16,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.errors import FtlmError
 from ftlm.data.equations import Equation
-from ftlm.solve.records import Record, equation_tuple, initial_tuple, named_coefficients, structure_tuple
+from ftlm.solve.records import Record, equation_tuple, named_coefficients, structure_tuple
 
 #: Frequencies of the scan in units of the frequency below which 90 % of the output's power lies.
 FREQUENCIES = tuple(np.geomspace(0.15, 8.0, 14).tolist())
@@ -91,7 +91,7 @@ def _projected(
         sensor = response if rec.sensor is None else _core.series_multiply(response, rec.sensor, rec.m)
         filtered.append(replace(rec, means=means, sensor=sensor))
     # Caputo's powers of the whole equation: the rest alone would not know those of the own terms.
-    initial = initial_tuple(records[0].initial, records[0].offset)
+    initial = records[0].start
     signals = records[0].signals
     cores = [r.core() for r in filtered]
     raw = _core.least_squares(cores, structure_tuple(rest, signals), inputs, [t.fixed for t in rest.terms], initial)[0]

@@ -23,7 +23,6 @@ from ftlm.fit.resonance_scan import scan_equation
 from ftlm.solve.records import (
     Record,
     affine,
-    initial_tuple,
     lattice_tuple,
     named_coefficients,
     named_signals,
@@ -312,7 +311,7 @@ def stage_rows(
     joined = _core.search_stage(
         [r.core() for r in records], [axes[n] for n in names], laws, list(records[0].inputs),
         [[t.fixed for t in e.terms] for e in structure.equations], scales,
-        initial_tuple(records[0].initial, records[0].offset), settings.core(), None,
+        records[0].start, settings.core(), None,
     )  # fmt: skip
     rows = []
     for _, _, free, parts in joined["rows"]:
@@ -331,7 +330,7 @@ def equation_rows(
     try:
         table = _core.search(
             [r.core() for r in records], lattice_tuple(item, signals, axes), list(records[0].inputs),
-            [t.fixed for t in item.terms], initial_tuple(records[0].initial, records[0].offset), settings.core(), None,
+            [t.fixed for t in item.terms], records[0].start, settings.core(), None,
         )  # fmt: skip
     except ModelError as error:
         raise named_signals(error, signals) from None

@@ -287,7 +287,7 @@ def settings_table(result: Judged, *, title: str = "What the result depends on")
     ]
     rows += [[f"delay of {symbol(name)}", f"{delay:g} s"] for name, delay in structure.delay.items()]
     if structure.sensor_filter is not None:
-        filtered = ", ".join(symbol(o) for o in structure.sensor_filter.outputs)
+        filtered = ", ".join(symbol(o) for o in structure.sensor_filter.signals)
         rows.append(["known sensor filter on", filtered])
     rows += [
         [Markup("run <q>{}</q>").format(name), f"{number(step * comparison.m)} s, pulses of {number(step * 1e3)} ms"]

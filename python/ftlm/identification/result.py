@@ -20,7 +20,7 @@ from ftlm.identification.page import identification_html, identification_page
 from ftlm.identification.physical import PhysicalParameter, physical_parameters
 from ftlm.identification.settings import settings_in_words
 from ftlm.identification.warnings import validate
-from ftlm.judge.comparison import Comparison
+from ftlm.judge.comparison import Comparison, filter_state
 from ftlm.judge.metrics import finite
 from ftlm.judge.residuals import Residuals, resid
 from ftlm.paint.text import unbounded
@@ -249,6 +249,8 @@ def _initial_in_words(comparison: Comparison) -> list[str]:
     for (run, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True):
         for output, terms in initial.items():
             if terms:
-                listed = ", ".join(f"{v:.4g} t^{e:g}" for e, v in terms.items())
+                listed = ", ".join(
+                    f"{v:.4g} t^{e:g}" if e > -1 else f"{filter_state(e)} {v:.4g}" for e, v in terms.items()
+                )
                 lines.append(f"initial terms of {output} in {run} (of that run alone): {listed}")
     return lines

@@ -129,8 +129,8 @@ def irregular(runs: Sequence[Run], joint: JointFit, problem: FreeProblem) -> lis
     kept = [run.name for run in runs if run.readings is not None and not has_own_times(run, problem.structure)]
     if kept:
         warnings.append(
-            f"{', '.join(kept)}: outputs were read at times of their own, but a free delay, or a sensor filter with "
-            "coupling='measured', needs them on a grid: straight lines were drawn between them, and the intervals do "
+            f"{', '.join(kept)}: outputs were read at times of their own, but a free delay, or signals taken "
+            "behind a sensor filter, need them on a grid: straight lines were drawn between them, and the intervals do "
             "not know what that costs"
         )
     return warnings

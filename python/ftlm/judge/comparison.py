@@ -23,7 +23,7 @@ from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol_html
 from ftlm.solve.free_run import compared, respond
 from ftlm.solve.instants import compared_times
-from ftlm.solve.records import Record, check_m, default_m, equation_tuple, initial_tuple, records, whole
+from ftlm.solve.records import Record, check_m, default_m, equation_tuple, records, whole
 from ftlm.solve.sampled import Sampled, initial_exponents, measured_samples, refined
 
 #: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
@@ -241,7 +241,7 @@ def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> d
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
         alone = initial_exponents(item, "caputo", model.structure.offset)
-        if isinstance(model.structure.initial, str) and not set(initial[item.output]) <= set(alone):
+        if isinstance(model.structure.initial, str) and not {e for e in initial[item.output] if e > -1} <= set(alone):
             out[item.output] = {}
             continue
         exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
@@ -288,7 +288,7 @@ def _beside(
 
     The equation of an output with gaps has no error: it would be that of the straight lines over them.
     """
-    core, inputs, powers = full.core(), list(full.inputs), initial_tuple(full.initial, full.offset)
+    core, inputs, powers = full.core(), list(full.inputs), full.start
     missed = {
         e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers)
         for e in model.equations
@@ -427,10 +427,15 @@ def errors_table(
     return Table(title, ("output", *_FIGURES, *_FIGURES), rows, groups=groups, headings=headings, note=note)
 
 
+def filter_state(exponent: float) -> str:
+    """What the exponent of an impulse, -1, or of a derivative of one stands for."""
+    return f"filter's state {round(-exponent)}"
+
+
 def initial_terms_table(comparison: Comparison, *, title: str = "Initial terms of the free runs") -> Table | None:
     """Return initial terms by run and output, or None where every run starts at rest."""
     rows: list[list[Cell]] = [
-        [name, symbol_html(output), Exact(exponent), value]
+        [name, symbol_html(output), Exact(exponent) if exponent > -1 else filter_state(exponent), value]
         for (name, _, _), initial in zip(comparison.per_run, comparison.initial, strict=True)
         for output, terms in initial.items()
         for exponent, value in terms.items()

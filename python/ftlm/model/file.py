@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Collection
 from pathlib import Path
 from typing import Literal
 
@@ -20,8 +21,8 @@ from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
 #: Largest model file read: a model is a few kilobytes.
 MAX_MODEL_BYTES = 1 << 20
 #: Schema of a model that every version since the first reads, of one that has an offset, and of one that has intervals
-#: by profile likelihood.
-SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA = 2, 3, 4
+#: by profile likelihood or whose sensor filter names what is no output.
+SCHEMA, OFFSET_SCHEMA, NEWEST_SCHEMA = 2, 3, 4
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -53,6 +54,39 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
         return Equation(self.output, Order(self.order), terms)
 
 
+class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A sensor filter: of outputs alone, as every version reads it, or of any signals."""
+
+    numerator: tuple[tuple[float, float], ...]
+    denominator: tuple[tuple[float, float], ...]
+    outputs: tuple[str, ...] | UnsetType = UNSET
+    signals: tuple[str, ...] | UnsetType = UNSET
+
+    @classmethod
+    def of(cls, structure: Structure) -> FilterFile | None:
+        """Write the sensor filter of a structure, if it has one."""
+        sensor = structure.sensor_filter
+        if sensor is None:
+            return None
+        if set(sensor.signals) <= set(structure.outputs):
+            return cls(sensor.numerator, sensor.denominator, outputs=sensor.signals)
+        return cls(sensor.numerator, sensor.denominator, signals=sensor.signals)
+
+    def sensor(self, *, followed: Collection[str]) -> SensorFilter | None:
+        """Give the filter back; ``followed`` are the outputs of equations that act together, else empty.
+
+        A filter of outputs filtered those that follow together, and where none do whatever it named; an input that it
+        named beside the former did not count.
+        """
+        if isinstance(self.signals, UnsetType) == isinstance(self.outputs, UnsetType):
+            raise ModelError("its sensor filter has neither signals nor outputs, or both; one of them names them")
+        if not isinstance(self.signals, UnsetType):
+            return SensorFilter(self.signals, self.numerator, self.denominator)
+        named = () if isinstance(self.outputs, UnsetType) else self.outputs
+        kept = tuple(n for n in named if n in followed or not followed)
+        return SensorFilter(kept, self.numerator, self.denominator) if kept else None
+
+
 class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     """A model, without what is of use only before identification."""
 
@@ -63,7 +97,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     coupling: Literal["measured", "simulated"]
     delay: dict[str, float]
     initial: str | list[float]
-    sensor_filter: SensorFilter | None
+    sensor_filter: FilterFile | None
     units: dict[str, str]
     orders: dict[str, float]
     m: int | None
@@ -77,10 +111,11 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         s = model.structure
         # Written only where there is one, so that what has none is as it was.
         offset: Offset | UnsetType = UNSET if s.offset == "none" else s.offset
+        sensor = FilterFile.of(s)
         return cls(
-            "ftlm-model", schema_of(offset, model.estimate), s.name,
+            "ftlm-model", schema_of(offset, sensor, model.estimate), s.name,
             [EquationFile.of(e) for e in s.equations], s.coupling, dict(s.delay),
-            s.initial if isinstance(s.initial, str) else list(s.initial), s.sensor_filter, dict(model.units),
+            s.initial if isinstance(s.initial, str) else list(s.initial), sensor, dict(model.units),
             dict(model.orders), model.m, dict(model.about), model.estimate, offset,
         )  # fmt: skip
 
@@ -92,9 +127,11 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         ModelError
             Equations that are none, or a covariance of another size than they need.
         """
+        followed = [e.output for e in self.equations] if self.coupling == "simulated" else []
+        sensor = None if self.sensor_filter is None else self.sensor_filter.sensor(followed=followed)
         structure = Structure(
             equations=tuple(e.equation() for e in self.equations), coupling=self.coupling, delay=self.delay,
-            initial=check_initial(self.initial), sensor_filter=self.sensor_filter, name=self.name,
+            initial=check_initial(self.initial), sensor_filter=sensor, name=self.name,
             offset="none" if self.offset is UNSET else self.offset,
         )  # fmt: skip
         if self.estimate is not None and self.estimate.covariance is not None:
@@ -105,11 +142,12 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         return Solved(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 
-def schema_of(offset: Offset | UnsetType, estimate: Estimate | None) -> int:
+def schema_of(offset: Offset | UnsetType, sensor: FilterFile | None, estimate: Estimate | None) -> int:
     """Schema of a model: the least that has all of it, so that what has less is as it was."""
-    if estimate is not None and estimate.intervals is not UNSET:
-        return PROFILE_SCHEMA
-    return SCHEMA if offset is UNSET else OFFSET_SCHEMA
+    profiled = estimate is not None and estimate.intervals is not UNSET
+    if profiled or (sensor is not None and not isinstance(sensor.signals, UnsetType)):
+        return NEWEST_SCHEMA
+    return SCHEMA if isinstance(offset, UnsetType) else OFFSET_SCHEMA
 
 
 def write_model(model: Solved, path: str | os.PathLike[str], *, force: bool) -> Path:
@@ -136,7 +174,7 @@ def read_model(path: str | os.PathLike[str]) -> Solved:
         raise
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
-    latest = schema_of(read.offset, read.estimate)
+    latest = schema_of(read.offset, read.sensor_filter, read.estimate)
     if read.schema > latest or read.schema < 1:
         raise DataError(f"{file} has schema {read.schema}, this version reads up to {latest}; upgrade ftlm")
     try:

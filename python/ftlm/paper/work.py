@@ -129,7 +129,7 @@ class StageWork:
 
     def manual(self, label: str) -> Candidate:
         """The maker's integer-order model."""
-        return self.candidate(label, link_model(stage=self.number))
+        return self.candidate(label, link_model(stage=self.number, form="published"))
 
     def stepped(self, label: str, exact: Candidate) -> Candidate:
         """The same model stepped by explicit Euler, as the paper ran it."""

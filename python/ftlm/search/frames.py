@@ -37,6 +37,10 @@ Span = tuple[int, int, int, float]
 Outcomes = tuple[bytes, bytes]
 
 
+#: Most free motions of a sensor filter that a record may hold.
+MAX_STATES = 10
+
+
 class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A record: pulse means as little-endian doubles, row by row; an offset is written where there is one."""
 
@@ -48,6 +52,7 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
     sensor: bytes | None
     initial: str | tuple[float, ...]
     offset: Offset = "none"
+    states: int = 0
 
     @classmethod
     def of(cls, record: Record) -> RecordFile:
@@ -56,7 +61,15 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
         rows, m = record.means.shape
         means = np.ascontiguousarray(record.means, "<f8").tobytes()
         return cls(
-            record.signals, float(record.step), (rows, m), means, record.inputs, sensor, record.initial, record.offset
+            record.signals,
+            float(record.step),
+            (rows, m),
+            means,
+            record.inputs,
+            sensor,
+            record.initial,
+            record.offset,
+            record.states,
         )
 
     def record(self) -> Record:
@@ -65,9 +78,13 @@ class RecordFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_d
         sizes = (len(self.signals), len(self.inputs), len(self.means))
         if rows < 1 or m < 1 or sizes != (rows, rows, 8 * rows * m) or len(self.sensor or b"") % 8:
             raise ModelError("the sizes of a record do not fit one another")
+        if not 0 <= self.states <= (0 if self.sensor is None else MAX_STATES):
+            raise ModelError(f"a record with {self.states} states of its sensor filter")
         means = np.frombuffer(self.means, "<f8").astype(np.float64).reshape(rows, m)
         sensor = None if self.sensor is None else np.frombuffer(self.sensor, "<f8").astype(np.float64)
-        return Record(self.signals, self.step, means, self.inputs, sensor, check_initial(self.initial), self.offset)
+        return Record(
+            self.signals, self.step, means, self.inputs, sensor, check_initial(self.initial), self.offset, self.states
+        )
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -23,7 +23,7 @@ from ftlm.search.result import SearchResult, SearchRow
 from ftlm.search.rounds import search_equation, search_stage
 from ftlm.search.store import Store
 from ftlm.search.work import CoreRecord, EquationWork, StageWork, Told
-from ftlm.solve.records import InitialTuple, Record, initial_tuple, named_coefficients, named_signals
+from ftlm.solve.records import InitialTuple, Record, named_coefficients, named_signals
 
 #: Settings that tell one search from another; threads make no difference to it.
 KEPT = tuple(f.name for f in fields(Settings) if f.name != "threads")
@@ -79,7 +79,7 @@ class Job:
     def _recorded(self) -> tuple[tuple[CoreRecord, ...], list[bool], InitialTuple, Settings]:
         record = self.records[0]
         runs = tuple(r.core() for r in self.records)
-        return runs, list(record.inputs), initial_tuple(record.initial, record.offset), self.settings
+        return runs, list(record.inputs), record.start, self.settings
 
     def equation_work(self) -> EquationWork:
         """What the rounds of one equation are computed from."""

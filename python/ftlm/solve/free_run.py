@@ -14,17 +14,17 @@ from ftlm.base.errors import ConvergenceError, DataError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved, check_solved
 from ftlm.data.structures import check_initial
-from ftlm.solve.records import MAX_M, Record, equation_tuple, initial_tuple, records, sensor_series
+from ftlm.solve.records import MAX_M, Record, equation_tuple, records, sensor_series
 from ftlm.solve.sampled import refined
 
 
 def compared(runs: Sequence[Run], model: Solved, m: int) -> list[Record]:
     """Records that free runs are compared with: their outputs are the measured ones, filtered as those of a free run.
 
-    With simulated coupling all outputs follow together from the inputs, then pass the sensor filter; with measured
-    coupling each equation is driven by the other measured signals, in which the filter is already.
+    Free runs follow from their inputs, then pass the sensor filter where outputs were measured through it; where a
+    filtered signal drives one, all signals are taken behind the filter.
     """
-    return records(runs, model.structure, m, filtered=model.structure.coupling != "simulated")
+    return records(runs, model.structure, m, filtered=model.structure.behind_filter)
 
 
 def respond(model: Solved, rec: Record) -> tuple[dict[str, Floats], dict[str, dict[float, float]]]:
@@ -34,9 +34,10 @@ def respond(model: Solved, rec: Record) -> tuple[dict[str, Floats], dict[str, di
     """
     structure = model.structure
     coupled = structure.coupling == "simulated"
-    terms = initial_tuple(rec.initial, rec.offset)
+    terms = rec.start
     inputs = list(rec.inputs)
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
+    series = sensor_series(structure, rec.m, rec.step) if rec.sensor is None else None
     responses: dict[str, Floats] = {}
     initial: dict[str, dict[float, float]] = {}
 
@@ -46,15 +47,14 @@ def respond(model: Solved, rec: Record) -> tuple[dict[str, Floats], dict[str, di
             responses[name] = outputs[i]
             initial[name] = dict(zip(exponents[i], values[i], strict=True))
 
+    def behind(names: tuple[str, ...]) -> tuple[Floats, list[bool]] | None:
+        return None if series is None else (series, [structure.measured_through(n) for n in names])
+
     if coupled:
-        sensor = None
-        series = sensor_series(structure, rec.m, rec.step)
-        if series is not None and structure.sensor_filter is not None:
-            sensor = (series, [o in structure.sensor_filter.outputs for o in model.outputs])
-        keep(model.outputs, _core.respond_with_initial(rec.core(), equations, inputs, terms, sensor))
+        keep(model.outputs, _core.respond_with_initial(rec.core(), equations, inputs, terms, behind(model.outputs)))
     else:
         for name, item in zip(model.outputs, equations, strict=True):
-            keep((name,), _core.respond_with_initial(rec.core(), [item], inputs, terms, None))
+            keep((name,), _core.respond_with_initial(rec.core(), [item], inputs, terms, behind((name,))))
     return responses, initial
 
 
@@ -83,6 +83,7 @@ def simulate(
         Relative change at which refinement ends.
     initial
         Coefficients of initial terms, by output and exponent; default at rest. Those of another record mean nothing.
+        Behind a sensor filter -1 and -2 are an impulse and its derivative, which stand for the filter's own state.
         An offset c of the equation is the exponent alpha with the coefficient c / Gamma(alpha + 1); default none.
     largest_m
         Most pulses; beyond it the change that is left is an error.
@@ -90,7 +91,8 @@ def simulate(
     Returns
     -------
     Run
-        The inputs as they are and the simulated outputs, with the run's step and length.
+        The inputs as they are and the simulated outputs, with the run's step and length. Outputs that are measured
+        through the sensor filter are filtered; all of them are where a filtered signal drives the run.
 
     Raises
     ------
@@ -104,10 +106,12 @@ def simulate(
     check_solved(model)
     if not isinstance(run, Run):
         raise DataError(f"run is {type(run).__name__}, not a Run; use ftlm.load or Run.from_arrays")
+    sensor = model.structure.sensor_filter
+    impulses = {-1.0 - k for k in range(sensor.relative_degree if sensor is not None else 0)}
     for name, terms in (initial or {}).items():
         if name not in model.outputs:
             raise ModelError(f"initial terms of {name!r}, which is no output of the model: {', '.join(model.outputs)}")
-        check_initial(terms)
+        check_initial([e for e in terms if not (model.structure.behind_filter and e in impulses)])
     if not real_number("tolerance", tolerance) > 0:
         raise ModelError(f"tolerance = {tolerance} is not positive; the default is 1e-6")
     own = run.length - 1

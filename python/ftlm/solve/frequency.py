@@ -174,7 +174,8 @@ def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulate
         ``"simulated"``: the equations together, from the signals that are not modelled. ``"measured"``: each equation
         alone, the other outputs among its inputs (in the order of ``model.structure.signals``).
     sensor
-        Whether outputs that are measured through the sensor filter pass it.
+        Whether signals are those that are measured: an output passes the sensor filter that it is measured through,
+        and the response to an input that passed it is that much larger.
 
     Returns
     -------
@@ -228,7 +229,11 @@ def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulate
     if sensor and filtered is not None:
         gain = value_at({o: c for c, o in filtered.numerator}, s) / value_at({o: c for c, o in filtered.denominator}, s)
         for i, name in enumerate(model.outputs):
-            out[i] *= gain if name in filtered.outputs else 1.0
+            out[i] *= gain if name in filtered.signals else 1.0
+        for k, name in enumerate(inputs):
+            if name in filtered.signals:
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    out[:, k] /= gain
     return out
 
 

@@ -17,8 +17,7 @@ from ftlm.solve.records import Record
 
 def has_own_times(run: Run, structure: Structure) -> bool:
     """Whether a run's outputs are compared when they were read: not under a free delay, nor behind a filter of all."""
-    filtered = structure.sensor_filter is not None and structure.coupling != "simulated"
-    return run.readings is not None and not structure.free_delays and not filtered
+    return run.readings is not None and not structure.free_delays and not structure.behind_filter
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,7 +31,7 @@ MAX_M = 1 << 24
 SMALLEST = 1e-140
 COULOMB = "coulomb_"
 #: Initial terms as the core takes them.
-InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int]
+InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int] | tuple[bool, list[float], int, int]
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,8 @@ class Record:
         Initial terms, decided.
     offset
         Unknown constant of each equation on this run.
+    states
+        Free motions of the sensor filter beside the initial terms.
     """
 
     signals: tuple[str, ...]
@@ -63,6 +65,12 @@ class Record:
     sensor: Floats | None
     initial: Initial
     offset: Offset = "none"
+    states: int = 0
+
+    @property
+    def start(self) -> InitialTuple:
+        """Initial terms as the core takes them."""
+        return initial_tuple(self.initial, self.offset, self.states)
 
     @property
     def m(self) -> int:
@@ -109,9 +117,9 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
 
     Outputs are point samples taken as linear in between; inputs hold or are linear as the run says; m may exceed the
     run's own grid only where nothing is measured against it. ``filtered`` puts signals that were not measured through
-    the sensor filter through it (equation error); a coupled free run leaves them. Refuses signals that the run lacks,
-    those so small that their squares vanish, delays of what is no input, and samples that are missing where an equation
-    needs them; over others stand straight lines, to which nothing may be fitted.
+    the sensor filter through it (equation error); a free run that no filtered signal drives leaves them. Refuses
+    signals that the run lacks, those so small that their squares vanish, delays of what is no input, and samples that
+    are missing where an equation needs them; over others stand straight lines, to which nothing may be fitted.
     """
     _check_known(run, structure)
     check_held(run, structure)
@@ -122,7 +130,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     rows = []
     for name in structure.signals:
         means = _means(run, structure, name, m, at_rest=initial == "rest")
-        if sensor is not None and structure.sensor_filter is not None and name not in structure.sensor_filter.outputs:
+        if sensor is not None and not structure.measured_through(name):
             means = _core.series_multiply(sensor, means, m)
         peak = float(np.max(np.abs(means), initial=0.0))
         if 0 < peak < SMALLEST:
@@ -139,6 +147,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         sensor,
         initial,
         structure.offset,
+        structure.filter_states(initial) if sensor is not None else 0,
     )
 
 
@@ -209,10 +218,10 @@ def _check_known(run: Run, structure: Structure) -> None:
             f"{int(np.flatnonzero(gone)[0])}, and drives the equation of {drivers[lacking]} as measured; fill these "
             "rows yourself, avoid them with slice=, or use coupling='simulated'"
         )
-    if structure.sensor_filter is not None and not coupled and any(name in missing for name in outputs):
+    if structure.behind_filter and any(name in missing for name in outputs):
         raise DataError(
-            f"run {run.name!r} has missing samples, and a sensor filter with coupling='measured' must see all of them; "
-            "use coupling='simulated', or a part without gaps"
+            f"run {run.name!r} has missing samples, and a sensor filter with coupling='measured', or on what "
+            "drives the run, must see all of them; use coupling='simulated', or a part without gaps"
         )
 
 
@@ -294,10 +303,12 @@ def equation_tuple(
     return structure_tuple(item, signals), [float(t.fixed or 0.0) for t in item.terms]
 
 
-def initial_tuple(initial: Initial, offset: Offset = "none") -> InitialTuple:
-    """Return decided initial terms: whether Caputo's, else their exponents; the number of offset terms if any."""
+def initial_tuple(initial: Initial, offset: Offset = "none", states: int = 0) -> InitialTuple:
+    """Return decided initial terms: whether Caputo's, else their exponents; numbers of offset terms, filter states."""
     powers = [] if isinstance(initial, str) else list(initial)
     decided = (initial == "caputo", powers)
+    if states:
+        return (*decided, ("none", "constant", "ramp").index(offset), states)
     return decided if offset == "none" else (*decided, 1 if offset == "constant" else 2)
 
 

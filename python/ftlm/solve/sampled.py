@@ -62,10 +62,13 @@ class Sampled:
     change: Floats
 
 
-def initial_exponents(item: Equation, initial: Initial, offset: Offset) -> list[float]:
-    """Exponents of the initial terms and the offset of an equation whose orders are numbers, distinct and ascending."""
+def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: int = 0) -> list[float]:
+    """Exponents of the initial terms and the offset of an equation whose orders are numbers, distinct and ascending.
+
+    Those of the states of a sensor filter are -1, -2 and on.
+    """
     alpha = item.order.constant
-    found = {round(e, 9) for e in offset_exponents(alpha, offset).values()}
+    found = {round(e, 9) for e in offset_exponents(alpha, offset).values()} | {-1.0 - k for k in range(states)}
     if initial != "caputo":
         return sorted(found | ({round(e, 9) for e in initial} if not isinstance(initial, str) else set()))
     left: set[float] = set()
@@ -169,14 +172,17 @@ def sampled(
 
     At the instants of the grid, or at times of their own [s].
     """
-    coupled = model.structure.coupling == "simulated"
-    rec = record(run, model.structure, (run.length - 1) * every, filtered=not coupled)
+    rec = record(run, model.structure, (run.length - 1) * every, filtered=model.structure.behind_filter)
     still = replace(rec, means=np.zeros_like(rec.means))
     at = None if times is None else Instants.of(run, rec, model.structure, times)
     if initial is not None:
         kept = {o: dict(initial.get(o, {})) for o in model.outputs}
         return _read(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
-    names = [(e.output, power) for e in model.equations for power in initial_exponents(e, rec.initial, rec.offset)]
+    names = [
+        (e.output, power)
+        for e in model.equations
+        for power in initial_exponents(e, rec.initial, rec.offset, rec.states)
+    ]
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
     driven = _read(model, run, rec, every, _responses(model, rec, none), none, at)
     if not names or not np.all(np.isfinite(driven)):
@@ -193,12 +199,11 @@ def measured_samples(model: Solved, run: Run, every: int, rec: Record | None = N
 
     NaN where an output was not read.
     """
-    sensor = model.structure.sensor_filter
-    filtered = sensor is not None and model.structure.coupling != "simulated"
-    if not filtered or sensor is None or set(model.outputs) <= set(sensor.outputs):
+    through = model.structure.measured_through
+    if not model.structure.behind_filter or all(map(through, model.outputs)):
         return np.stack([compared_values(run, model.structure, name) for name in model.outputs])
     rec = rec or record(run, model.structure, (run.length - 1) * every)
-    return np.stack([run[n] if n in sensor.outputs else _core.point_samples(rec.of(n))[::every] for n in model.outputs])
+    return np.stack([run[n] if through(n) else _core.point_samples(rec.of(n))[::every] for n in model.outputs])
 
 
 def _fitted(
@@ -253,8 +258,10 @@ def _read(
     for i, item in enumerate(model.equations):
         start[i] = terms[item.output].get(0.0, 0.0)
         if rec.sensor is not None and structure.sensor_filter is not None:
-            # The whole equation passes the filter, and so does what its output starts from.
-            start[i] *= high_frequency_gain(structure.sensor_filter)
+            # The whole equation passes the filter, and so does what its output starts from: of all powers of t, and of
+            # impulses as powers below, the one that the filter makes a jump of.
+            degree = structure.sensor_filter.relative_degree
+            start[i] = terms[item.output].get(-float(degree), 0.0) * leading_gain(structure.sensor_filter)
         for term in item.terms:
             if abs(term.order.constant - item.order.constant) > GRAIN:
                 continue
@@ -269,10 +276,10 @@ def _read(
     with np.errstate(invalid="ignore", over="ignore"):
         rest = means - drive
         gain = np.ones(len(names))
-        series = sensor_series(structure, rec.m, rec.step) if coupled else None
+        series = sensor_series(structure, rec.m, rec.step) if rec.sensor is None else None
         if series is not None and structure.sensor_filter is not None:
             for i, name in enumerate(names):
-                if name in structure.sensor_filter.outputs and np.all(np.isfinite(means[i])):
+                if structure.measured_through(name) and np.all(np.isfinite(means[i])):
                     gain[i] = high_frequency_gain(structure.sensor_filter)
                     rest[i] = _core.series_multiply(series, means[i], rec.m) - gain[i] * drive[i]
         if at is not None:
@@ -320,6 +327,18 @@ def high_frequency_gain(sensor: SensorFilter) -> float:
     """What a sensor filter makes of a jump at once: 0 unless its numerator is of the denominator's order."""
     highest = max(order for coefficient, order in sensor.denominator if coefficient)
     top, bottom = (sum(c for c, order in part if order == highest) for part in (sensor.numerator, sensor.denominator))
+    return top / bottom
+
+
+def leading_gain(sensor: SensorFilter) -> float:
+    """Jump of a sensor filter's answer to the derivative of an impulse that it just answers with one, else 0."""
+    orders = [max((o for c, o in part if c), default=0.0) for part in (sensor.numerator, sensor.denominator)]
+    if abs(orders[1] - orders[0] - sensor.relative_degree) > GRAIN:
+        return 0.0
+    top, bottom = (
+        sum(c for c, o in part if o == highest)
+        for part, highest in zip((sensor.numerator, sensor.denominator), orders, strict=True)
+    )
     return top / bottom
 
 

@@ -23,11 +23,11 @@ impl<'a> Needed<'a> {
         if !self.alphas.insert(grains(alpha)) {
             return;
         }
-        for exponent in self.initial.offset_exponents(alpha) {
+        for exponent in self.initial.offset_exponents(alpha).into_iter().chain(self.initial.impulses()) {
             self.index.insert(Key::initial(exponent));
         }
         match self.initial.under() {
-            Initial::Rest | Initial::Offset { .. } => {}
+            Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => {}
             Initial::Powers(powers) => powers.iter().for_each(|&e| {
                 self.index.insert(Key::initial(e));
             }),
