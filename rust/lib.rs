@@ -11,6 +11,7 @@
 //! 4. [`regressors`]: a record and an equation become regressors I^{α−ν} s;
 //! 5. [`estimate`]: coefficients at given orders by least squares, multi-innovation least squares and instrumental
 //!    variables; orders and coefficients together by joint output error ([`small`] and [`memory`] serve them);
+//!    [`friction`]: free runs of a body that may stick, and their output error;
 //! 6. [`search`]: the orders themselves, exhaustively over a lattice;
 //! 7. [`simulate`], [`metrics`]: free runs, the two errors, and what they amount to.
 //!
@@ -65,6 +66,7 @@ pub mod regressors;
 pub mod regularity;
 
 pub mod estimate;
+pub mod friction;
 pub mod memory;
 pub mod small;
 

@@ -13,7 +13,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.arm.link import flexible_link, link_model, order_law
     from ftlm.arm.parameters import PARAMETERS, LinkParameters
     from ftlm.base.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
-    from ftlm.data.equations import Equation, Term
+    from ftlm.data.equations import Equation, Friction, Term
     from ftlm.data.language import equation
     from ftlm.data.lattice import Lattice, lattice
     from ftlm.data.orders import Order
@@ -50,13 +50,13 @@ if _typing.TYPE_CHECKING:
 
 __all__ = [
     "PARAMETERS", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation", "Estimate",
-    "FeedbackTest", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria", "InternalError",
-    "Lattice", "LinkParameters", "Metrics", "Model", "ModelError", "Order", "OutputResiduals", "PhysicalParameter",
-    "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow", "SensorFilter",
-    "StoreStatus", "Structure", "Term", "Trace", "__version__", "block_pulse_matrix", "compare", "equation",
-    "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse", "haar_matrix",
-    "haar_transform", "identify", "identify_many", "information_criteria", "lattice", "link_model", "load",
-    "load_model", "metrics", "multi_innovation_trace", "operational_matrix", "order_law", "physical_parameters",
+    "FeedbackTest", "Friction", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria",
+    "InternalError", "Lattice", "LinkParameters", "Metrics", "Model", "ModelError", "Order", "OutputResiduals",
+    "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow",
+    "SensorFilter", "StoreStatus", "Structure", "Term", "Trace", "__version__", "block_pulse_matrix", "compare",
+    "equation", "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse",
+    "haar_matrix", "haar_transform", "identify", "identify_many", "information_criteria", "lattice", "link_model",
+    "load", "load_model", "metrics", "multi_innovation_trace", "operational_matrix", "order_law", "physical_parameters",
     "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status", "simulate",
 ]  # fmt: skip
 
@@ -68,7 +68,7 @@ _HOMES = {
         "arm.link": "flexible_link link_model order_law",
         "arm.parameters": "LinkParameters PARAMETERS",
         "base.errors": "ConvergenceError DataError FtlmError InternalError ModelError RigFault",
-        "data.equations": "Equation Term",
+        "data.equations": "Equation Friction Term",
         "data.language": "equation",
         "data.lattice": "Lattice lattice",
         "data.orders": "Order",

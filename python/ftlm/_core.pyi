@@ -29,6 +29,8 @@ __all__ = [
     "fractional_derivative",
     "fractional_integral",
     "fractional_memory",
+    "friction_error",
+    "friction_respond",
     "grunwald_letnikov_weights",
     "haar_inverse",
     "haar_matrix",
@@ -217,6 +219,33 @@ def output_error(
     evaluations: int,
     tolerance: float,
 ) -> _Fit: ...
+
+class _Motion(TypedDict):
+    output: _Vector
+    velocity: _Vector
+    sign: _Vector
+    stuck: Any
+
+def friction_respond(
+    run: _Record,
+    equation: _Structure,
+    coefficients: Sequence[float],
+    strength: float,
+    terms: Sequence[tuple[float, float]],
+) -> _Motion: ...
+def friction_error(
+    runs: Sequence[_Experiment],
+    law: _FreeEquation,
+    strength: _Monomial,
+    order_bounds: Sequence[tuple[float, float]],
+    names: Sequence[str],
+    terms: _Initial,
+    orders: Sequence[float],
+    coefficients: Sequence[float],
+    states: Sequence[Sequence[float]],
+    evaluations: int,
+    tolerance: float,
+) -> dict[str, Any]: ...
 
 # ---------------------------------------------------------------------------------------------------------- simulation
 

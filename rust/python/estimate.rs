@@ -101,18 +101,18 @@ pub fn instrumental_variables(
 }
 
 /// (constant, weight of each free order).
-type AffineArg = (f64, Vec<f64>);
+pub type AffineArg = (f64, Vec<f64>);
 /// (known factor, (coefficient, power) pairs).
-type MonomialArg = (f64, Vec<(usize, i32)>);
+pub type MonomialArg = (f64, Vec<(usize, i32)>);
 /// (output, alpha, [(signal, order, coefficient), …]).
-type FreeEquationArg = (usize, AffineArg, Vec<(usize, AffineArg, MonomialArg)>);
+pub type FreeEquationArg = (usize, AffineArg, Vec<(usize, AffineArg, MonomialArg)>);
 /// (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between).
-type OwnTimesArg<'py> =
+pub type OwnTimesArg<'py> =
     (PyReadonlyArray1<'py, f64>, Vec<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
 /// (record, pulses a sample interval, samples of each output, filter of simulated outputs, weight of each output,
 /// (values at the samples, whether it holds) of each signal, shares of the compared samples of each output, times of
 /// their own).
-type ExperimentArg<'py> = (
+pub type ExperimentArg<'py> = (
     RecordArg<'py>,
     usize,
     PyReadonlyArray2<'py, f64>,
@@ -127,7 +127,7 @@ fn affine((constant, weights): AffineArg) -> AffineOrder {
     AffineOrder { constant, weights }
 }
 
-fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
+pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     let (record, samples, weights) = (record(&argument.0)?, rows(&argument.2), argument.4.clone());
     let experiment = match &argument.7 {
         None => joint::Experiment::new(record, argument.1, samples, weights)?,
@@ -159,6 +159,43 @@ fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     })
 }
 
+/// One equation whose orders and coefficients are free.
+pub fn free_equation((output, order, terms): FreeEquationArg) -> joint::FreeEquation {
+    joint::FreeEquation {
+        output,
+        order: affine(order),
+        terms: terms
+            .into_iter()
+            .map(|(signal, order, (factor, powers))| (signal, affine(order), joint::Monomial { factor, powers }))
+            .collect(),
+    }
+}
+
+/// Coordinates by name.
+pub fn coordinates(names: &[String]) -> PyResult<Vec<joint::Coordinate>> {
+    let known = |name: &String| match name.as_str() {
+        "plain" => Ok(joint::Coordinate::Plain),
+        "logarithm" => Ok(joint::Coordinate::Logarithm),
+        "excess" => Ok(joint::Coordinate::ExcessLogarithm),
+        "held" => Ok(joint::Coordinate::Held),
+        other => Err(Error::Structure {
+            what: format!("coordinate '{other}' is not known"),
+            remedy: "use plain, logarithm, excess or held".into(),
+        }),
+    };
+    Ok(names.iter().map(known).collect::<Result<Vec<_>, _>>()?)
+}
+
+/// How a search ended, as Python has it.
+pub fn status(status: joint::Status) -> &'static str {
+    match status {
+        joint::Status::Converged => "converged",
+        joint::Status::Exhausted => "exhausted",
+        joint::Status::Stalled => "stalled",
+        joint::Status::Wall => "wall",
+    }
+}
+
 #[pyfunction]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
 pub fn output_error<'py>(
@@ -176,30 +213,8 @@ pub fn output_error<'py>(
     tolerance: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
-    let equations = laws
-        .into_iter()
-        .map(|(output, order, terms)| joint::FreeEquation {
-            output,
-            order: affine(order),
-            terms: terms
-                .into_iter()
-                .map(|(signal, order, (factor, powers))| (signal, affine(order), joint::Monomial { factor, powers }))
-                .collect(),
-        })
-        .collect();
-    let coordinates = coordinates
-        .iter()
-        .map(|name| match name.as_str() {
-            "plain" => Ok(joint::Coordinate::Plain),
-            "logarithm" => Ok(joint::Coordinate::Logarithm),
-            "excess" => Ok(joint::Coordinate::ExcessLogarithm),
-            "held" => Ok(joint::Coordinate::Held),
-            other => Err(Error::Structure {
-                what: format!("coordinate '{other}' is not known"),
-                remedy: "use plain, logarithm, excess or held".into(),
-            }),
-        })
-        .collect::<Result<Vec<_>, _>>()?;
+    let equations = laws.into_iter().map(free_equation).collect();
+    let coordinates = self::coordinates(&coordinates)?;
     let start = joint::Point {
         orders: start_orders,
         coefficients: start_coefficients,
@@ -220,15 +235,7 @@ pub fn output_error<'py>(
     dict.set_item("initial", fit.initial)?;
     dict.set_item("exponents", fit.exponents)?;
     dict.set_item("evaluations", fit.evaluations)?;
-    dict.set_item(
-        "status",
-        match fit.status {
-            joint::Status::Converged => "converged",
-            joint::Status::Exhausted => "exhausted",
-            joint::Status::Stalled => "stalled",
-            joint::Status::Wall => "wall",
-        },
-    )?;
+    dict.set_item("status", status(fit.status))?;
     Ok(dict)
 }
 

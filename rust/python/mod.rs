@@ -4,6 +4,7 @@
 mod arrays;
 mod errors;
 mod estimate;
+mod friction;
 mod operators;
 mod search;
 mod simulate;
@@ -25,6 +26,9 @@ mod _core {
 
     #[pymodule_export]
     use super::estimate::{instrumental_variables, least_squares, multi_innovation, output_error, Streaming};
+
+    #[pymodule_export]
+    use super::friction::{friction_error, friction_respond};
 
     #[pymodule_export]
     use super::simulate::{

@@ -9,6 +9,7 @@ mod bindings;
 mod equation;
 mod estimators;
 mod fractional;
+mod friction;
 mod haar;
 mod iv;
 mod joint;

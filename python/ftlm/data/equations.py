@@ -7,6 +7,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from msgspec import UNSET, UnsetType
+
 from ftlm.base.checks import real_number
 from ftlm.base.errors import ModelError
 from ftlm.data.orders import MAX_EXCESS, MAX_ORDER, MIN_INPUT_ORDER, Order
@@ -60,6 +62,40 @@ def derivative(order: Order, signal: str) -> str:
 
 
 @dataclass(frozen=True)
+class Friction:
+    """Coulomb friction ``factor * coefficient * sign(D output)`` of an equation's own output, set-valued at rest.
+
+    The sign is that of the velocity that the equation itself gives, not of a measured one. At rest it is whatever
+    within [-1, 1] keeps the body there; where nothing within does, the body slides.
+
+    Parameters
+    ----------
+    coefficient
+        Name of the free coefficient, or its value [unit of D^alpha y]; not negative times a factor that is negative.
+    factor
+        Known factor, negative: friction takes energy.
+    name
+        Name that the coefficient had before it got its value.
+    """
+
+    coefficient: str | float
+    factor: float = -1.0
+    name: str | None = None
+
+    @property
+    def strength(self) -> float | None:
+        """What friction holds at most, [unit of D^alpha y], if it is known."""
+        return None if isinstance(self.coefficient, str) else -self.factor * self.coefficient
+
+    def written(self, output: str) -> str:
+        """Write the term in words."""
+        if isinstance(self.coefficient, str):
+            factor = "" if self.factor == -1 else f"{-self.factor!r} "
+            return f"- {factor}{self.coefficient} sign(D {output})"
+        return f"- {-self.factor * self.coefficient!r} sign(D {output})"
+
+
+@dataclass(frozen=True)
 class Equation:
     """D^order output = sum of terms.
 
@@ -73,16 +109,21 @@ class Equation:
         Right-hand side. Orders of the output itself lie in [0, alpha), those of other signals in [-3, alpha + 1): the
         link of an arm hangs on a hub that is differentiated more often than its own deflection. A command that holds
         between samples stays at alpha or below, its jumps have no derivative.
+    coulomb
+        Coulomb friction of the output's own velocity, if there is some; alpha then lies in (1, 2], and every order
+        below alpha.
     """
 
     output: str
     order: Order
     terms: tuple[Term, ...]
+    # Absent where there is none, so that what is written of an equation without it is as it was.
+    coulomb: Friction | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         if not self.terms:
             raise ModelError(f"the equation of {self.output} has no term; add at least one")
-        names = [t.coefficient for t in self.terms if isinstance(t.coefficient, str)]
+        names = list(self.coefficient_names)
         twice = next((n for i, n in enumerate(names) if n in names[:i]), None)
         if twice is not None:
             raise ModelError(
@@ -119,6 +160,41 @@ class Equation:
                     "an equation carries another signal less than one order above its own output: lower it"
                 )
 
+        if self.friction is not None:
+            self._check_friction(self.friction)
+
+    def _check_friction(self, friction: Friction) -> None:
+        """Refuse friction that drives, and orders beside which a velocity has no meaning."""
+        words = f"friction in the equation of {self.output}"
+        if not (math.isfinite(friction.factor) and friction.factor < 0):
+            raise ModelError(
+                f"{words} has the factor {friction.factor:g}, but friction takes energy: write "
+                f"'- fc*sign(D {self.output})'"
+            )
+        if friction.strength is not None and not 0 <= friction.strength < math.inf:
+            raise ModelError(
+                f"{words} has the coefficient {friction.coefficient!r}; it is not negative: the sign is in the term"
+            )
+        if self.order.names:
+            return
+        alpha = self.order.constant
+        if not 1 < alpha <= 2:
+            raise ModelError(
+                f"{words} acts on its velocity, but alpha = {alpha:g} is outside (1, 2]; leave it out, or choose "
+                "another order"
+            )
+        for term in self.terms:
+            if not term.order.names and term.order.constant >= alpha - 1e-9:
+                raise ModelError(
+                    f"order {term.order.constant:g} of {term.signal} is not below alpha = {alpha:g}, and {words} then "
+                    "has no velocity to follow; lower it"
+                )
+
+    @property
+    def friction(self) -> Friction | None:
+        """Coulomb friction of the output's own velocity; None without."""
+        return self.coulomb if isinstance(self.coulomb, Friction) else None
+
     @property
     def signals(self) -> tuple[str, ...]:
         """Output first, then the other signals in order of appearance."""
@@ -132,7 +208,8 @@ class Equation:
     @property
     def coefficient_names(self) -> tuple[str, ...]:
         """Free coefficients in order of appearance."""
-        return tuple(t.coefficient for t in self.terms if isinstance(t.coefficient, str))
+        friction = () if self.friction is None else (self.friction,)
+        return tuple(t.coefficient for t in (*self.terms, *friction) if isinstance(t.coefficient, str))
 
     def with_orders(self, values: Mapping[str, float]) -> Equation:
         """Return the equation with these free orders replaced by values; others stay free.
@@ -143,7 +220,7 @@ class Equation:
             Orders out of range once they are numbers.
         """
         terms = tuple(replace(t, order=t.order.partly(values)) for t in self.terms)
-        return Equation(self.output, self.order.partly(values), terms)
+        return Equation(self.output, self.order.partly(values), terms, self.coulomb)
 
     def with_coefficients(self, values: Mapping[str, float]) -> Equation:
         """Return the equation with these free coefficients replaced by values; others stay free.
@@ -159,7 +236,11 @@ class Equation:
             else t
             for t in self.terms
         )
-        return Equation(self.output, self.order, terms)
+        coulomb = self.coulomb
+        if isinstance(coulomb, Friction) and isinstance(coulomb.coefficient, str) and coulomb.coefficient in values:
+            name = coulomb.coefficient
+            coulomb = replace(coulomb, coefficient=real_number(name, values[name]), name=name)
+        return Equation(self.output, self.order, terms, coulomb)
 
     @property
     def is_identified(self) -> bool:
@@ -168,7 +249,8 @@ class Equation:
 
     def __str__(self) -> str:
         right = " + ".join(str(t) for t in self.terms).replace("+ -", "- ")
-        return f"{derivative(self.order, self.output)} = {right}"
+        friction = "" if self.friction is None else f" {self.friction.written(self.output)}"
+        return f"{derivative(self.order, self.output)} = {right}{friction}"
 
 
 def numeric(item: Equation, delay: Mapping[str, float] | None = None) -> str:
@@ -176,4 +258,6 @@ def numeric(item: Equation, delay: Mapping[str, float] | None = None) -> str:
     late = {n: f"{n}(t - {d:.6g} s)" for n, d in (delay or {}).items() if d > 0}
     parts = [f"{t.fixed or 0.0:+.6g} {derivative(t.order, late.get(t.signal, t.signal))}" for t in item.terms]
     right = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])
+    if item.friction is not None:
+        right += f" - {item.friction.strength or 0.0:.6g} sign(D {item.output})"
     return f"{derivative(item.order, item.output)} = {right}"

@@ -6,9 +6,11 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
+from msgspec import UNSET
+
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
-from ftlm.data.equations import Equation, Term
+from ftlm.data.equations import Equation, Friction, Term
 from ftlm.data.orders import Order, Values
 from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial, check_offset
 
@@ -35,7 +37,9 @@ def equation(
         Such as ``"D^2.2 y = a1 D^0.9 y + a0 y + b0 u"``. ``D^alpha`` names a free order, ``D^(alpha-mu)`` an order
         law, ``D`` and ``D y`` the first derivative; a coefficient is a name, a number (fixed) or a number times a
         name. Several equations are separated by ``;`` or by lines. A term that is ``c`` alone (or ``c0``, ``c1``, …)
-        is an offset, an unknown constant; a signal of that name is ``1 c``.
+        is an offset, an unknown constant; a signal of that name is ``1 c``. ``- fc*sign(D y)`` in the equation of y is
+        Coulomb friction: the sign of the velocity that the equation itself gives, and at rest whatever within
+        [-1, 1] keeps it there.
     orders
         Values of the free orders: a number fixes one, ``"0.5:1.5:0.05"`` or (low, high, step) gives its lattice.
     fixed
@@ -172,6 +176,7 @@ def _parse(text: str) -> tuple[Equation, bool]:
         )
     terms = []
     offset = False
+    friction: Friction | None = None
     while True:
         sign = 1.0
         while words.peek()[1] in "+-" and words.peek()[0] == "symbol":
@@ -185,6 +190,15 @@ def _parse(text: str) -> tuple[Equation, bool]:
                 )
             offset = True
             words.take()
+        elif (rubs := _parse_friction(words, sign)) is not None:
+            if friction is not None:
+                raise ModelError(f"equation {text!r}: friction of D {output} stands there twice; write it once")
+            if rubs[1] != output:
+                raise ModelError(
+                    f"equation {text!r}: friction follows the velocity of the equation's own output, which is "
+                    f"{output}, not {rubs[1]}; the sign of a measured rate is the signal coulomb_{rubs[1]}"
+                )
+            friction = rubs[0]
         else:
             terms.append(_parse_term(words, sign))
         kind, value, _ = words.peek()
@@ -192,7 +206,37 @@ def _parse(text: str) -> tuple[Equation, bool]:
             break
         if not (kind == "symbol" and value in "+-"):
             raise words.fail("'+', '-' or the end")
-    return Equation(output, order, tuple(terms)), offset
+    return Equation(output, order, tuple(terms), friction or UNSET), offset
+
+
+def _parse_friction(words: _Words, sign: float) -> tuple[Friction, str] | None:
+    """``fc*sign(D y)`` with its signal; None where the term is another one."""
+    ahead = 0
+    factor, coefficient = sign, 1.0
+    named: str | None = None
+    if words.peek(ahead)[0] == "number":
+        coefficient = float(words.peek(ahead)[1])
+        ahead += 1 + (words.peek(ahead + 1)[1] == "*")
+    if words.peek(ahead)[0] == "name" and words.peek(ahead)[1] not in ("D", "sign"):
+        named = words.peek(ahead)[1]
+        ahead += 1 + (words.peek(ahead + 1)[1] == "*")
+    if words.peek(ahead)[1] != "sign" or words.peek(ahead + 1)[1] != "(":
+        return None
+    words.position += ahead + 2
+    if words.peek()[1] != "D" or words.peek(1)[0] != "name":
+        raise words.fail("D and the name of a signal, as in sign(D y)")
+    words.take()
+    signal = words.take()[1]
+    if words.peek()[1] != ")":
+        raise words.fail("')'")
+    words.take()
+    if factor > 0:
+        raise ModelError(
+            f"equation {words.text!r}: friction takes energy, so it is subtracted: write '- fc*sign(D {signal})'"
+        )
+    if named is not None:
+        return Friction(named, factor * coefficient), signal
+    return Friction(coefficient, factor), signal
 
 
 def _is_offset(words: _Words) -> bool:

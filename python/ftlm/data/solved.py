@@ -27,8 +27,9 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     values, standard_errors
         Orders and coefficients by name as they were estimated, and their standard errors where there are any.
     covariance
-        Of every number of the model in the order of its equations (alpha, then order and coefficient of each term);
-        None where the estimator gives none. It may be singular: laws tie numbers.
+        Of every number of the model in the order of its equations (alpha, then order and coefficient of each term, then
+        the coefficient of friction where there is some); None where the estimator gives none. It may be singular: laws
+        tie numbers.
     fit
         Fit of the free run on these runs in percent, by output.
     information
@@ -80,7 +81,9 @@ class Solved:
     @property
     def coefficients(self) -> dict[str, float]:
         """Coefficients by name."""
-        return {t.name: float(t.coefficient) for e in self.equations for t in e.terms if t.name is not None}
+        named = {t.name: float(t.coefficient) for e in self.equations for t in e.terms if t.name is not None}
+        rubs = [e.friction for e in self.equations if e.friction is not None]
+        return named | {f.name: float(f.coefficient) for f in rubs if f.name is not None}
 
     @property
     def equations(self) -> tuple[Equation, ...]:

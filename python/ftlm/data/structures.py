@@ -242,6 +242,37 @@ class Structure:
         if self.sensor_filter is not None:
             check_known("filtered signal", self.sensor_filter.signals, self.signals)
         self._check_offset()
+        if self.has_friction:
+            self._check_friction()
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether the output of an equation may stick."""
+        return any(e.friction is not None for e in self.equations)
+
+    def _check_friction(self) -> None:
+        """Refuse what a free run with friction does not know yet."""
+        first = next(e.output for e in self.equations if e.friction is not None)
+        words = f"the equation of {first} has friction"
+        if len(self.equations) > 1:
+            raise ModelError(
+                f"{words}, and the structure {len(self.equations)} equations: friction is followed in one equation by "
+                "itself, driven by the other signals as measured: give it alone"
+            )
+        if self.sensor_filter is not None:
+            raise ModelError(
+                f"{words}, and the structure a sensor filter: what sticks does so before the filter; leave the filter "
+                "out, or compare signals that passed none"
+            )
+        if self.free_delays:
+            raise ModelError(f"{words}, and the delay of {', '.join(self.free_delays)} is free; give it in seconds")
+        if self.coefficient_law:
+            raise ModelError(f"{words}, and its coefficients follow a law; leave one of the two out")
+        if isinstance(self.initial, History) or self.initial == "history":
+            raise ModelError(
+                f"{words}: powers of t for an unknown past would give it velocities that it never had; use "
+                "initial='caputo' (level and velocity at the start), or begin the run at rest"
+            )
 
     def _check_offset(self) -> None:
         """Refuse an offset that is no word, or that given initial terms hold already."""

@@ -159,6 +159,9 @@ def descend(
         else:
             late = coefficient - len(coordinates)
             ends[late] = (attempt.delays[late],) * 2
+    if structure.has_friction:
+        outcome = _with_friction(problem, experiments, attempt, bounds, coordinates, evaluations, tolerance)
+        return Attempt(list(outcome["orders"]), list(outcome["coefficients"]), attempt.origin, outcome)
     outcome = _core.output_error(
         experiments, problem.laws(signals), bounds, coordinates, structure.coupling == "simulated",
         initial_tuple(structure.initial, structure.offset, states), attempt.orders, attempt.coefficients,
@@ -170,6 +173,20 @@ def descend(
     )  # fmt: skip
     orders, coefficients, delays = (list(outcome[n]) for n in ("orders", "coefficients", "delays"))
     return Attempt(orders, coefficients, attempt.origin, outcome, delays)
+
+
+def _with_friction(
+    problem: FreeProblem, experiments: list[Any], attempt: Attempt, bounds: list[tuple[float, float]],
+    coordinates: list[str], evaluations: int, tolerance: float,
+) -> Any:  # fmt: skip
+    """The same of a body that may stick: what its runs start with is no projection, and goes on from where it was."""
+    structure = problem.structure
+    known = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
+    return _core.friction_error(
+        experiments, problem.laws(structure.signals)[0], problem.strength(), bounds, coordinates,
+        initial_tuple(structure.initial, structure.offset), attempt.orders, attempt.coefficients, known, evaluations,
+        tolerance,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def fit_any_start(
         return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss)
 
     joint = fitted(start)
-    if structure.initial != "auto" or not has_memory(structure):
+    if structure.initial != "auto" or not has_memory(structure) or structure.has_friction:
         return joint
     if start == "rest":
         if not _moved(joint, runs, structure):

@@ -21,6 +21,7 @@ from ftlm.data.run import Run
 from ftlm.data.settings import Loss
 from ftlm.data.structures import Initial, Structure, delay_name
 from ftlm.fit.extrapolation import feasible
+from ftlm.fit.friction import race_with_friction
 from ftlm.fit.grid import FINEST, Attempt, Grid
 from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.problem import FreeProblem
@@ -197,7 +198,8 @@ def fit_output_error(
     starts: list[tuple[float, str]] = []
     if start is None:
         floor = float(np.mean([(noise[o] / (COARSE_SHARE * sizes[o])) ** 2 for o in outputs]))
-        reached = race(alike, floor, threads, progress)
+        runners = race_with_friction if structure.has_friction else race
+        reached = runners(alike, floor, threads, progress)
         starts, contenders = [(a.level, a.origin) for a in reached], finalists(reached)
     else:
         orders, coefficients, delays = problem.split([start[n] for n in problem.names])

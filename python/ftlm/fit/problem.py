@@ -16,6 +16,8 @@ from ftlm.solve.records import affine
 
 #: Own bounds of orders where the structure gives none.
 ALPHA_BOUNDS = (0.05, SEARCHED_ORDER)
+#: The same of highest orders beside friction.
+FRICTION_BOUNDS = (1.001, 2.0)
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class FreeProblem:
             else:
                 least = ALPHA_BOUNDS[0] if name in highest else 0.0
                 bounds.append((least, _reach(structure, name, above=name in highest)))
+        if structure.has_friction:
+            # A velocity needs inertia, and friction of it an order of 2 at most.
+            ends = dict(zip(structure.order_names, bounds, strict=True))
+            inertia = {n: (max(ends[n][0], FRICTION_BOUNDS[0]), min(ends[n][1], FRICTION_BOUNDS[1])) for n in highest}
+            bounds = list((ends | inertia).values())
         coefficients = tuple(dict.fromkeys(free))
         return cls(
             structure, structure.order_names, coefficients, tuple(bounds), products, tuple(structure.free_delays)
@@ -104,6 +111,15 @@ class FreeProblem:
             for e in self.structure.equations
         ]  # fmt: skip
 
+    def strength(self) -> tuple[float, list[tuple[int, int]]]:
+        """What friction of the only equation holds at most, as a monomial in the free coefficients."""
+        rubs = self.structure.equations[0].friction
+        if rubs is None:
+            return 0.0, []
+        if isinstance(rubs.coefficient, str):
+            return -rubs.factor, [(self.coefficients.index(rubs.coefficient), 1)]
+        return float(rubs.strength or 0.0), []
+
     def named(self, values: Sequence[float]) -> dict[str, float]:
         """Every coefficient of the structure by name from the free ones."""
         free = dict(zip(self.coefficients, map(float, values), strict=True))
@@ -116,7 +132,8 @@ class FreeProblem:
     def number_jacobian(self, orders: Sequence[float], coefficients: Sequence[float]) -> Floats:
         """Derivatives of a model's numbers (rows) with respect to everything that is free (columns).
 
-        Rows are, equation by equation, alpha, then order and coefficient of each term; delays are none of them.
+        Rows are, equation by equation, alpha, then order and coefficient of each term, then the coefficient of friction
+        where there is some; delays are none of them.
         """
         free = dict(zip(self.coefficients, coefficients, strict=True))
         count, idle = len(self.orders), len(self.delays)
@@ -135,6 +152,11 @@ class FreeProblem:
                         others = [free[f] for j, f in enumerate(factors) if j != k]
                         row[count + list(free).index(name)] += term.factor * sign * math.prod(others)
                 rows += [of_order(term.order), row]
+            if item.friction is not None:
+                row = np.zeros(count + len(free) + idle)
+                if isinstance(item.friction.coefficient, str):
+                    row[count + list(free).index(item.friction.coefficient)] = 1.0
+                rows.append(row)
         return np.stack(rows)
 
     def free_from(self, estimated: Mapping[str, float]) -> list[float]:

@@ -24,7 +24,7 @@ from ftlm.identification.judged import Task
 from ftlm.identification.offsets import with_decided_offset
 from ftlm.identification.reference import by_reference, driven_by
 from ftlm.identification.result import Identification
-from ftlm.identification.warnings import discretisation, growing, unexcited
+from ftlm.identification.warnings import discretisation, growing, one_sided, unexcited
 from ftlm.judge.comparison import Comparison, compared_samples, free_runs
 from ftlm.judge.criteria import InformationCriteria, information_criteria
 from ftlm.judge.metrics import finite
@@ -141,6 +141,8 @@ def identify(
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
     if offset is not None:
         structure = replace(structure, offset=check_offset(offset))
+    if structure.has_friction:
+        _check_friction(structure, method, reference)
     check_lattice(lattice)
     check_lattice_names(lattice, structure)
     if not (genetic is None or isinstance(genetic, Genetic)):
@@ -190,6 +192,20 @@ def identify(
     return judged(fit)
 
 
+def _check_friction(structure: Structure, method: str, reference: str | None) -> None:
+    """Refuse what does not know friction."""
+    words = f"the equation of {structure.outputs[0]} has friction, which"
+    if method != "output-error":
+        raise ModelError(f"{words} method={method!r} does not know; use method='output-error'")
+    if reference is not None:
+        raise ModelError(f"{words} the instrument reference={reference!r} does not know; leave one of the two out")
+    if structure.offset == "auto":
+        raise ModelError(
+            f"{words} the test of offset='auto' does not know; use offset='constant', whose interval says whether it "
+            "is 0, or offset='none'"
+        )
+
+
 def judged(fit: Fit) -> Identification:
     """Both errors, residual tests, information criteria and everything that makes a fit doubtful."""
     runs, model = as_runs(fit.task.runs), fit.model
@@ -197,7 +213,7 @@ def judged(fit: Fit) -> Identification:
     comparison = compared_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
     warnings = [*comparison.warnings, *fit.warnings]
     warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings] + unexcited(runs, fit.task.structure)
-    warnings += discretisation(model, comparison) + growing(model)
+    warnings += discretisation(model, comparison) + growing(model) + one_sided(model, free)
     tests, criteria = None, None
     try:
         tests = tested_residuals(model, runs, free, lags=LAGS)

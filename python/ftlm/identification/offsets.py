@@ -26,7 +26,8 @@ def with_decided_offset(runs: Sequence[Run], structure: Structure, estimate: Cal
     """
     if structure.offset != "auto":
         fit = estimate(structure)
-        if structure.offset != "none" or not _small(fit.task.runs):
+        # Where a body may stick, what a constant does is no sensitivity alone: it decides where the body rests.
+        if structure.offset != "none" or structure.has_friction or not _small(fit.task.runs):
             return fit
         said = unasked_offset(tested(fit), fit.model.outputs) or _in_place_of_a_past(fit)
         return replace(fit, warnings=[*fit.warnings, *said])

@@ -45,6 +45,8 @@ LAGS = 25
 #: Innovation lengths of the paper's tables, and points of a convergence curve.
 INNOVATION_LENGTHS = (1, 3, 5, 7)
 TRACE_POINTS = 64
+#: Of a model with friction, where others have their stability.
+STICKS = "The body rests while friction holds it, so that no poles say how it comes to rest."
 
 
 def identification_page(
@@ -123,7 +125,7 @@ def first_sections(
     drawn = [f for label, c in compared for f in comparison_charts(c, units=units, label=label, points=points)]
     equations = [
         *(equation_html(e, model.structure.delay) for e in model.equations),
-        f"As a whole, the model is {model.stability()}.",
+        STICKS if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
     ]
     sections = [
         Section("Warnings", words[1:] if warned else words, warned),
@@ -155,6 +157,9 @@ def residual_section(tests: Sequence[tuple[str, Residuals]], information: Inform
 
 def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Section:
     """Gain and phase as far as runs of these steps and durations show them."""
+    if model.structure.has_friction:
+        words = "A body that may stick has none: its answer is not in proportion to what drives it."
+        return Section("Frequency response", words)
     omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
     words = "Exact, orders as they are; the equations together, from what is not modelled."
     if model.estimate is None or model.estimate.covariance is None:

@@ -22,6 +22,7 @@ from ftlm.identification.judged import Judged
 from ftlm.judge.comparison import Comparison, compare, validation_warnings
 from ftlm.model.model import Model
 from ftlm.solve.instants import compared_values, has_own_times
+from ftlm.solve.sampled import Sampled
 
 #: Two parameters more correlated than this cannot be told apart where neither is known by itself.
 INSEPARABLE = 0.995
@@ -38,6 +39,8 @@ DECISIVE = 0.5
 COARSE = 2.0
 #: Share of a step by which multiples of it may be off.
 ROUNDED = 0.01
+#: Share of its range by which an output must move within a sample to count as moving.
+TURNED = 1e-6
 #: Two coefficients further apart than this share do not obey the coefficient law.
 LAW_BROKEN = 0.05
 
@@ -274,8 +277,27 @@ def discretisation(model: Model, comparison: Comparison) -> list[str]:
     return warnings
 
 
+def one_sided(model: Model, free: Sequence[Sampled]) -> list[str]:
+    """Warn where friction and an offset do the same: the body slides in one direction only."""
+    if not model.structure.has_friction or model.structure.offset == "none":
+        return []
+    output = model.outputs[0]
+    for run in free:
+        moved = np.diff(run.outputs[0])
+        least = TURNED * float(np.ptp(run.outputs[0]))
+        if np.any(moved > least) and np.any(moved < -least):
+            return []
+    return [
+        f"the velocity of {output} never changes its sign in a run: while it slides, friction is a constant like the "
+        "offset, and only the rests tell them apart; add a run that moves both ways, or use offset='none'"
+    ]
+
+
 def growing(model: Model) -> list[str]:
     """Warn of poles with a positive real part: within one run the input may hide what they do, later nothing does."""
+    if model.structure.has_friction:
+        # Friction holds what would grow slowly; no poles say so.
+        return []
     verdict = model.stability(coupling=model.structure.coupling)
     if not verdict.unstable_poles > 0:
         return []

@@ -241,7 +241,8 @@ def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> d
     out: dict[str, dict[str, float]] = {}
     for item in model.equations:
         alone = initial_exponents(item, "caputo", model.structure.offset)
-        if isinstance(model.structure.initial, str) and not {e for e in initial[item.output] if e > -1} <= set(alone):
+        found = {round(e, 9) for e in initial[item.output] if e > -1}
+        if isinstance(model.structure.initial, str) and not found <= set(alone):
             out[item.output] = {}
             continue
         exponents, values = map(np.array, zip(*initial[item.output].items(), strict=True))
@@ -292,7 +293,8 @@ def _beside(
     missed = {
         e.output: _core.equation_error(core, equation_tuple(e, full.signals), inputs, powers)
         for e in model.equations
-        if e.output not in gaps
+        # Nor has one with friction: the sign of a measured velocity is that of its noise, most of all at rest.
+        if e.output not in gaps and e.friction is None
     }
     return _Beside(full.step, initial, simulated, measured, {o: full.of(o) for o in model.outputs}, missed)
 

@@ -13,16 +13,16 @@ from msgspec import UNSET, UnsetType
 
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import write_atomically
-from ftlm.data.equations import Equation, Term
+from ftlm.data.equations import Equation, Friction, Term
 from ftlm.data.orders import Order
 from ftlm.data.solved import Estimate, Solved
 from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
 
 #: Largest model file read: a model is a few kilobytes.
 MAX_MODEL_BYTES = 1 << 20
-#: Schema of a model that every version since the first reads, of one that has an offset, and of one that has intervals
-#: by profile likelihood or whose sensor filter names what is no output.
-SCHEMA, OFFSET_SCHEMA, NEWEST_SCHEMA = 2, 3, 4
+#: Schema of a model that every version since the first reads, of one that has an offset, of one that has intervals by
+#: profile likelihood or whose sensor filter names what is no output, and of one that has friction.
+SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA = 2, 3, 4, 5
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -35,23 +35,36 @@ class TermFile(msgspec.Struct, forbid_unknown_fields=True):
     name: str | None = None
 
 
+class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
+    """Coulomb friction of an equation's own output: coefficient is its number without the factor."""
+
+    coefficient: float
+    factor: float = -1.0
+    name: str | None = None
+
+
 class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
     """An equation whose orders are numbers."""
 
     output: str
     order: float
     terms: list[TermFile]
+    friction: FrictionFile | UnsetType = UNSET
 
     @classmethod
     def of(cls, item: Equation) -> EquationFile:
         """Write an equation."""
         terms = [TermFile(t.signal, t.order.constant, float(t.coefficient), t.factor, t.name) for t in item.terms]
-        return cls(item.output, item.order.constant, terms)
+        rubs = item.friction
+        friction = UNSET if rubs is None else FrictionFile(float(rubs.coefficient), rubs.factor, rubs.name)
+        return cls(item.output, item.order.constant, terms, friction)
 
     def equation(self) -> Equation:
         """Give the equation back."""
         terms = tuple(Term(t.signal, Order(t.order), t.coefficient, t.factor, t.name) for t in self.terms)
-        return Equation(self.output, Order(self.order), terms)
+        rubs = self.friction
+        coulomb = UNSET if rubs is UNSET else Friction(rubs.coefficient, rubs.factor, rubs.name)
+        return Equation(self.output, Order(self.order), terms, coulomb)
 
 
 class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -113,7 +126,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         offset: Offset | UnsetType = UNSET if s.offset == "none" else s.offset
         sensor = FilterFile.of(s)
         return cls(
-            "ftlm-model", schema_of(offset, sensor, model.estimate), s.name,
+            "ftlm-model", FRICTION_SCHEMA if s.has_friction else schema_of(offset, sensor, model.estimate), s.name,
             [EquationFile.of(e) for e in s.equations], s.coupling, dict(s.delay),
             s.initial if isinstance(s.initial, str) else list(s.initial), sensor, dict(model.units),
             dict(model.orders), model.m, dict(model.about), model.estimate, offset,
@@ -135,7 +148,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             offset="none" if self.offset is UNSET else self.offset,
         )  # fmt: skip
         if self.estimate is not None and self.estimate.covariance is not None:
-            count = sum(1 + 2 * len(e.terms) for e in self.equations)
+            count = sum(1 + 2 * len(e.terms) + (e.friction is not UNSET) for e in self.equations)
             rows = self.estimate.covariance
             if len(rows) != count or any(len(row) != count for row in rows):
                 raise ModelError(f"its covariance is not of {count} by {count} numbers, as its equations need")
@@ -146,7 +159,7 @@ def schema_of(offset: Offset | UnsetType, sensor: FilterFile | None, estimate: E
     """Schema of a model: the least that has all of it, so that what has less is as it was."""
     profiled = estimate is not None and estimate.intervals is not UNSET
     if profiled or (sensor is not None and not isinstance(sensor.signals, UnsetType)):
-        return NEWEST_SCHEMA
+        return PROFILE_SCHEMA
     return SCHEMA if isinstance(offset, UnsetType) else OFFSET_SCHEMA
 
 
@@ -174,7 +187,8 @@ def read_model(path: str | os.PathLike[str]) -> Solved:
         raise
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
-    latest = schema_of(read.offset, read.sensor_filter, read.estimate)
+    rubs = any(e.friction is not UNSET for e in read.equations)
+    latest = FRICTION_SCHEMA if rubs else schema_of(read.offset, read.sensor_filter, read.estimate)
     if read.schema > latest or read.schema < 1:
         raise DataError(f"{file} has schema {read.schema}, this version reads up to {latest}; upgrade ftlm")
     try:

@@ -43,6 +43,10 @@ def equation_html(item: Equation, delay: Mapping[str, float] | None = None) -> M
         parts.append(_math(lead + _number_math(abs(value)) + THIN +
                            _derivative_math(term.order, term.signal, (delay or {}).get(term.signal, 0.0)),
                            "term"))  # fmt: skip
+    if item.friction is not None:
+        rubs = Markup('<mo form="infix">−</mo>') + _number_math(item.friction.strength or 0.0) + THIN
+        velocity = Markup("<mi>sgn</mi><mo>(</mo>") + _derivative_math(Order(1.0), item.output) + Markup("<mo>)</mo>")
+        parts.append(_math(rubs + velocity, "term"))
     return Markup('<span class="equation">{}</span>').format(Markup(" ").join(parts))
 
 
@@ -142,6 +146,11 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
             shown.add(term.name)
             # + 0.0 makes the negative zero of a product of signs a plain zero.
             rows.append(row(term.name, float(term.coefficient), None if stated is None else stated + 0.0, place))
+        if item.friction is not None and item.friction.name is not None:
+            name = item.friction.name
+            shown.add(name)
+            place = Markup("Coulomb friction in the equation of {}").format(symbol_html(item.output))
+            rows.append(row(name, float(item.friction.coefficient), reference.get(name), place))
     delays = {delay_name(n): (n, v) for n, v in model.structure.delay.items() if delay_name(n) in errors}
     rows += [
         row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown and n not in delays

@@ -26,7 +26,7 @@ from ftlm.search.result import SearchResult, StoreStatus
 from ftlm.search.rounds import equation_state, stage_state
 from ftlm.search.store import Store
 from ftlm.search.work import Told
-from ftlm.solve.records import check_held, prepare
+from ftlm.solve.records import check_held, check_linear, prepare
 
 
 def search_orders(
@@ -154,6 +154,7 @@ def make_job(
         raise ModelError(f"equation is {type(equation).__name__}, not a structure; use ftlm.equation or flexible_link")
     if not equation.order_names:
         raise ModelError("every order is a number, so there is nothing to search; name one, as in D^alpha y")
+    check_linear(equation.equations, "an order search")
     if len(equation.equations) > 1 and not equation.has_order_law:
         raise ModelError(
             "the equations share no order law, so they are searched one by one: "

@@ -18,6 +18,7 @@ from ftlm.base.checks import real_number, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.data.solved import Solved
 from ftlm.solve.frequency import frequency_response, response_inputs
+from ftlm.solve.records import check_linear
 from ftlm.solve.stability import stability
 
 #: Errors of the approximation beyond which a warning is due: gain [dB], phase [degrees].
@@ -225,6 +226,7 @@ def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> 
     count = whole_number(order)
     if count is None or not 1 <= count <= LARGEST_ORDER:
         raise ModelError(f"order = {order!r} is no whole number from 1 to {LARGEST_ORDER}")
+    check_linear(model.equations, "a linear system in state space")
     inputs, outputs = response_inputs(model, coupled=True), model.outputs
     builder = _Builder(len(inputs), len(outputs))
     delays = model.structure.delay

@@ -18,6 +18,7 @@ from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.solve.free_run import simulate
+from ftlm.solve.records import check_linear
 
 #: A sum of coefficient * s^power, by power.
 Polynomial: TypeAlias = dict[float, float]
@@ -52,6 +53,7 @@ def _times(a: Polynomial, b: Polynomial) -> Polynomial:
 
 def row_of(item: Equation, names: Sequence[str]) -> tuple[list[Polynomial], dict[str, Polynomial]]:
     """D^alpha y - own and coupled terms, by output; every other signal's terms."""
+    check_linear([item], "a frequency response")
     left: list[Polynomial] = [{} for _ in names]
     right: dict[str, Polynomial] = {}
     left[names.index(item.output)][item.order.constant] = 1.0

@@ -74,7 +74,8 @@ def decided(run: Run, structure: Structure) -> Initial:
     if initial == "auto":
         if starts_at_rest(run, structure):
             return "rest"
-        initial = "history" if has_memory(structure) else "caputo"
+        # A body with friction has no velocities but its own, so that only level and velocity are asked for.
+        initial = "history" if has_memory(structure) and not structure.has_friction else "caputo"
     return history(run, structure) if initial == "history" else initial
 
 

@@ -272,7 +272,29 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
 
 
 def structure_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
-    """Output, alpha and (signal, order) pairs of an equation whose orders are numbers."""
+    """Output, alpha and (signal, order) pairs of an equation whose orders are numbers.
+
+    Raises
+    ------
+    ModelError
+        An equation with friction, which nothing linear follows.
+    """
+    check_linear([item], "what is linear in its coefficients")
+    return linear_tuple(item, signals)
+
+
+def check_linear(equations: Sequence[Equation], what: str) -> None:
+    """Refuse friction where nothing knows it."""
+    for item in equations:
+        if item.friction is not None:
+            raise ModelError(
+                f"the equation of {item.output} has friction, which {what} does not know; use method='output-error' "
+                "and free runs (simulate, compare), or leave the friction out"
+            )
+
+
+def linear_tuple(item: Equation, signals: Sequence[str]) -> tuple[int, float, list[tuple[int, float]]]:
+    """The linear part of an equation."""
     index = {name: i for i, name in enumerate(signals)}
     terms = [(index[t.signal], t.order.constant) for t in item.terms]
     return index[item.output], item.order.constant, terms
@@ -282,6 +304,7 @@ def lattice_tuple(
     item: Equation, signals: Sequence[str], values: Mapping[str, Sequence[float]]
 ) -> tuple[int, list[float], list[tuple[int, list[float], bool]]]:
     """Output, values of alpha, and (signal, values of the order, whether both are free) of each term."""
+    check_linear([item], "an order search")
 
     def axis(order: Order) -> list[float]:
         return list(values[order.names[0]]) if order.names else [order.constant]

@@ -19,6 +19,7 @@ from ftlm.data.equations import Equation
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Offset, SensorFilter, Structure, offset_exponents
+from ftlm.solve.friction import begun, motion_with_friction
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
 from ftlm.solve.motion import decided, misfit, missed, needed
 from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_series
@@ -26,6 +27,8 @@ from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_ser
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
 #: least from which a sample follows that no jump of a held input at its instant has reached.
 FIRST_REFINEMENT = 2
+#: Refinement at which a run with friction is told what it starts with: its own error is a few 1e-5 of the run there.
+FRICTION_REFINEMENT = 4
 #: Orders closer than this are one order.
 GRAIN = 1e-9
 #: A power of t this close to that of an offset cannot be told from it: an order just above a whole one brings a power
@@ -94,7 +97,11 @@ def refined(
     """
     own = run.length - 1
     every = FIRST_REFINEMENT
-    if initial is None:
+    if initial is None and model.structure.has_friction:
+        # Level and velocity at the start are found by descent, whose ends scatter by more than steps move them.
+        rec = record(run, model.structure, FRICTION_REFINEMENT * own)
+        initial = {model.outputs[0]: dict(begun(model, run, rec, FRICTION_REFINEMENT)["powers"][0])}
+    elif initial is None:
         model = started(model, run)
     times = run.time if on_grid and has_own_times(run, model.structure) else own_times(model, run)
     coarse, known = _tried(model, run, every, initial, times)
@@ -178,6 +185,9 @@ def sampled(
     if initial is not None:
         kept = {o: dict(initial.get(o, {})) for o in model.outputs}
         return _read(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
+    if model.structure.has_friction:
+        kept = {model.outputs[0]: dict(begun(model, run, rec, every)["powers"][0])}
+        return _read(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
     names = [
         (e.output, power)
         for e in model.equations
@@ -233,6 +243,9 @@ def _fitted(
 
 def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
     """Pulse means of the outputs, before the sensor filter: all together, or each driven by the measured others."""
+    if model.structure.has_friction:
+        item = model.equations[0]
+        return motion_with_friction(item, rec, sorted(terms[item.output].items()))["output"][None]
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
     powers = [sorted(terms[o].items()) for o in model.outputs]
     inputs = list(rec.inputs)

@@ -143,7 +143,7 @@ impl Experiment {
     }
 
     /// Samples that are compared: all that have a pulse on either side, or all that were read at times of their own.
-    pub(super) fn compared(&self) -> usize {
+    pub(crate) fn compared(&self) -> usize {
         match &self.own {
             Some(own) => own.readings.len(),
             None => (self.record.m() / self.every).saturating_sub(1),
@@ -163,7 +163,7 @@ impl Experiment {
     }
 
     /// Weighted compared samples as measured, all outputs after one another.
-    pub(super) fn measured(&self) -> Vec<f64> {
+    pub(crate) fn measured(&self) -> Vec<f64> {
         let weighted = |(i, values): (usize, &Vec<f64>)| -> Vec<f64> {
             self.weights_of(i).zip(self.inner(values)).map(|(w, v)| w * v).collect()
         };
@@ -201,7 +201,7 @@ impl Experiment {
     }
 
     /// Weighted samples of pulse means, all outputs after one another.
-    pub(super) fn sampled(&self, response: &[Vec<f64>]) -> Vec<f64> {
+    pub(crate) fn sampled(&self, response: &[Vec<f64>]) -> Vec<f64> {
         let mut samples = Vec::with_capacity(response.len() * self.compared());
         for (i, means) in response.iter().enumerate() {
             let filtered;

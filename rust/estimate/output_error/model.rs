@@ -31,7 +31,7 @@ impl Coordinate {
     }
 
     /// A coefficient moved by `delta` in its coordinate.
-    pub(super) fn shifted(self, value: f64, delta: f64) -> f64 {
+    pub(crate) fn shifted(self, value: f64, delta: f64) -> f64 {
         // A factor of e^5 in one step has left the region in which the linearisation means anything.
         let bounded = delta.clamp(-5.0, 5.0);
         match self {
@@ -43,7 +43,7 @@ impl Coordinate {
     }
 
     /// Derivative of a coefficient with respect to its coordinate.
-    pub(super) fn stretch(self, value: f64) -> f64 {
+    pub(crate) fn stretch(self, value: f64) -> f64 {
         match self {
             Self::Plain => 1.0,
             Self::Logarithm => value,
@@ -63,12 +63,12 @@ pub struct Monomial {
 }
 
 impl Monomial {
-    pub(super) fn at(&self, coefficients: &[f64]) -> f64 {
+    pub(crate) fn at(&self, coefficients: &[f64]) -> f64 {
         self.powers.iter().fold(self.factor, |product, &(i, n)| product * coefficients[i].powi(n))
     }
 
     /// Derivative with respect to coefficient i.
-    pub(super) fn slope(&self, coefficients: &[f64], i: usize) -> f64 {
+    pub(crate) fn slope(&self, coefficients: &[f64], i: usize) -> f64 {
         let Some(&(_, n)) = self.powers.iter().find(|&&(j, _)| j == i) else { return 0.0 };
         let rest = self.powers.iter().filter(|&&(j, _)| j != i);
         let others = rest.fold(self.factor, |product, &(j, k)| product * coefficients[j].powi(k));

@@ -1,0 +1,149 @@
+"""A body that sticks, measured: recovery with intervals, cost of a free run, hubs of real arms.
+
+``python benches/friction.py recovery [--seeds 20]``, ``speed``, ``measured``. Truth of the recovery is a cart in closed
+form between its events (tests/python/friction.py) with offsets a run; the real runs are those of ``FTLM_DATA``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ftlm
+from ftlm import _core
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
+
+import friction
+from measured import DATA
+
+CART = "D^2 y = - v D y + g u - fc*sign(D y) + c"
+TRUTH = {"v": 1.0, "g": 1.0, "fc": 0.8, "alpha": 2.0}
+HUB = "D^2 theta11 = - v D theta11 + g I1 + k theta12{rubs} + c"
+RUBS = " - fc*sign(D theta11)"
+#: Steps that are fitted; the amplifier of the arm clips at LIMIT.
+FITTED = ("30", "20", "minus10", "minus20")
+JUDGED = ("10", "minus30", "0_return", "5", "minus5")
+LIMIT = 0.94
+
+
+def cart(seed: int, noise: float, rows: int = 801) -> ftlm.Run:
+    """A cart under two sinusoids of held values, with an offset of its own."""
+    rng = np.random.default_rng(seed)
+    step, offset = 0.0125, rng.uniform(-0.2, 0.2)
+    times, phases = np.arange(rows) * step, rng.uniform(0.0, 2.0 * np.pi, 2)
+    force = 1.6 * np.sin(2.2 * times + phases[0]) + 0.8 * np.sin(5.1 * times + phases[1])
+    y, _ = friction.exact_cart(force + offset, step, 1.0, 0.8, 0.3, 0.0)
+    y += noise * np.std(y) * rng.standard_normal(rows)
+    return ftlm.Run.from_arrays(step=step, inputs={"u": force}, outputs={"y": y}, name=f"cart {seed}")
+
+
+def recovery(seeds: int) -> None:
+    """Coverage of 95 % intervals, order fixed and free, two runs a fit."""
+    free = CART.replace("D^2", "D^alpha")
+    for words, orders in ((CART, {}), (free, {"alpha": (1.5, 2.0, 0.1)})):
+        structure = ftlm.equation(words, initial="caputo", orders=orders)
+        names = (*orders, "v", "g", "fc")
+        for noise in (0.002, 0.02):
+            scores, taken = [], []
+            for seed in range(seeds):
+                begun = time.process_time()
+                found = ftlm.identify([cart(2 * seed, noise), cart(2 * seed + 1, noise)], structure, threads=1)
+                taken.append(time.process_time() - begun)
+                values = {**found.orders, **found.coefficients}
+                scores.append([(values[n] - TRUTH[n]) / found.standard_errors[n] for n in names])
+            z = np.array(scores)
+            inside = ", ".join(f"{n} {c}" for n, c in zip(names, np.sum(np.abs(z) < 1.96, axis=0), strict=True))
+            mean = ", ".join(f"{v:+.2f}" for v in z.mean(axis=0))
+            order = "free" if orders else "2"
+            print(
+                f"| {order} | {noise:g} | {inside} of {seeds} | {mean} | {np.abs(z).max():.2f} | "
+                f"{statistics.median(taken):.2g} |",
+                flush=True,
+            )
+
+
+def speed() -> None:
+    """A free run of order 1.8 with friction beside the linear one."""
+    rng = np.random.default_rng(0)
+    equation = (0, 1.8, [(0, 0.9), (1, 0.0)])
+    for m in (1 << 11, 1 << 14, 1 << 17):
+        record = (1e-3, np.stack([np.zeros(m), rng.normal(size=m)]), None)
+        rubs = timed(partial(_core.friction_respond, record, equation, [-3.0, 1.0], 0.5, []))
+        plain = timed(partial(_core.respond, record, [(equation, [-3.0, 1.0])], [False, True], [[]]))
+        print(f"| {m} | {1e3 * rubs:.1f} | {rubs / plain:.1f} |", flush=True)
+
+
+def timed(work: Any) -> float:
+    """Median of five [s of processor time]."""
+    taken = []
+    for _ in range(5):
+        begun = time.process_time()
+        work()
+        taken.append(time.process_time() - begun)
+    return statistics.median(taken)
+
+
+def run_of(path: Path, current: str, *, name: str, clip: bool = False, **options: Any) -> ftlm.Run:
+    """A run of the arm at 8 ms, angles in rad."""
+    run = ftlm.load(path, time="t_s", inputs={"I1": current}, outputs={"theta11": "th11_deg", "theta12": "th12_deg"},
+                    units={"theta11": "deg", "theta12": "deg"}, **options)  # fmt: skip
+    command = np.clip(run["I1"], -LIMIT, LIMIT) if clip else run["I1"]
+    return ftlm.Run.from_arrays(
+        step=4 * run.step, inputs={"I1": command[::4]}, outputs={n: run[n][::4] for n in ("theta11", "theta12")},
+        name=name,
+    )  # fmt: skip
+
+
+def measured() -> None:
+    """Hubs of the real arm, from the current and the measured deflection."""
+    runs = {
+        "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", slice=(1.1, 19.5)),
+        "lqr": run_of(DATA / "two_link_lqr" / "lqr.csv", "Im1_meas_A", name="lqr"),
+    }
+    for words in ("", RUBS):
+        structure = ftlm.equation(HUB.format(rubs=words), initial="caputo")
+        for run in runs.values():
+            told(structure, [run], runs)
+    for clip in (False, True):
+        steps = {
+            n: run_of(DATA / "two_link_steps" / f"lqr_{n}.csv", "Im1_cmd_A", name=n, clip=clip)
+            for n in (*FITTED, *JUDGED)
+        }
+        for words in ("", RUBS):
+            print("clipped at 0.94 A" if clip else "command as it is", flush=True)
+            told(ftlm.equation(HUB.format(rubs=words), initial="caputo"), [steps[n] for n in FITTED], steps)
+
+
+def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm.Run]) -> None:
+    """Fit, print numbers with standard errors, and judge on every run."""
+    begun = time.process_time()
+    found = ftlm.identify(fitted, structure, threads=1)
+    taken = time.process_time() - begun
+    numbers = ", ".join(f"{n} {v:.4g} ± {found.standard_errors[n]:.2g}" for n, v in found.coefficients.items())
+    names = {run.name for run in fitted}
+    print(f"{structure}: {numbers}; {taken:.2g} s", flush=True)
+    for name, run in runs.items():
+        there = found.model.compare(run)
+        print(f"    {name} {'fitted' if name in names else 'judged'}: {there.fit_percent['theta11']:.2f}, "
+              f"offset {there.offsets[0]['theta11']['constant']:+.3f}", flush=True)  # fmt: skip
+
+
+def main() -> None:
+    """Run what is asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=("recovery", "speed", "measured"))
+    parser.add_argument("--seeds", type=int, default=20)
+    asked = parser.parse_args()
+    {"recovery": lambda: recovery(asked.seeds), "speed": speed, "measured": measured}[asked.what]()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Where joint fits of a body with friction start: at fits that are linear, its sign as measured or left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+from msgspec import UNSET
+
+from ftlm.base.errors import DataError, FtlmError
+from ftlm.base.statistics import noise_of
+from ftlm.data.equations import Friction, Term
+from ftlm.data.orders import Order
+from ftlm.data.readings import read
+from ftlm.data.run import Run
+from ftlm.data.structures import Structure
+from ftlm.fit.grid import FINEST, Attempt, Grid
+from ftlm.fit.problem import FreeProblem
+from ftlm.fit.race import COARSE_SAMPLES, FINALISTS, FIRST_LAP, SECOND_LAP, Laps, race
+from ftlm.solve.records import COULOMB
+
+#: Friction at a start as shares of the force that drives the body, from next to none upwards.
+SHARES = (0.01, 0.05, 0.2, 0.5)
+#: The same as shares of what the measured sign of the velocity says.
+MULTIPLES = (1.0, 0.3)
+#: A body that moves by less than this many deviations of its noise, peak to peak, has not moved.
+STILL = 10.0
+
+
+def race_with_friction(
+    alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None
+) -> list[Attempt]:
+    """Coarse fits of a body with friction, best first, every output weighing alike.
+
+    The sign of the measured velocity makes the equation linear; where the body rests it is noise, and so are its
+    numbers, but they are near enough. Beside them stand those without friction, with some of it put in.
+    """
+    problem, runs = alike.problem, alike.runs
+    structure = problem.structure
+    check_moves(runs, structure)
+    rubs = structure.equations[0].friction
+    if rubs is None:
+        return race(alike, floor, threads, progress)
+    signed = with_measured_sign(structure, rubs)
+    reached = race(replace(alike, problem=FreeProblem.of(signed)), floor, threads, progress)
+    coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
+    starts: list[Attempt] = []
+    for attempt in reached[:FINALISTS]:
+        values = dict(zip(FreeProblem.of(signed).names, attempt.values.tolist(), strict=True))
+        starts += started(coarse, values, rubs, attempt.origin)
+    laps = Laps(len(starts), threads, None)
+    ended = laps.run(coarse, starts, FIRST_LAP)
+    while coarse.every < FINEST and not ended:
+        coarse = coarse.finer
+        ended = laps.run(coarse, starts, FIRST_LAP)
+    return laps.run(coarse, ended[: 2 * FINALISTS], SECOND_LAP)
+
+
+def check_moves(runs: Sequence[Run], structure: Structure) -> None:
+    """Refuse runs in none of which the body moves."""
+    output = structure.outputs[0]
+    if all(float(np.ptp(read(run[output]))) <= STILL * noise_of(run[output]) for run in runs):
+        raise DataError(
+            f"{output} never moves beyond its noise in {', '.join(r.name for r in runs)}, and a body that only rests "
+            "tells nothing but that its friction is not exceeded; add a run in which it slides"
+        )
+
+
+def with_measured_sign(structure: Structure, rubs: Friction) -> Structure:
+    """The structure with the sign of the measured velocity as a signal in the place of friction."""
+    item = structure.equations[0]
+    term = Term(f"{COULOMB}{item.output}", Order(), rubs.coefficient, rubs.factor)
+    return replace(structure, equations=(replace(item, terms=(*item.terms, term), coulomb=UNSET),))
+
+
+def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str) -> list[Attempt]:
+    """Starts at numbers of a linear fit, with friction as it says, and as shares of the force that drives the body."""
+    problem = coarse.problem
+    if not isinstance(rubs.coefficient, str):
+        return [at(problem, values, origin)]
+    name = rubs.coefficient
+    said = values[name] if values[name] > 0 else 0.0
+    strengths = [(m * said, f"{m:g} of the measured sign") for m in MULTIPLES if said > 0]
+    out = [at(problem, {**values, name: v}, f"{origin}, friction {words}") for v, words in strengths]
+    item = problem.structure.equations[0]
+    plain = replace(problem.structure, equations=(replace(item, coulomb=UNSET),))
+    linear = FreeProblem.of(plain)
+    try:
+        without = replace(coarse, problem=linear).descend(at(linear, values, origin), FIRST_LAP)
+    except FtlmError:
+        # Without any friction it runs away.
+        return out
+    values = {**values, **dict(zip(linear.names, without.values.tolist(), strict=True))}
+    force = driving(coarse.runs, plain.with_coefficients({n: values[n] for n in plain.coefficient_names}))
+    for share in SHARES if force > 0 else ():
+        strength = share * force / -rubs.factor
+        out.append(at(problem, {**values, name: strength}, f"{origin}, friction {share:g} of what drives"))
+    return out
+
+
+def at(problem: FreeProblem, values: dict[str, float], origin: str) -> Attempt:
+    """A start at named values."""
+    orders, coefficients, delays = problem.split([values[n] for n in problem.names])
+    return Attempt(orders, coefficients, origin, {}, delays)
+
+
+def driving(runs: Sequence[Run], structure: Structure) -> float:
+    """Root mean square of the largest force that another signal exerts by itself [unit of D^alpha y]."""
+    item = structure.equations[0]
+    sizes = [0.0]
+    for term in item.terms:
+        if term.signal == item.output or term.order.names or term.order.constant != 0:
+            continue
+        signal = np.concatenate([read(run[term.signal]) for run in runs])
+        sizes.append(abs(term.fixed or 0.0) * float(np.sqrt(np.mean(signal**2))))
+    return max(sizes)

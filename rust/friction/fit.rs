@@ -1,0 +1,250 @@
+//! Output error of a body with friction, by Levenberg–Marquardt: orders, coefficients, and the states of every run.
+
+use super::model::{Evaluation, FrictionModel, Point};
+use crate::dense;
+use crate::error::{check_finite, check_length, Result};
+use crate::estimate::output_error::levenberg_marquardt::{minimise, Problem, Settings, Status};
+use crate::estimate::output_error::Experiment;
+
+/// Where a fit starts.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Start {
+    /// Free orders.
+    pub orders: Vec<f64>,
+    /// Free coefficients.
+    pub coefficients: Vec<f64>,
+    /// States of each run; empty: those that suit the start best.
+    pub states: Vec<Vec<f64>>,
+}
+
+/// The optimum and what describes it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Fit {
+    /// Free orders.
+    pub orders: Vec<f64>,
+    /// Free coefficients.
+    pub coefficients: Vec<f64>,
+    /// States of each run.
+    pub states: Vec<Vec<f64>>,
+    /// The initial terms that they are, (exponent, coefficient), run by run.
+    pub initial: Vec<Vec<(f64, f64)>>,
+    /// Half the weighted sum of squared residuals.
+    pub cost: f64,
+    /// Weighted residuals, run after run.
+    pub residuals: Vec<f64>,
+    /// Their derivatives with respect to orders and coefficients, what states can follow taken out.
+    pub jacobian: Vec<Vec<f64>>,
+    /// Evaluations of residuals.
+    pub evaluations: usize,
+    /// How it ended.
+    pub status: Status,
+}
+
+struct OutputError<'a> {
+    model: &'a FrictionModel,
+    experiments: &'a [Experiment],
+}
+
+impl Problem for OutputError<'_> {
+    type Point = Point;
+    type Evaluation = Evaluation;
+
+    fn evaluate(&self, point: &Point) -> Result<Evaluation> {
+        self.model.evaluate(self.experiments, point)
+    }
+
+    fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
+        &evaluation.residuals
+    }
+
+    fn jacobian(&self, point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
+        self.model.jacobian(self.experiments, point, evaluation, true)
+    }
+
+    fn moved(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
+        let mut next = point.clone();
+        let mut moved: f64 = 0.0;
+        let (orders, rest) = steps.split_at(point.orders.len());
+        let (coefficients, mut states) = rest.split_at(point.coefficients.len());
+        for ((order, &(low, high)), step) in next.orders.iter_mut().zip(&self.model.order_bounds).zip(orders) {
+            let before = *order;
+            *order = (before + step).clamp(low, high);
+            moved = moved.max((*order - before).abs());
+        }
+        let share = |before: f64, after: f64| (after - before).abs() / before.abs().max(f64::MIN_POSITIVE);
+        for (j, (value, step)) in next.coefficients.iter_mut().zip(coefficients).enumerate() {
+            let before = *value;
+            *value = self.model.coordinates[j].shifted(before, *step);
+            if self.model.rubs() == Some(j) {
+                *value = value.max(0.0);
+            }
+            moved = moved.max(share(before, *value));
+        }
+        for run in &mut next.states {
+            let (own, others) = states.split_at(run.len());
+            states = others;
+            for (value, step) in run.iter_mut().zip(own) {
+                moved = moved.max(share(*value, *value + step));
+                *value += step;
+            }
+        }
+        (next, moved)
+    }
+
+    fn stretch(&self, point: &Point, parameter: usize) -> f64 {
+        parameter
+            .checked_sub(point.orders.len())
+            .filter(|j| *j < point.coefficients.len())
+            .map_or(1.0, |j| self.model.coordinates[j].stretch(point.coefficients[j]))
+    }
+
+    /// Orders have bounds, and friction is not negative.
+    fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
+        if let Some(order) = point.orders.get(parameter) {
+            let (low, high) = self.model.order_bounds[parameter];
+            return (order - low, high - order);
+        }
+        let j = parameter - point.orders.len();
+        let plain = self.model.coordinates.get(j).is_some_and(|c| c.stretch(2.0) == 1.0);
+        match self.model.rubs() {
+            Some(rubs) if rubs == j && plain => (point.coefficients[j], f64::INFINITY),
+            _ => (f64::INFINITY, f64::INFINITY),
+        }
+    }
+
+    /// Instants at which the body stops or turns pass from pulse to pulse, whatever moves them.
+    fn kinked(&self, _point: &Point, _parameter: usize) -> bool {
+        true
+    }
+
+    fn size(&self, evaluation: &Evaluation) -> f64 {
+        evaluation.size
+    }
+}
+
+/// The same of one run with everything but its states known.
+struct Begun<'a> {
+    model: &'a FrictionModel,
+    experiment: &'a Experiment,
+    orders: &'a [f64],
+    coefficients: &'a [f64],
+}
+
+impl Begun<'_> {
+    fn at(&self, states: &[f64]) -> Point {
+        Point { orders: self.orders.to_vec(), coefficients: self.coefficients.to_vec(), states: vec![states.to_vec()] }
+    }
+}
+
+impl Problem for Begun<'_> {
+    type Point = Vec<f64>;
+    type Evaluation = Evaluation;
+
+    fn evaluate(&self, states: &Vec<f64>) -> Result<Evaluation> {
+        self.model.evaluate(std::slice::from_ref(self.experiment), &self.at(states))
+    }
+
+    fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
+        &evaluation.residuals
+    }
+
+    fn jacobian(&self, states: &Vec<f64>, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
+        self.model.jacobian(std::slice::from_ref(self.experiment), &self.at(states), evaluation, false)
+    }
+
+    fn moved(&self, states: &Vec<f64>, steps: &[f64]) -> (Vec<f64>, f64) {
+        let next: Vec<f64> = states.iter().zip(steps).map(|(x, step)| x + step).collect();
+        let share = |(x, step): (&f64, &f64)| step.abs() / x.abs().max(f64::MIN_POSITIVE);
+        (next, states.iter().zip(steps).map(share).fold(0.0, f64::max))
+    }
+
+    fn kinked(&self, _states: &Vec<f64>, _parameter: usize) -> bool {
+        true
+    }
+
+    fn size(&self, evaluation: &Evaluation) -> f64 {
+        evaluation.size
+    }
+}
+
+/// Constants at which the states of a run are begun, as shares of its friction: where a body rests hangs on the sign of
+/// what is left of the two, which a descent does not cross.
+const BEGUN: [f64; 3] = [0.0, 0.5, -0.5];
+const BEGUN_SETTINGS: Settings = Settings { evaluations: 30, tolerance: 1e-6 };
+
+/// States of a run at given numbers: the best that descents from its first samples reach.
+fn begun(model: &FrictionModel, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<f64> {
+    let problem = Begun { model, experiment, orders, coefficients };
+    let plain = model.first_states(orders, experiment, 0.0);
+    let mut best = (f64::INFINITY, plain.clone());
+    for share in BEGUN {
+        let start = model.first_states(orders, experiment, share * model.friction.at(coefficients));
+        if share != 0.0 && start == plain {
+            continue;
+        }
+        // One whose run leaves the range of numbers is none.
+        if let Ok(found) = minimise(&problem, start, BEGUN_SETTINGS) {
+            if found.cost < best.0 {
+                best = (found.cost, found.point);
+            }
+        }
+    }
+    best.1
+}
+
+/// Weighted least squares on the output error from a start.
+///
+/// # Errors
+/// A start whose free run is not finite ([`crate::error::Error::Diverged`]); a model that names what is not there,
+/// experiments that do not fit it ([`FrictionModel::check`]).
+pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, settings: Settings) -> Result<Fit> {
+    model.check(experiments)?;
+    check_length("orders", model.order_bounds.len(), start.orders.len())?;
+    check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
+    check_finite("orders of the start", &start.orders)?;
+    check_finite("coefficients of the start", &start.coefficients)?;
+    let orders: Vec<f64> =
+        start.orders.iter().zip(&model.order_bounds).map(|(o, &(low, high))| o.clamp(low, high)).collect();
+    let mut coefficients = start.coefficients.clone();
+    if let Some(j) = model.rubs() {
+        coefficients[j] = coefficients[j].max(0.0);
+    }
+    let count = model.states(&orders).len();
+    let mut states = start.states.clone();
+    if states.len() != experiments.len() || states.iter().any(|s| s.len() != count) {
+        states = experiments.iter().map(|e| begun(model, &orders, &coefficients, e)).collect();
+    }
+    for values in &states {
+        check_finite("states of the start", values)?;
+    }
+    let problem = OutputError { model, experiments };
+    let found = minimise(&problem, Point { orders, coefficients, states }, settings)?;
+    let numbers = found.point.orders.len() + found.point.coefficients.len();
+    let mut basis = Vec::new();
+    for column in &found.jacobian[numbers..] {
+        dense::extend_orthonormal(&mut basis, column.clone(), SPANNED);
+    }
+    let mut jacobian = found.jacobian;
+    jacobian.truncate(numbers);
+    for column in &mut jacobian {
+        for direction in &basis {
+            let along: f64 = direction.iter().zip(column.iter()).map(|(q, v)| q * v).sum();
+            column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
+        }
+    }
+    let Point { orders, coefficients, states } = found.point;
+    Ok(Fit {
+        initial: states.iter().map(|values| model.powers(&orders, &coefficients, values)).collect(),
+        orders,
+        coefficients,
+        states,
+        cost: found.cost,
+        residuals: found.evaluation.residuals,
+        jacobian,
+        evaluations: found.evaluations,
+        status: found.status,
+    })
+}
+
+/// A state whose response lies in the span of the others up to this share adds nothing.
+const SPANNED: f64 = 1e-12;

@@ -1,0 +1,20 @@
+//! Free runs of a body with dry friction, and their output error.
+//!
+//! D^α y = Σ c D^ν s − f sgn(Dy) + … with 1 < α ≤ 2, sgn set-valued at rest. Everything but sgn is linear, so superposition
+//! leaves one scalar problem: the velocity at the edges of the pulses is V = L − f g ∗ s with s ∈ sgn(V), L the velocity
+//! without friction and g what a pulse of force does to it ([`dynamics`]). It is marched pulse by pulse ([`march`]), the
+//! sum over the past by blocked transforms ([`online`]). A body at rest stays exactly at rest while friction can hold it.
+//!
+//! Derivatives follow the march: s stands still while the body slides, and is what holds it while it sticks. Offsets and
+//! the state in which a run starts enter through the velocity, so they are no projection here but numbers of each run.
+
+pub mod dynamics;
+pub mod fit;
+pub mod march;
+mod model;
+pub mod online;
+mod states;
+
+pub use dynamics::{Body, Motion};
+pub use fit::{fit, Fit, Start};
+pub use model::FrictionModel;

@@ -1,0 +1,370 @@
+//! A body with friction whose orders and coefficients are free: its residuals on every experiment, and their derivatives.
+
+use super::dynamics::{product, Body, Integrated, Operators, Run};
+use super::states::{together, Forcing, State};
+use crate::equation::{Initial, Structure, Term};
+use crate::error::{check_length, Error, Result};
+use crate::estimate::output_error::{Coordinate, Experiment, FreeEquation, Monomial};
+use crate::regressors::Record;
+use crate::series::Kernel;
+
+/// What is estimated: one equation, its output alone unknown, with Coulomb friction of that output's velocity.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FrictionModel {
+    /// The linear terms.
+    pub equation: FreeEquation,
+    /// f of − f sgn(Dy).
+    pub friction: Monomial,
+    /// Bounds of each free order.
+    pub order_bounds: Vec<(f64, f64)>,
+    /// Coordinate of each free coefficient.
+    pub coordinates: Vec<Coordinate>,
+    /// Initial terms of each record, and offsets.
+    pub initial: Initial,
+}
+
+/// Values of all that is free.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub(super) struct Point {
+    pub(super) orders: Vec<f64>,
+    pub(super) coefficients: Vec<f64>,
+    /// Of each run.
+    pub(super) states: Vec<Vec<f64>>,
+}
+
+/// Residuals at a point, and what their derivatives are made of.
+pub(super) struct Evaluation {
+    pub(super) residuals: Vec<f64>,
+    pub(super) size: f64,
+    parts: Vec<Part>,
+}
+
+struct Part {
+    operators: Operators,
+    run: Run,
+}
+
+/// Samples from which a run's first velocity is taken.
+const FIRST_SAMPLES: usize = 8;
+
+/// Powers of t move smoothly with orders: the error of a central difference is 1e−10.
+const SHIFT: f64 = 1e-5;
+
+/// What a parameter moves.
+enum Moved {
+    /// A free order, a free coefficient or a state of one run.
+    Order(usize),
+    Coefficient(usize),
+    State(usize, usize),
+}
+
+impl FrictionModel {
+    /// Refuses what names something that is not there, or an experiment that this model cannot be compared with.
+    ///
+    /// # Errors
+    /// [`Error::Structure`], [`Error::Length`].
+    pub fn check(&self, experiments: &[Experiment]) -> Result<()> {
+        let refuse = |what: &str, remedy: &str| Err(Error::Structure { what: what.into(), remedy: remedy.into() });
+        let Some(signals) = experiments.iter().map(|e| e.record.len()).min() else {
+            return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
+        };
+        let known = |c: &Monomial| c.powers.iter().all(|&(i, _)| i < self.coordinates.len());
+        let terms = &self.equation.terms;
+        if self.equation.output >= signals || terms.iter().any(|t| t.0 >= signals || !known(&t.2)) {
+            return refuse("an equation names a signal or a coefficient that is not there", "number them from 0");
+        }
+        if !known(&self.friction) || self.friction.powers.len() > 1 || self.friction.factor < 0.0 {
+            return refuse("friction is no multiple of one free coefficient", "give it one that is not negative");
+        }
+        for order in terms.iter().map(|t| &t.1).chain([&self.equation.order]) {
+            check_length("weights of an order", self.order_bounds.len(), order.weights.len())?;
+        }
+        for experiment in experiments {
+            experiment.check()?;
+            check_length("outputs", 1, experiment.samples.len())?;
+            if experiment.filter.is_some() || experiment.own.is_some() {
+                return refuse("friction behind a filter, or with samples at times of their own", "leave them out");
+            }
+        }
+        self.initial.check()
+    }
+
+    pub(super) fn structure(&self, orders: &[f64]) -> Structure {
+        let at = |law: &crate::equation::AffineOrder| {
+            law.constant + law.weights.iter().zip(orders).map(|(w, x)| w * x).sum::<f64>()
+        };
+        Structure {
+            output: self.equation.output,
+            order: at(&self.equation.order),
+            terms: (self.equation.terms.iter()).map(|(s, o, _)| Term { signal: *s, order: at(o) }).collect(),
+        }
+    }
+
+    fn body(&self, orders: &[f64], coefficients: &[f64]) -> Body {
+        Body {
+            structure: self.structure(orders),
+            coefficients: self.equation.terms.iter().map(|t| t.2.at(coefficients)).collect(),
+            friction: self.friction.at(coefficients),
+        }
+    }
+
+    /// States of every run at these orders.
+    pub(super) fn states(&self, orders: &[f64]) -> Vec<State> {
+        let alpha = &self.equation.order.weights;
+        let moves = |term: usize| {
+            let own = &self.equation.terms[term].1.weights;
+            alpha.iter().zip(own).any(|(a, w)| (a - w).abs() > 0.0)
+        };
+        State::all(&self.structure(orders), &self.initial, moves)
+    }
+
+    /// States of a run as its first samples have them: where the body is and how fast, a constant as given, the rest 0.
+    pub(super) fn first_states(&self, orders: &[f64], experiment: &Experiment, constant: f64) -> Vec<f64> {
+        let samples = experiment.samples.first().map_or(&[][..], Vec::as_slice);
+        let near = &samples[..samples.len().min(FIRST_SAMPLES)];
+        #[allow(clippy::cast_precision_loss)]
+        let (count, step) = (near.len() as f64, experiment.record.step() * experiment.every as f64);
+        let middle = 0.5 * (count - 1.0);
+        let mean = near.iter().sum::<f64>() / count.max(1.0);
+        #[allow(clippy::cast_precision_loss)]
+        let (mut across, mut along) = (0.0, 0.0);
+        for (k, value) in near.iter().enumerate() {
+            #[allow(clippy::cast_precision_loss)]
+            let x = k as f64 - middle;
+            across += x * (value - mean);
+            along += x * x;
+        }
+        let rate = if along > 0.0 { across / along / step } else { 0.0 };
+        let level = mean - rate * middle * step;
+        let alpha = self.structure(orders).order;
+        let value = |state: &State| match state {
+            State::Level => level,
+            State::Rate => rate,
+            State::Offset(0) => constant / libm::tgamma(alpha + 1.0),
+            _ => 0.0,
+        };
+        self.states(orders).iter().map(value).collect()
+    }
+
+    /// The coefficient that friction is a multiple of, if it is free.
+    pub(super) fn rubs(&self) -> Option<usize> {
+        self.friction.powers.first().map(|&(i, _)| i)
+    }
+
+    /// Powers of t of a run's states: (exponent, coefficient).
+    pub(super) fn powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<(f64, f64)> {
+        let body = self.body(orders, coefficients);
+        let own = body.own();
+        together(
+            self.states(orders)
+                .iter()
+                .zip(values)
+                .flat_map(|(state, &x)| state.powers(&body.structure, &own).into_iter().map(move |(e, c)| (e, x * c))),
+        )
+    }
+
+    fn forcing(&self, orders: &[f64], coefficients: &[f64], values: &[f64], record: &Record) -> Forcing {
+        let own = self.body(orders, coefficients).own();
+        Forcing::of(&self.powers(orders, coefficients, values), &own, record.m(), record.step())
+    }
+
+    pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point) -> Result<Evaluation> {
+        let body = self.body(&point.orders, &point.coefficients);
+        // Reported like a step too far, so that a search shortens it.
+        let far = |_| Error::Diverged { what: "orders or friction out of range; the free run".into(), index: 0 };
+        body.check(usize::MAX).map_err(far)?;
+        let mut out = Evaluation { residuals: Vec::new(), size: 0.0, parts: Vec::with_capacity(experiments.len()) };
+        for (experiment, values) in experiments.iter().zip(&point.states) {
+            let operators = Operators::new(&body, &experiment.record);
+            let forcing = self.forcing(&point.orders, &point.coefficients, values, &experiment.record);
+            let run = Run::new(&body, &operators, &forcing)?;
+            let mut residuals = experiment.measured();
+            out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
+            let sampled = experiment.sampled(std::slice::from_ref(&run.output));
+            residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
+            out.residuals.extend(residuals);
+            out.parts.push(Part { operators, run });
+        }
+        Ok(out)
+    }
+
+    /// Derivatives of the residuals with respect to orders, coefficients, then the states of run after run; without
+    /// `numbers` to states alone.
+    pub(super) fn jacobian(
+        &self,
+        experiments: &[Experiment],
+        point: &Point,
+        at: &Evaluation,
+        numbers: bool,
+    ) -> Result<Vec<Vec<f64>>> {
+        let mut all: Vec<Moved> = Vec::new();
+        if numbers {
+            all.extend((0..point.orders.len()).map(Moved::Order));
+            all.extend((0..point.coefficients.len()).map(Moved::Coefficient));
+        }
+        for (run, states) in point.states.iter().enumerate() {
+            all.extend((0..states.len()).map(|state| Moved::State(run, state)));
+        }
+        let body = self.body(&point.orders, &point.coefficients);
+        let mut columns = vec![Vec::with_capacity(at.residuals.len()); all.len()];
+        for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
+            let spectra = Spectra::new(&body, part);
+            for (column, moved) in columns.iter_mut().zip(&all) {
+                if matches!(moved, Moved::State(run, _) if *run != index) {
+                    column.extend(std::iter::repeat_n(0.0, experiment.compared()));
+                    continue;
+                }
+                let slope = self.slope(&body, experiment, part, &spectra, point, index, moved);
+                // Residuals fall where the response rises.
+                column.extend(experiment.sampled(&[slope]).into_iter().map(|v| -v));
+            }
+        }
+        if columns.iter().flatten().any(|v| !v.is_finite()) {
+            return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
+        }
+        Ok(columns)
+    }
+
+    /// How the output's means move with one parameter.
+    #[allow(clippy::too_many_arguments)]
+    fn slope(
+        &self,
+        body: &Body,
+        experiment: &Experiment,
+        part: &Part,
+        spectra: &Spectra,
+        point: &Point,
+        run: usize,
+        moved: &Moved,
+    ) -> Vec<f64> {
+        let (operators, motion, record) = (&part.operators, &part.run, &experiment.record);
+        let (alpha_moves, moves, friction_moves) = self.moves(point, moved);
+        let mut total = self.forcing_slope(point, &point.states[run], record, moved);
+        let mut add = |weight: f64, part: &Integrated| {
+            if weight != 0.0 {
+                total.output.iter_mut().zip(&part.output).for_each(|(s, v)| *s += weight * v);
+                total.velocity.iter_mut().zip(&part.velocity).for_each(|(s, v)| *s += weight * v);
+                total.edges.iter_mut().zip(&part.edges).for_each(|(s, v)| *s += weight * v);
+            }
+        };
+        for (k, (&(dc, deta), &c)) in moves.iter().zip(&body.coefficients).enumerate() {
+            if let (Some(driven), Some((driver, signal))) = (&operators.driven[k], &operators.drivers[k]) {
+                add(dc, driven);
+                if deta != 0.0 {
+                    add(c * deta, &driver.of(signal, 1));
+                }
+            }
+            if let Some(kernels) = &operators.own[k] {
+                if dc != 0.0 {
+                    add(dc, &spectra.own(kernels, 0));
+                }
+                if deta != 0.0 {
+                    add(c * deta, &spectra.own(kernels, 1));
+                }
+            }
+        }
+        add(-friction_moves, &motion.signed);
+        if alpha_moves != 0.0 {
+            add(-body.friction * alpha_moves, &operators.friction.of(&motion.sign, 1));
+        }
+        let through = product(&operators.own_edges, &product(&operators.inverse, &total.velocity));
+        let at_ends: Vec<f64> = through.iter().zip(&total.edges).map(|(a, b)| a + b).collect();
+        let brake = friction_moves * operators.first + body.friction * operators.first_slope(body, alpha_moves, &moves);
+        let signs = motion.march.slope(&at_ends, &operators.response, body.friction, brake, total.start);
+        if let Some(signs) = signs {
+            let held = operators.friction.of(&Kernel::new(&signs), 0);
+            total.output.iter_mut().zip(&held.output).for_each(|(s, v)| *s -= body.friction * v);
+        }
+        product(&operators.inverse, &total.output)
+    }
+
+    /// Derivatives of α, of (coefficient, integration) of each term, and of friction.
+    fn moves(&self, point: &Point, moved: &Moved) -> (f64, Vec<(f64, f64)>, f64) {
+        let terms = &self.equation.terms;
+        match *moved {
+            Moved::Order(j) => {
+                let of = |weights: &[f64]| weights.get(j).copied().unwrap_or(0.0);
+                let alpha = of(&self.equation.order.weights);
+                (alpha, terms.iter().map(|t| (0.0, alpha - of(&t.1.weights))).collect(), 0.0)
+            }
+            Moved::Coefficient(j) => (
+                0.0,
+                terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect(),
+                self.friction.slope(&point.coefficients, j),
+            ),
+            Moved::State(..) => (0.0, vec![(0.0, 0.0); terms.len()], 0.0),
+        }
+    }
+
+    /// How what a run starts with moves: it is linear in states and coefficients, and smooth in orders.
+    fn forcing_slope(&self, point: &Point, values: &[f64], record: &Record, moved: &Moved) -> Forcing {
+        let idle = values.is_empty() || values.iter().all(|x| *x == 0.0);
+        match *moved {
+            Moved::State(_, state) => {
+                let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
+                self.forcing(&point.orders, &point.coefficients, &unit, record)
+            }
+            _ if idle => Forcing::none(record.m()),
+            Moved::Coefficient(j) => {
+                let own = |k: usize| self.equation.terms[k].0 == self.equation.output;
+                let depends = |k: usize| self.equation.terms[k].2.slope(&point.coefficients, j) != 0.0;
+                if !(0..self.equation.terms.len()).any(|k| own(k) && depends(k)) {
+                    return Forcing::none(record.m());
+                }
+                let step = point.coefficients[j].abs().max(1.0);
+                let mut shifted = point.coefficients.clone();
+                shifted[j] += step;
+                difference(
+                    &self.forcing(&point.orders, &shifted, values, record),
+                    &self.forcing(&point.orders, &point.coefficients, values, record),
+                    step,
+                )
+            }
+            Moved::Order(j) => {
+                let shifted = |by: f64| {
+                    let mut orders = point.orders.clone();
+                    orders[j] += by;
+                    self.forcing(&orders, &point.coefficients, values, record)
+                };
+                difference(&shifted(SHIFT), &shifted(-SHIFT), 2.0 * SHIFT)
+            }
+        }
+    }
+}
+
+fn difference(up: &Forcing, down: &Forcing, step: f64) -> Forcing {
+    let mut out = Forcing::none(up.output.len());
+    out.add(1.0 / step, up);
+    out.add(-1.0 / step, down);
+    out
+}
+
+/// Spectra of output and velocity, which own terms take in.
+struct Spectra {
+    output: Option<Kernel>,
+    velocity: Option<Kernel>,
+}
+
+impl Spectra {
+    fn new(body: &Body, part: &Part) -> Self {
+        let any = !body.own().is_empty();
+        Self {
+            output: any.then(|| Kernel::new(&part.run.output)),
+            velocity: any.then(|| Kernel::new(&part.run.velocity)),
+        }
+    }
+
+    /// An own term's share through its kernels (0) or their slopes (1).
+    fn own(&self, kernels: &[Vec<f64>; 4], which: usize) -> Integrated {
+        let [mean, mean_slope, end, end_slope] = kernels;
+        let (means, ends) = if which == 0 { (mean, end) } else { (mean_slope, end_slope) };
+        let of = |spectrum: &Option<Kernel>, kernel: &[f64]| {
+            spectrum.as_ref().map_or_else(|| vec![0.0; kernel.len()], |cached| product(cached, kernel))
+        };
+        Integrated {
+            output: of(&self.output, means),
+            velocity: of(&self.velocity, means),
+            edges: of(&self.velocity, ends),
+        }
+    }
+}

@@ -1,0 +1,79 @@
+//! Free runs of a body with friction, and their output error.
+
+use numpy::PyArray1;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use super::arrays::{initial, record, stacked, structure, InitialArg, RecordArg, StructureArg};
+use super::errors::detached;
+use super::estimate::{coordinates, experiment, free_equation, status, ExperimentArg, FreeEquationArg, MonomialArg};
+use crate::estimate::output_error as joint;
+use crate::friction::march::Phase;
+use crate::friction::{self, Body, FrictionModel, Start};
+
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn friction_respond<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    equation: StructureArg,
+    coefficients: Vec<f64>,
+    strength: f64,
+    terms: Vec<(f64, f64)>,
+) -> PyResult<Bound<'py, PyDict>> {
+    let record = record(&run)?;
+    let inputs = vec![true; record.len()];
+    let body = Body { structure: structure(equation, record.len(), &inputs)?, coefficients, friction: strength };
+    let motion = detached(py, || body.run(&record, &terms))?;
+    let dict = PyDict::new(py);
+    dict.set_item("output", PyArray1::from_vec(py, motion.output))?;
+    dict.set_item("velocity", PyArray1::from_vec(py, motion.velocity))?;
+    dict.set_item("sign", PyArray1::from_vec(py, motion.sign))?;
+    let stuck = motion.phases.iter().map(|phase| *phase == Phase::Stick).collect();
+    dict.set_item("stuck", PyArray1::from_vec(py, stuck))?;
+    Ok(dict)
+}
+
+#[pyfunction]
+#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
+pub fn friction_error<'py>(
+    py: Python<'py>,
+    runs: Vec<ExperimentArg<'py>>,
+    law: FreeEquationArg,
+    strength: MonomialArg,
+    order_bounds: Vec<(f64, f64)>,
+    names: Vec<String>,
+    terms: InitialArg,
+    orders: Vec<f64>,
+    coefficients: Vec<f64>,
+    states: Vec<Vec<f64>>,
+    evaluations: usize,
+    tolerance: f64,
+) -> PyResult<Bound<'py, PyDict>> {
+    let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
+    let model = FrictionModel {
+        equation: free_equation(law),
+        friction: joint::Monomial { factor: strength.0, powers: strength.1 },
+        order_bounds,
+        coordinates: coordinates(&names)?,
+        initial: initial(terms)?,
+    };
+    let start = Start { orders, coefficients, states };
+    let settings = joint::Settings { evaluations, tolerance };
+    let fit = detached(py, || friction::fit(&model, &experiments, &start, settings))?;
+    let dict = PyDict::new(py);
+    dict.set_item("orders", fit.orders)?;
+    dict.set_item("coefficients", fit.coefficients)?;
+    dict.set_item("delays", Vec::<f64>::new())?;
+    dict.set_item("states", fit.states.clone())?;
+    dict.set_item("initial", fit.states.into_iter().map(|states| vec![states]).collect::<Vec<_>>())?;
+    dict.set_item("powers", fit.initial)?;
+    dict.set_item("cost", fit.cost)?;
+    dict.set_item("residuals", PyArray1::from_vec(py, fit.residuals))?;
+    let samples = fit.jacobian.first().map_or(0, Vec::len);
+    let none = fit.jacobian.is_empty() || samples == 0;
+    dict.set_item("jacobian", if none { None } else { Some(stacked(py, &fit.jacobian)?) })?;
+    dict.set_item("evaluations", fit.evaluations)?;
+    dict.set_item("status", status(fit.status))?;
+    Ok(dict)
+}

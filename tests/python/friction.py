@@ -1,0 +1,140 @@
+"""A body on dry friction, computed slowly: sums over the whole past written out, one implicit step an instant.
+
+Nothing here imports the package. D^alpha y = sum of c D^nu y + F(t) - f sgn(Dy), 1 < alpha <= 2, Caputo's derivatives,
+sgn set-valued at rest. In the velocity v = Dy the derivatives are those of Grünwald and Letnikov, of first order in the
+step, and every step solves its own scalar inclusion: what is left of all other forces beyond f moves the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+
+def weights(order: float, count: int) -> np.ndarray:
+    """(-1)^j C(order, j): a derivative for a positive order, an integral for a negative one."""
+    out = np.ones(count)
+    for j in range(1, count):
+        out[j] = out[j - 1] * (1.0 - (order + 1.0) / j)
+    return out
+
+
+def naive_run(
+    force: np.ndarray, step: float, alpha: float, own: Sequence[tuple[float, float]], friction: float,
+    level: float = 0.0, rate: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Position and velocity at the instants of `force`; `own` are (coefficient, order) with orders in [0, alpha)."""
+    count = force.size
+    v, y = np.zeros(count), np.full(count, level)
+    v[0] = rate
+    inertia = weights(alpha - 1.0, count) * step ** (1.0 - alpha)
+    damping = [(c, nu, weights(nu - 1.0, count) * step ** (1.0 - nu)) for c, nu in own]
+    for k in range(1, count):
+        # Everything but this instant's velocity and friction; Caputo's derivative of the velocity does not see `rate`.
+        known = force[k] - inertia[1 : k + 1] @ (v[k - 1 :: -1][:k] - rate) + inertia[0] * rate
+        gain = inertia[0]
+        for c, nu, w in damping:
+            if nu == 0:
+                known += c * y[k - 1]
+                gain -= c * step
+            elif nu < 1:
+                known += c * (w[1:k] @ v[k - 1 : 0 : -1])
+                gain -= c * w[0]
+            else:
+                shift = rate if nu > 1 else 0.0
+                known += c * (w[1 : k + 1] @ (v[k - 1 :: -1][:k] - shift) - w[0] * shift)
+                gain -= c * w[0]
+        v[k] = np.sign(known) * max(abs(known) - friction, 0.0) / gain
+        y[k] = y[k - 1] + step * v[k]
+    return y, v
+
+
+def between_events(
+    force: Callable[[float], float], times: np.ndarray, viscous: float, friction: float, rate: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Mass of 1 with viscous and Coulomb friction, integrated between its events: stops, turns, breaks away."""
+    state, now, end = np.array([0.0, rate]), 0.0, float(times[-1])
+    y, v = np.zeros(times.size), np.zeros(times.size)
+    v[0] = rate
+    side = np.sign(rate)
+    while now < end:
+        if side == 0:
+            fine = np.linspace(now, end, 20001)
+            away = np.flatnonzero(np.abs([force(t) for t in fine]) > friction)
+            until = end if away.size == 0 else float(fine[away[0]])
+            if away.size and away[0] > 0:
+                low, high = float(fine[away[0] - 1]), until
+                for _ in range(60):
+                    middle = 0.5 * (low + high)
+                    low, high = (low, middle) if abs(force(middle)) > friction else (middle, high)
+                until = high
+            held = (times >= now) & (times <= until)
+            y[held], v[held] = state[0], 0.0
+            now, side = until, np.sign(force(until)) if until < end else 0.0
+            if until >= end:
+                break
+        s = side
+
+        def motion(t: float, x: np.ndarray, s: float = s) -> list[float]:
+            return [x[1], force(t) - viscous * x[1] - s * friction]
+
+        def rest(t: float, x: np.ndarray, s: float = s, begun: float = now) -> float:
+            return x[1] if t > begun + 1e-9 else s
+
+        rest.terminal, rest.direction = True, -s
+        inside = times[(times > now) & (times <= end)]
+        found = solve_ivp(motion, (now, end), state, events=rest, rtol=1e-10, atol=1e-12, dense_output=True,
+                          max_step=(end / 500))  # fmt: skip
+        reached = inside[inside <= found.t[-1]]
+        if reached.size:
+            at = [np.searchsorted(times, t) for t in reached]
+            y[at], v[at] = found.sol(reached)
+        now, state = float(found.t[-1]), found.y[:, -1].copy()
+        if found.status == 1:
+            state[1] = 0.0
+            pull = force(now)
+            side = 0.0 if abs(pull) <= friction else float(np.sign(pull))
+    return y, v
+
+
+def regularised(
+    force: Callable[[float], float], times: np.ndarray, viscous: float, friction: float, width: float, rate: float = 0.0
+) -> np.ndarray:
+    """Position of the same mass where sgn is tanh(v / width)."""
+    found = solve_ivp(
+        lambda t, x: [x[1], force(t) - viscous * x[1] - friction * np.tanh(x[1] / width)], (0.0, float(times[-1])),
+        [0.0, rate], method="LSODA", t_eval=times, rtol=1e-9, atol=1e-11, max_step=float(times[-1]) / 2000,
+    )  # fmt: skip
+    return np.asarray(found.y[0])
+
+
+def exact_cart(
+    force: np.ndarray, step: float, viscous: float, friction: float, level: float = 0.0, rate: float = 0.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Position and velocity of a mass of 1 at the instants of a force that holds in between, to rounding.
+
+    Between its events the velocity is an exponential, so the instants of stops and turns are logarithms.
+    """
+    y, v = np.zeros(force.size), np.zeros(force.size)
+    y[0], v[0] = level, rate
+    x, w = level, rate
+    for k in range(force.size - 1):
+        left = step
+        while left > 0:
+            side = np.sign(w)
+            if side == 0:
+                if abs(force[k]) <= friction:
+                    break
+                side = np.sign(force[k])
+            final = (force[k] - side * friction) / viscous
+            gone = left
+            if w != 0 and final * side < 0:
+                gone = min(left, np.log((w - final) / -final) / viscous)
+            decay = np.exp(-viscous * gone)
+            x += final * gone + (w - final) * (1.0 - decay) / viscous
+            w = 0.0 if gone < left else final + (w - final) * decay
+            left -= gone
+        y[k + 1], v[k + 1] = x, w
+    return y, v

@@ -1,0 +1,378 @@
+"""A body that sticks: free runs against closed forms, events and slow stepping; words; estimates with intervals."""
+
+from __future__ import annotations
+
+import json
+from math import gamma
+
+import numpy as np
+import pytest
+
+import friction
+import ftlm
+from ftlm import _core
+from ftlm.errors import DataError, ModelError
+from ftlm.fit.problem import FreeProblem
+from ftlm.fit.streaming import Streaming
+
+BLOCK = "D^2 y = u - fc*sign(D y)"
+CART = "D^2 y = - v D y + g u - fc*sign(D y)"
+
+
+def run_of(force: np.ndarray, step: float, y: np.ndarray | None = None, *, hold: bool = True, name: str = "run"):
+    return ftlm.Run.from_arrays(
+        step=step, inputs={"u": force}, outputs={"y": np.zeros(force.size) if y is None else y},
+        intersample={"u": "zoh" if hold else "foh"}, name=name,
+    )  # fmt: skip
+
+
+def model_of(words: str, **values: float) -> ftlm.Model:
+    orders = {n: v for n, v in values.items() if f"^{n}" in words}
+    structure = ftlm.equation(words, orders=orders, fixed={n: v for n, v in values.items() if n not in orders})
+    return ftlm.Model(structure)
+
+
+def motion(means: np.ndarray, step: float, alpha: float, own, strength: float, powers=()):
+    """The core's march: own are (coefficient, order)."""
+    terms = [(0, order) for _, order in own] + [(1, 0.0)]
+    record = (step, np.stack([np.zeros_like(means), means]), None)
+    return _core.friction_respond(record, (0, alpha, terms), [*(c for c, _ in own), 1.0], strength, list(powers))
+
+
+def level_and_rate(alpha: float, own, level: float, rate: float) -> list[tuple[float, float]]:
+    """Initial terms of Caputo's derivatives: own terms see neither a level nor, above order 1, a velocity."""
+    powers = {0.0: level, 1.0: rate}
+    for c, nu in own:
+        eta = alpha - nu
+        if nu > 0:
+            powers[eta] = powers.get(eta, 0.0) - c * level / gamma(eta + 1)
+        if nu > 1:
+            powers[eta + 1] = powers.get(eta + 1, 0.0) - c * rate / gamma(eta + 2)
+    return list(powers.items())
+
+
+# ------------------------------------------------------------------------------------------------------------ free runs
+
+
+@pytest.mark.parametrize("fc", [0.37, 2.0])
+def test_a_sliding_block_stops_at_its_instant_and_stays(fc: float) -> None:
+    found = motion(np.zeros(400), 0.01, 2.0, [], fc, [(0.0, 0.5), (1.0, 1.0)])
+    times = np.arange(401) * 0.01
+    np.testing.assert_allclose(found["velocity"], np.maximum(1.0 - fc * times, 0.0), atol=1e-12)
+    rest = times >= 1.0 / fc
+    assert np.all(found["velocity"][rest] == 0.0)
+    assert np.ptp(found["output"][rest[:-1]][1:]) < 1e-12
+    assert found["output"][-1] == pytest.approx(0.5 + 0.5 / fc, abs=1e-4)
+
+
+def test_a_body_at_rest_moves_only_where_the_force_exceeds_its_friction() -> None:
+    times = np.arange(2001) * 0.005
+    force = np.sin(times)
+    held = motion(force[:-1], 0.005, 2.0, [(-1.0, 1.0)], 1.0)
+    assert not held["velocity"].any()
+    assert np.max(np.abs(held["output"])) < 1e-12
+    freed = motion(force[:-1], 0.005, 2.0, [(-1.0, 1.0)], 0.6)
+    first = int(np.flatnonzero(freed["velocity"])[0])
+    assert times[first] == pytest.approx(np.arcsin(0.6), abs=0.011)
+    assert np.all(np.abs(freed["sign"]) <= 1.0 + 1e-9)
+
+
+@pytest.mark.parametrize("fc", [0.8, 1.5])
+def test_stops_turns_and_break_aways_are_those_between_events(fc: float) -> None:
+    def force(t):
+        return 2.0 * np.sin(3.0 * t) + 0.3
+
+    times = np.linspace(0.0, 4.0, 2001)
+    _, v = friction.between_events(force, times, 1.0, fc, 1.0)
+    assert np.mean(v == 0.0) > 0.2 or fc < 1.0
+    errors = []
+    for m in (250, 500, 1000):
+        fine = (np.arange(50 * m) + 0.5) * 4.0 / (50 * m)
+        found = motion(force(fine).reshape(m, 50).mean(axis=1), 4.0 / m, 2.0, [(-1.0, 1.0)], fc, [(1.0, 1.0)])
+        assert np.array_equal(found["velocity"][1:][found["stuck"]], np.zeros(found["stuck"].sum()))
+        edges = np.arange(m + 1) * 4.0 / m
+        errors.append(float(np.max(np.abs(found["velocity"] - np.interp(edges, times, v)))))
+    assert errors[0] < 1e-4
+    # The second order: a quarter for half the step, events and all, up to where in its pulse each one lies.
+    assert errors[2] < errors[0] / 7.0
+
+
+@pytest.mark.parametrize(
+    ("alpha", "own"),
+    [(2.0, [(-1.0, 1.0)]), (1.8, [(-1.0, 0.9)]), (1.7, [(-2.0, 0.0), (-0.5, 1.2)]), (1.4, [(-0.3, 0.5)])],
+)
+def test_fractional_bodies_are_those_of_slow_stepping(alpha: float, own) -> None:
+    errors = []
+    for count in (250, 500, 1000):
+        step = 4.0 / count
+        force = 2.0 * np.sin(3.0 * np.arange(count + 1) * step) + 0.3
+        y, v = friction.naive_run(force, step, alpha, own, 0.8, 0.2, 1.0)
+        found = motion(0.5 * (force[1:] + force[:-1]), step, alpha, own, 0.8, level_and_rate(alpha, own, 0.2, 1.0))
+        errors.append(float(np.max(np.abs(found["output"] - 0.5 * (y[1:] + y[:-1])))))
+        # After the first turn, so that both have slid and turned.
+        assert np.ptp(np.sign(v)) == 2.0
+    # The slow one is of first order.
+    assert errors[2] < 0.005
+    assert errors[2] < 0.3 * errors[0]
+
+
+def test_a_steep_tanh_tends_to_it() -> None:
+    def force(t):
+        return 2.0 * np.sin(3.0 * t) + 0.3
+
+    m = 4000
+    step = 4.0 / m
+    times = (np.arange(m) + 0.5) * step
+    exact = motion(force(times), step, 2.0, [(-1.0, 1.0)], 1.5, [(1.0, 1.0)])["output"]
+    at = np.concatenate([[0.0], times[::40]])
+    away = [
+        float(np.max(np.abs(friction.regularised(force, at, 1.0, 1.5, width, 1.0)[1:] - exact[::40])))
+        for width in (1e-1, 1e-2, 1e-3)
+    ]
+    assert away[2] < 2e-3
+    assert away[1] < 0.2 * away[0]
+    assert away[2] < 0.2 * away[1]
+
+
+@pytest.mark.parametrize(
+    ("alpha", "own"), [(2.0, [(-3.0, 1.0)]), (1.8, [(-3.0, 0.9), (-2.0, 0.0)]), (1.3, [(-0.5, 1.1)])]
+)
+def test_without_friction_it_is_the_linear_free_run(alpha: float, own) -> None:
+    means = np.sign(np.sin(np.arange(1000) * 0.03))
+    powers = [(0.0, 0.3), (1.0, -0.2)]
+    record = (0.01, np.stack([np.zeros(1000), means]), None)
+    equation = ((0, alpha, [(0, nu) for _, nu in own] + [(1, 0.0)]), [*(c for c, _ in own), 1.0])
+    linear = _core.respond(record, [equation], [False, True], [powers])[0]
+    found = motion(means, 0.01, alpha, own, 0.0, powers)
+    np.testing.assert_allclose(found["output"], linear, atol=1e-9 * np.max(np.abs(linear)))
+
+
+def test_a_blocked_sum_is_the_plain_sum() -> None:
+    # 5 000 pulses need blocks of 64 to 2 048; the plain march sums over the whole past.
+    rng = np.random.default_rng(5)
+    m, step, alpha, strength = 5000, 0.01, 1.6, 0.7
+    means = np.repeat(rng.normal(size=m // 20), 20)
+    response = step ** (alpha - 1) / gamma(alpha) * np.diff(np.arange(m + 1) ** (alpha - 1.0))
+    linear = np.convolve(response, means)[:m]
+    sign, v, brake = np.zeros(m), 0.0, strength * response[0]
+    edges = [0.0]
+    for k in range(m):
+        p = linear[k] - strength * (response[1 : k + 1][::-1] @ sign[:k])
+        side = np.sign(v) if v else np.sign(p)
+        end = p - brake * side
+        if end * side >= 0 and (v or abs(p) > brake):
+            sign[k] = side
+        elif abs(p - v) <= brake:
+            sign[k], end = p / brake, 0.0
+        else:
+            sign[k] = side * (2.0 * v / (v - end) - 1.0)
+            end = p - brake * sign[k]
+        v = end
+        edges.append(v)
+    found = motion(means, step, alpha, [], strength)
+    np.testing.assert_allclose(found["velocity"], edges, atol=1e-10)
+    assert 0.05 < np.mean(found["stuck"]) < 0.95
+
+
+def test_simulate_stops_where_the_block_does() -> None:
+    force = np.concatenate([np.full(100, 1.0), np.zeros(300)])
+    free = model_of(BLOCK, fc=0.25).simulate(run_of(force, 0.01))
+    times = free.time
+    # 0.75 for one second, then 0.25 against it for three.
+    expected = np.where(times < 1.0, 0.375 * times**2, 0.375 + 0.75 * (times - 1) - 0.125 * (times - 1) ** 2)
+    np.testing.assert_allclose(free["y"], expected, atol=1e-6)
+    later = model_of(BLOCK, fc=1.0).simulate(run_of(force, 0.01))
+    assert not later["y"].any()
+
+
+def test_initial_terms_are_level_and_velocity() -> None:
+    free = model_of(BLOCK, fc=0.5).simulate(run_of(np.zeros(301), 0.01), initial={"y": {0.0: 2.0, 1.0: 1.0}})
+    stop = free.time >= 2.0
+    np.testing.assert_allclose(free["y"][stop], 3.0, atol=1e-6)
+    assert free["y"][0] == 2.0
+
+
+# ------------------------------------------------------------------------------------------------------- sensitivities
+
+
+@pytest.mark.parametrize("orders", [(1.9, 0.9), (1.8, 0.4), (1.95, 1.2)])
+def test_derivatives_are_those_of_finite_differences(orders) -> None:
+    rng = np.random.default_rng(1)
+
+    def experiment(m: int, every: int):
+        u = 2 * np.sin(0.012 * np.arange(m)) + 0.3 * rng.normal(size=m) + 0.2
+        samples = rng.normal(size=(1, m // every + 1))
+        return ((0.004, np.stack([0 * u, u]), None), every, samples, None, [1.3], [(None, False)] * 2, None, None)
+
+    runs = [experiment(400, 1), experiment(600, 2)]
+    law = (0, (0.0, [1.0, 0.0]), [(0, (0.0, [0.0, 1.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0, 0.0]), (1.0, [(1, 1)]))])
+
+    def at(point):
+        return _core.friction_error(
+            runs, law, (1.0, [(2, 1)]), [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 3, (True, [], 1), list(point[:2]),
+            list(point[2:5]), [list(point[5:8]), list(point[8:])], 1, 1e-9,
+        )  # fmt: skip
+
+    point = np.array([*orders, 0.7, 1.1, 0.9, 0.1, 0.2, 0.05, -0.2, 0.4, -0.1])
+    found = np.asarray(at(point)["jacobian"])
+    columns = []
+    for i in range(point.size):
+        step = np.zeros(point.size)
+        step[i] = 1e-6
+        up, down = (np.asarray(at(point + s)["residuals"]) for s in (step, -step))
+        columns.append((up - down) / 2e-6)
+    states = np.linalg.qr(np.array(columns[5:]).T)[0]
+    for k in range(5):
+        expected = columns[k] - states @ (states.T @ columns[k])
+        assert np.linalg.norm(found[k] - expected) < 1e-6 * np.linalg.norm(columns[k])
+
+
+# --------------------------------------------------------------------------------------------------------------- words
+
+
+def test_words_are_read_and_written() -> None:
+    structure = ftlm.equation("D^2 y = - v D y + g u - fc*sign(D y) + c")
+    assert str(structure) == "D^2 y = -v D^1 y + g u - fc sign(D y) + c"
+    assert structure.coefficient_names == ("v", "g", "fc")
+    assert str(ftlm.equation("D^2 y = u - 2 fc sign(D y)")) == "D^2 y = 1.0 u - 2.0 fc sign(D y)"
+    known = ftlm.equation("D^2 y = u - 0.5*sign(D y)")
+    assert known.coefficient_names == ()
+    assert known.equations[0].friction.strength == 0.5
+    again = ftlm.equation(str(structure))
+    assert again == structure
+    assert str(model_of(CART, v=2.0, g=1.5, fc=0.3)) == "D^2 y = -2 D^1 y + 1.5 u - 0.3 sign(D y)"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("D^2 y = u + fc*sign(D y)", "it is subtracted"),
+        ("D^2 y = u - fc*sign(D u)", "own output"),
+        ("D^2 y = u - fc*sign(y)", "D and the name of a signal"),
+        ("D^2 y = u - fc*sign(D y) - fs*sign(D y)", "twice"),
+        ("D^0.8 y = u - fc*sign(D y)", r"outside \(1, 2\]"),
+        ("D^2.2 y = u - fc*sign(D y)", r"outside \(1, 2\]"),
+        ("D^2 y = D^2 u - fc*sign(D y)", "not below alpha"),
+        ("D^2 y = u - fc*sign(D y); D^2 x = y + u", "2 equations"),
+    ],
+)
+def test_words_that_mean_nothing_are_refused(words: str, said: str) -> None:
+    with pytest.raises(ModelError, match=said):
+        ftlm.equation(words)
+
+
+def test_a_negative_coefficient_is_refused() -> None:
+    with pytest.raises(ModelError, match="not negative"):
+        model_of(BLOCK, fc=-0.1)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"initial": "history"}, "initial='caputo'"),
+        ({"delay": {"u": (0.0, 0.1)}}, "delay of u is free"),
+        ({"sensor_filter": ftlm.SensorFilter.low_pass(["y"])}, "sensor filter"),
+    ],
+)
+def test_what_a_march_does_not_know_is_refused(options, said: str) -> None:
+    with pytest.raises(ModelError, match=said):
+        ftlm.equation(BLOCK, **options)
+
+
+def test_a_file_keeps_it(tmp_path) -> None:
+    model = model_of(CART, v=2.0, g=1.5, fc=0.3)
+    path = model.save(tmp_path / "cart.json")
+    assert json.loads(path.read_text())["schema"] == 5
+    again = ftlm.load_model(path)
+    assert again.structure.equations == model.structure.equations
+    assert again.coefficients == {"v": 2.0, "g": 1.5, "fc": 0.3}
+    plain = model_of("D^2 y = - v D y + g u", v=2.0, g=1.5).save(tmp_path / "plain.json")
+    assert json.loads(plain.read_text())["schema"] == 2
+
+
+@pytest.mark.parametrize("method", ["instrumental-variables", "multi-innovation", "least-squares", "genetic"])
+def test_other_methods_refuse_it(method: str) -> None:
+    with pytest.raises(ModelError, match="has friction"):
+        ftlm.identify(cart_run(0)[0], ftlm.equation(CART), method=method)
+
+
+def test_what_is_linear_refuses_it() -> None:
+    model = model_of(CART, v=2.0, g=1.5, fc=0.3)
+    for linear in (model.stability, model.poles, lambda: model.frequency_response([1.0])):
+        with pytest.raises(ModelError, match="has friction"):
+            linear()
+    for export in (lambda: model.to_control(band=(0.1, 10.0)), lambda: ftlm.frequency.transfer_functions(model)):
+        with pytest.raises(ModelError, match="has friction"):
+            export()
+    free = ftlm.equation("D^alpha y = - v D y + g u - fc*sign(D y)")
+    with pytest.raises(ModelError, match="has friction"):
+        ftlm.search_orders(cart_run(0)[0], free)
+    with pytest.raises(ModelError, match="has friction"):
+        Streaming(ftlm.equation(CART), step=0.01, longest=1.0, inputs=["u"])
+    with pytest.raises(ModelError, match="does not know"):
+        ftlm.identify(cart_run(0)[0], ftlm.equation(CART), offset="auto")
+
+
+# ----------------------------------------------------------------------------------------------------------- estimates
+
+
+def cart_run(seed: int, *, noise: float = 0.005, offset: float = 0.0, rate: float = 0.0, rows: int = 801):
+    """A cart with v = 1, g = 1, fc = 0.8 under two sinusoids of held values, in closed form, with white noise."""
+    step = 0.0125
+    times = np.arange(rows) * step
+    rng = np.random.default_rng(seed)
+    first, second = rng.uniform(0.0, 2.0 * np.pi, 2)
+    force = 1.6 * np.sin(2.2 * times + first) + 0.8 * np.sin(5.1 * times + second)
+    clean, v = friction.exact_cart(force + offset, step, 1.0, 0.8, 0.3, rate)
+    samples = clean + noise * np.std(clean) * rng.standard_normal(rows)
+    return run_of(force, step, samples, name=f"cart {seed}"), v
+
+
+def test_friction_is_recovered_with_offsets_a_run(tmp_path) -> None:
+    runs = [cart_run(1, offset=0.15)[0], cart_run(2, offset=-0.1)[0]]
+    found = ftlm.identify(runs, ftlm.equation(CART + " + c", initial="caputo"))
+    for name, truth in {"v": 1.0, "g": 1.0, "fc": 0.8}.items():
+        error = found.standard_errors[name]
+        assert error < 0.03
+        assert abs(found.coefficients[name] - truth) < 4.0 * error + 0.004
+    constants = [o["y"]["constant"] for o in found.comparison.offsets]
+    np.testing.assert_allclose(constants, [0.15, -0.1], atol=0.02)
+    assert found.fit_percent["y"] > 98.5
+    assert np.isnan(found.equation_error["y"].fit)
+    page = found.report(tmp_path / "cart.html").read_text()
+    assert "sgn" in page
+    assert "Coulomb friction" in page
+    again = found.model.compare(runs)
+    assert again.fit_percent["y"] == pytest.approx(found.fit_percent["y"], abs=1e-9)
+
+
+def test_a_velocity_of_one_sign_does_not_tell_friction_from_an_offset() -> None:
+    times = np.arange(401) * 0.01
+    force = 3.0 + np.sin(4.0 * times)
+    y, v = friction.exact_cart(force, 0.01, 1.0, 0.5)
+    assert np.all(v >= 0.0)
+    run = run_of(force, 0.01, y + 1e-3 * np.random.default_rng(0).standard_normal(401))
+    found = ftlm.identify(run, ftlm.equation(CART + " + c", initial="caputo"))
+    assert any("never changes its sign" in w for w in found.warnings)
+
+
+def test_a_run_that_never_moves_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    run = run_of(np.sin(np.arange(400) * 0.02), 0.01, 1e-3 * rng.standard_normal(400))
+    with pytest.raises(DataError, match="never moves"):
+        ftlm.identify(run, ftlm.equation(CART, initial="caputo"))
+
+
+def test_a_free_order_has_bounds_within_which_a_body_has_a_velocity() -> None:
+    for words, bounds in ((CART, []), (CART.replace("D^2", "D^alpha"), [(1.001, 2.0)])):
+        assert list(FreeProblem.of(ftlm.equation(words)).bounds) == bounds
+
+
+@pytest.mark.slow
+def test_a_free_order_stays_where_friction_has_a_velocity() -> None:
+    run = cart_run(3)[0]
+    found = ftlm.identify(run, ftlm.equation(CART.replace("D^2", "D^alpha"), initial="caputo"))
+    assert 1.0 < found.orders["alpha"] <= 2.0
+    assert found.orders["alpha"] == pytest.approx(2.0, abs=0.05)
+    assert found.coefficients["fc"] == pytest.approx(0.8, abs=0.08)
+    assert found.model.structure.equations[0].friction.strength == found.coefficients["fc"]

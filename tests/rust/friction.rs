@@ -1,0 +1,114 @@
+//! A body that sticks: its march against a plain one, closed forms, derivatives against differences, refusals.
+
+use ftlm::equation::{AffineOrder, Initial, Structure, Term};
+use ftlm::error::Error;
+use ftlm::estimate::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
+use ftlm::friction::march::{March, Phase};
+use ftlm::friction::online::{Heads, Online};
+use ftlm::friction::{fit, Body, FrictionModel, Start};
+use ftlm::regressors::Record;
+
+fn body(order: f64, friction: f64) -> Body {
+    let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
+    Body { structure: Structure { output: 0, order, terms }, coefficients: vec![-1.0, 1.0], friction }
+}
+
+fn force(m: usize) -> Vec<f64> {
+    (0..m).map(|k| 2.0 * (0.03 * k as f64).sin() + 0.3 * (0.11 * k as f64).cos()).collect()
+}
+
+#[test]
+fn sums_over_the_past_are_the_plain_ones() {
+    let (kernel, signal) = (force(1000), force(1500).split_off(500));
+    let heads = Heads::new(&kernel);
+    let mut online = Online::new(&heads);
+    for (k, &x) in signal.iter().enumerate() {
+        let plain: f64 = (0..k).map(|j| kernel[k - j] * signal[j]).sum();
+        assert!((online.past() - plain).abs() < 1e-10, "{k}");
+        online.push(x);
+    }
+    assert_eq!(online.into_signal(), signal);
+}
+
+#[test]
+fn a_march_obeys_its_law() {
+    let m = 3000;
+    let response: Vec<f64> = (0..m).map(|n| 0.01 * (-0.002 * n as f64).exp()).collect();
+    let linear: Vec<f64> = force(m);
+    let strength = 3.0;
+    let march = March::new(&linear, &Heads::new(&response), response[0], strength, 0.0);
+    assert!(march.phases.contains(&Phase::Stick) && march.phases.contains(&Phase::Slip));
+    for k in 0..m {
+        let past: f64 = (0..=k).map(|j| response[k - j] * march.sign[j]).sum();
+        assert!((march.edges[k + 1] - (linear[k] - strength * past)).abs() < 1e-9, "{k}");
+        assert!(march.sign[k].abs() <= 1.0 + 1e-9);
+        match march.phases[k] {
+            Phase::Stick => assert_eq!(march.edges[k + 1], 0.0),
+            Phase::Slip => assert!(march.sign[k] * march.edges[k + 1] >= 0.0 && march.sign[k].abs() == 1.0),
+            Phase::Turn => assert!(march.edges[k] * march.edges[k + 1] < 0.0),
+        }
+    }
+}
+
+#[test]
+fn what_never_leaves_its_rest_is_where_it_was() -> Result<(), Error> {
+    let record = Record::new(0.01, vec![vec![0.0; 400], force(400)], None)?;
+    let motion = body(2.0, 2.5).run(&record, &[(0.0, 0.7), (1.0, 0.7)])?;
+    assert!(motion.velocity.iter().all(|v| *v == 0.0));
+    assert!(motion.output.iter().all(|y| (y - 0.7).abs() < 1e-15));
+    Ok(())
+}
+
+#[test]
+fn its_numbers_are_found_again() -> Result<(), Error> {
+    let m = 600;
+    let record = Record::new(0.02, vec![vec![0.0; m], force(m)], None)?;
+    let truth = body(1.9, 0.8);
+    let output = truth.run(&record, &[])?.output;
+    let experiment = Experiment::new(record, 1, vec![ftlm::means::point_samples(&output)], vec![1.0])?;
+    let order = |constant: f64, weight: f64| AffineOrder { constant, weights: vec![weight] };
+    let free = |i: usize, factor: f64| Monomial { factor, powers: vec![(i, 1)] };
+    let model = FrictionModel {
+        equation: FreeEquation {
+            output: 0,
+            order: order(0.0, 1.0),
+            terms: vec![(0, order(1.0, 0.0), free(0, -1.0)), (1, order(0.0, 0.0), free(1, 1.0))],
+        },
+        friction: free(2, 1.0),
+        order_bounds: vec![(1.2, 2.0)],
+        coordinates: vec![Coordinate::Plain; 3],
+        initial: Initial::Rest,
+    };
+    let start = Start { orders: vec![2.0], coefficients: vec![0.7, 1.2, 0.5], states: vec![] };
+    let found =
+        fit(&model, std::slice::from_ref(&experiment), &start, Settings { evaluations: 200, tolerance: 1e-14 })?;
+    assert!((found.orders[0] - 1.9).abs() < 1e-5, "{:?}", found.orders);
+    for (value, truth) in found.coefficients.iter().zip([1.0, 1.0, 0.8]) {
+        assert!((value - truth).abs() < 1e-4, "{:?}", found.coefficients);
+    }
+    let strange = FrictionModel { friction: Monomial { factor: -1.0, powers: vec![] }, ..model.clone() };
+    assert!(matches!(strange.check(&[experiment]), Err(Error::Structure { .. })));
+    assert!(matches!(model.check(&[]), Err(Error::Length { .. })));
+    Ok(())
+}
+
+#[test]
+fn what_has_no_velocity_is_refused() -> Result<(), Error> {
+    let record = Record::new(0.01, vec![vec![0.0; 50], vec![1.0; 50]], None)?;
+    for wrong in [body(1.0, 0.5), body(2.3, 0.5), body(2.0, -0.5)] {
+        assert!(matches!(wrong.run(&record, &[]), Err(Error::OutOfRange { .. })));
+    }
+    let mut fast = body(1.5, 0.5);
+    fast.structure.terms[1].order = 1.5;
+    assert!(matches!(fast.run(&record, &[]), Err(Error::OutOfRange { .. })));
+    let mut lost = body(1.5, 0.5);
+    lost.coefficients[0] = f64::NAN;
+    assert!(lost.run(&record, &[]).is_err());
+    // Pushed away from where it is held: nothing is left of the digits of a run without friction.
+    let mut tipping = body(2.0, 5.0);
+    tipping.structure.terms[0].order = 0.0;
+    tipping.coefficients[0] = 400.0;
+    let long = Record::new(0.05, vec![vec![0.0; 400], vec![1.0; 400]], None)?;
+    assert!(matches!(tipping.run(&long, &[]), Err(Error::Diverged { .. })));
+    Ok(())
+}
