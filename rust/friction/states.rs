@@ -104,7 +104,7 @@ impl State {
     /// Those of a run; `free` says of which term or of α (none) the integration moves with an order.
     pub(super) fn all(structure: &Structure, initial: &Initial, free: impl Fn(usize) -> bool) -> Vec<Self> {
         let mut all = match initial.under() {
-            Initial::Rest | Initial::Offset { .. } => Vec::new(),
+            Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => Vec::new(),
             Initial::Powers(powers) => powers.iter().map(|&e| Self::Power(e)).collect(),
             Initial::Caputo => {
                 let mut all = vec![Self::Level, Self::Rate];
