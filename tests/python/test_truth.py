@@ -256,7 +256,8 @@ def test_a_richer_equation_never_fits_worse_than_a_simpler_one() -> None:
     run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": noisy})
     rest = {"initial": "rest"}
     simple = ftlm.identify(run, ftlm.equation("D^alpha y = a0 y + b0 u", **rest))
-    rich = ftlm.identify(run, ftlm.equation("D^alpha y = a2 D^kappa y + a1 D^nu y + a0 y + b0 u", **rest))
+    structure = ftlm.equation("D^alpha y = a2 D^kappa y + a1 D^nu y + a0 y + b0 u", **rest)
+    rich = ftlm.identify(run, structure, intervals="quadratic")
     assert rich.joint.noise["y"] <= simple.joint.noise["y"] * (1 + 1e-4)
     # What it does not need it cannot tell, and says so.
     assert any("cannot be told" in w or "not different from 0" in w for w in rich.warnings)

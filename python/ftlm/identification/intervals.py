@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from ftlm.base.arrays import Floats
 from ftlm.base.checks import real_number
 from ftlm.base.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.data.run import Run
@@ -45,6 +48,9 @@ def with_intervals(
         found = profiled(valley, names, PRINTED, threads=threads, progress=progress)
         if found.lower is None or turn == REFITS:
             break
+        if not is_lower(valley, joint.on_grid, found.lower):
+            # What only this grid carries is a mode of the scheme; along it the cost tells nothing of the numbers.
+            return joint, warnings
         start = dict(zip(problem.names, found.lower.tolist(), strict=True))
         tried, level = len(joint.starts), joint.noise
         try:
@@ -58,6 +64,15 @@ def with_intervals(
             f"{after} now): there may be others"
         ]
     return replace(joint, profiles=found.intervals), warnings
+
+
+def is_lower(valley: Valley, before: Floats, after: Floats) -> bool:
+    """Whether a point leads to a lower cost than another one on the next finer grid, too."""
+    try:
+        first, second = (Valley.at(valley.grid.finer, values, np.zeros_like(values)) for values in (before, after))
+    except FtlmError:
+        return False
+    return float(second.best.outcome["cost"]) < float(first.best.outcome["cost"])
 
 
 def valley_of(result: Judged) -> Valley:

@@ -11,7 +11,7 @@ from ftlm.data.run import Run
 from ftlm.fit.recursion import Trace
 from ftlm.identification.result import Identification
 from ftlm.judge.comparison import Comparison
-from ftlm.judge.metrics import Metrics
+from ftlm.judge.metrics import Metrics, finite
 from ftlm.model.model import Model
 from ftlm.paper.arm import truth_of
 
@@ -56,7 +56,7 @@ class Candidate:
         return {
             "orders": {n: float(v) for n, v in self.model.orders.items()},
             "coefficients": {n: float(v) for n, v in self.model.coefficients.items()},
-            "intervals": {} if result is None else {n: list(i) for n, i in result.intervals.items()},
+            "intervals": {} if result is None else {n: list(map(finite, i)) for n, i in result.intervals.items()},
             "estimation": self.estimation.to_dict(),
             "validation": None if self.validation is None else self.validation.to_dict(),
             "alone": {run: {o: f.to_dict() for o, f in figures.items()} for run, figures in self.alone.items()},
