@@ -145,8 +145,12 @@ class Valley:
                 worst = max(worst, abs(self.rise(i, float(left @ left)) / width - 1.0))
         return worst
 
-    def end(self, i: int, side: float, width: float, stop: threading.Event | None = None) -> End:
+    def end(
+        self, i: int, side: float, width: float, stop: threading.Event | None = None, most: int | None = None
+    ) -> End | None:
         """The end of a number's interval on one side, by Newton's method between what is in and what is out.
+
+        None where it would take more than ``most`` free runs.
 
         At a refit the cost's slope along the number alone is the slope of the profile; the root of its rise is linear
         where the cost is a parabola, so that one refit finds the end there.
@@ -164,7 +168,12 @@ class Valley:
                 break
             if stop is not None and stop.is_set():
                 raise KeyboardInterrupt
-            there, following = self.refitted(i, start + side * way, within), math.inf
+            lap = LAP if most is None else min(LAP, most - evaluations)
+            if lap <= 0:
+                return None
+            there, following = self.refitted(i, start + side * way, within, lap), math.inf
+            if there is None:
+                evaluations += lap
             rise = math.inf
             if there is not None:
                 evaluations += int(there.outcome["evaluations"])
@@ -203,7 +212,7 @@ class Valley:
         risen = math.isfinite(outside) and any(r >= width**2 for _, r in points)
         return End(start + side * outside if risen else side * math.inf, points, evaluations)
 
-    def refitted(self, i: int, value: float, near: Attempt) -> Attempt | None:
+    def refitted(self, i: int, value: float, near: Attempt, lap: int = LAP) -> Attempt | None:
         """The optimum of all others at a value of one number, followed from a point nearby; None where there is none.
 
         Raises
@@ -215,7 +224,7 @@ class Valley:
         least = 2.0 * float(self.best.outcome["cost"])
         for point in self._starts(i, value, near):
             try:
-                there = self._descended(i, point, LAP, EXACT * rise / max(least, rise))
+                there = self._descended(i, point, lap, EXACT * rise / max(least, rise))
             except FtlmError:
                 continue
             if 2.0 * float(there.outcome["cost"]) < least - LOWER * rise:
@@ -288,15 +297,18 @@ class Profiles:
         By name.
     lower
         Values of everything free at an optimum that is lower than the fit's; None where there is none worth a fit.
+    left
+        Names of numbers whose profile would have taken more free runs than were allowed.
     """
 
     intervals: dict[str, ProfileInterval]
     lower: Floats | None = None
+    left: tuple[str, ...] = ()
 
 
 def profiled(
     valley: Valley, names: Sequence[str], level: float, *, threads: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Callable[[int, int], None] | None = None, most: int | None = None,
 ) -> Profiles:  # fmt: skip
     """Profile intervals of some of a fit's numbers.
 
@@ -313,6 +325,8 @@ def profiled(
         Probability between 0 and 1.
     threads, progress
         Threads, and what is called with (ends found, ends in all).
+    most
+        Free runs that an end may take at most; None for as many as it needs.
 
     Raises
     ------
@@ -321,7 +335,7 @@ def profiled(
     """
     start = valley
     for _ in range(DESCENTS):
-        ends = _ends(valley, names, level, threads, progress)
+        ends = _ends(valley, names, level, threads, progress, most)
         below = [e.attempt for e in ends.values() if isinstance(e, _LowerError)]
         if not below:
             break
@@ -331,8 +345,9 @@ def profiled(
     fall = 2.0 * (float(start.best.outcome["cost"]) - float(valley.best.outcome["cost"]))
     known = valley.units[np.isfinite(valley.units)]
     lower = valley.best.values if known.size and fall > WORTH * float(np.median(known)) else None
-    found = {}
-    for name in names:
+    found: dict[str, ProfileInterval] = {}
+    left = tuple(n for n in names if any(ends.get((n, side), 0) is None for side in (-1.0, 1.0)))
+    for name in (n for n in names if n not in left):
         both = [e for e in (ends.get((name, side)) for side in (-1.0, 1.0)) if isinstance(e, End)]
         if len(both) < 2:
             found[name] = ProfileInterval(-math.inf, math.inf, level)
@@ -343,23 +358,24 @@ def profiled(
         low, high = (min(max(v, first), last) if math.isfinite(v) else v for v in (low, high))
         points = tuple(sorted([*both[0].points, *both[1].points]))
         found[name] = ProfileInterval(low, high, level, points, sum(e.evaluations for e in both))
-    return Profiles(found, lower)
+    return Profiles(found, lower, left)
 
 
 def _ends(
-    valley: Valley, names: Sequence[str], level: float, threads: int, progress: Callable[[int, int], None] | None
-) -> dict[tuple[str, float], End | _LowerError]:
+    valley: Valley, names: Sequence[str], level: float, threads: int, progress: Callable[[int, int], None] | None,
+    most: int | None,
+) -> dict[tuple[str, float], End | _LowerError | None]:  # fmt: skip
     """Both ends of every number that the runs see, or the lower optimum that the way there led to."""
     width, stop = half_width(level), threading.Event()
     asked = [(n, side) for n in names if valley.seen(valley.names.index(n)) for side in (-1.0, 1.0)]
 
-    def found(one: tuple[str, float]) -> End | _LowerError:
+    def found(one: tuple[str, float]) -> End | _LowerError | None:
         try:
-            return valley.end(valley.names.index(one[0]), one[1], width, stop)
+            return valley.end(valley.names.index(one[0]), one[1], width, stop, most)
         except _LowerError as lower:
             return lower
 
-    out: dict[tuple[str, float], End | _LowerError] = {}
+    out: dict[tuple[str, float], End | _LowerError | None] = {}
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         try:
             for one, end in zip(asked, pool.map(found, asked), strict=True):

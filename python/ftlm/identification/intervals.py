@@ -22,6 +22,8 @@ from ftlm.identification.judged import Judged
 PRINTED = 0.95
 #: How often a fit goes on from a lower optimum that its intervals came upon.
 REFITS = 2
+#: Pulses that may be spent on profiles nobody asked for, all numbers together, and free runs on an end at least.
+UNASKED, FEWEST = 3_000_000, 20
 
 
 def with_intervals(
@@ -45,7 +47,9 @@ def with_intervals(
             # No finite free run where the weights of the last descent are taken anew: what is known stays.
             return joint, warnings
         names = valley.names if intervals == "profile" else bent_numbers(valley, PRINTED)
-        found = profiled(valley, names, PRINTED, threads=threads, progress=progress)
+        runs_allowed = UNASKED // (joint.samples * joint.refinement)
+        most = None if intervals == "profile" else max(runs_allowed // max(2 * len(names), 1), FEWEST)
+        found = profiled(valley, names, PRINTED, threads=threads, progress=progress, most=most)
         if found.lower is None or turn == REFITS:
             break
         if not is_lower(valley, joint.on_grid, found.lower):
@@ -63,6 +67,11 @@ def with_intervals(
             f"none of {tried} starts led to this optimum, but the search for intervals did (residuals {before} before, "
             f"{after} now): there may be others"
         ]
+    if found.left:
+        warnings.append(
+            f"the cost is no parabola along {', '.join(found.left)}, and its profile there would take long: these "
+            "intervals are rough; intervals='profile' finds them"
+        )
     return replace(joint, profiles=found.intervals), warnings
 
 
