@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import real_number
 from ftlm.base.errors import ConvergenceError, FtlmError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.settings import Intervals, Loss
+from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
@@ -52,7 +51,7 @@ def with_intervals(
         found = profiled(valley, names, PRINTED, threads=threads, progress=progress, most=most)
         if found.lower is None or turn == REFITS:
             break
-        if not is_lower(valley, joint.on_grid, found.lower):
+        if not is_lower(valley.grid, joint.on_grid, found.lower):
             # What only this grid carries is a mode of the scheme; along it the cost tells nothing of the numbers.
             return joint, warnings
         start = dict(zip(problem.names, found.lower.tolist(), strict=True))
@@ -75,13 +74,20 @@ def with_intervals(
     return replace(joint, profiles=found.intervals), warnings
 
 
-def is_lower(valley: Valley, before: Floats, after: Floats) -> bool:
-    """Whether a point leads to a lower cost than another one on the next finer grid, too."""
-    try:
-        first, second = (Valley.at(valley.grid.finer, values, np.zeros_like(values)) for values in (before, after))
-    except FtlmError:
-        return False
-    return float(second.best.outcome["cost"]) < float(first.best.outcome["cost"])
+def is_lower(grid: Grid, before: Floats, after: Floats) -> bool:
+    """Whether one point costs less than another on the next finer grid as well.
+
+    There they are only evaluated: a mode of the scheme would settle on that grid anew.
+    """
+    finer, costs = grid.finer, []
+    for values in (before, after):
+        orders, coefficients, delays = grid.problem.split(values.tolist())
+        try:
+            there = finer.descend(Attempt(orders, coefficients, "finer grid", {}, delays), 1, plain=True)
+        except FtlmError:
+            return False
+        costs.append(float(there.outcome["cost"]))
+    return costs[1] < costs[0]
 
 
 def valley_of(result: Judged) -> Valley:
