@@ -264,6 +264,23 @@ def test_numbers_that_are_known_well_are_not_profiled(bent: ftlm.Run) -> None:
         np.testing.assert_allclose((own.low, own.high), (low, high), atol=0.05 * (high - low))
 
 
+def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
+    bent: ftlm.Run, found: ftlm.Identification, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ftlm.identification.intervals.UNASKED", 0)
+    monkeypatch.setattr("ftlm.identification.intervals.FEWEST", 1)
+    structure = found.task.structure
+    short = ftlm.identify(bent, structure)
+    assert "c" not in short.profiles
+    (said,) = [w for w in short.warnings if "its profile there would take long" in w]
+    assert "along c" in said
+    assert "intervals='profile'" in said
+    half = 1.959963984540054 * short.standard_errors["c"]
+    assert short.intervals["c"] == pytest.approx((short.coefficients["c"] - half, short.coefficients["c"] + half))
+    # Asked for, it takes what it needs.
+    assert "c" in ftlm.identify(bent, structure, intervals="profile").profiles
+
+
 def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
     u = switched(200, 20)
     run = record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.01, 8)

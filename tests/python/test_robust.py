@@ -7,12 +7,13 @@ from math import gamma
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from scipy.signal import lfilter, lsim
 
 import ftlm
 from ftlm import _core
 from ftlm.base.colour import colour_covariances, coloured
-from ftlm.base.statistics import NORMAL_95, autocovariances, is_white
+from ftlm.base.statistics import BEND, MAD, NORMAL_95, autocovariances, huber_excess, is_white
 from ftlm.data.readings import Readings, bridged, places_on_grid
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.joint import fit_output_error
@@ -433,6 +434,22 @@ def test_one_outlier_that_holds_most_of_the_squares_is_named() -> None:
     u, y = noisy(3)
     y[150] += 0.06 * np.std(y)
     assert not [w for w in ftlm.identify(run_of(u, y), ftlm.equation(FREE)).warnings if "huber" in w]
+
+
+def test_the_excess_of_a_smaller_model_is_chi_squared_whatever_a_few_outliers_are() -> None:
+    """Eight numbers that explain nothing, fitted by SciPy's least squares under Huber's loss."""
+    excess = []
+    for seed in range(60):
+        rng = np.random.default_rng([77, seed])
+        columns, noise = rng.standard_normal((400, 8)), rng.standard_normal(400)
+        noise[:2] += 1000.0
+        scale = float(np.median(np.abs(noise))) / MAD
+        fit = least_squares(lambda x, c=columns, e=noise: e - c @ x, np.zeros(8), loss="huber", f_scale=BEND * scale)
+        excess.append(huber_excess(noise, noise - columns @ fit.x))
+    # Mean and variance of chi-squared of 8 degrees are 8 and 16.
+    assert abs(np.mean(excess) - 8.0) < 4 * np.sqrt(16 / 60)
+    assert 8 < np.var(excess) < 32
+    assert huber_excess(np.full(5, np.inf), np.ones(5)) == np.inf
 
 
 def test_huber_is_the_minimum_of_its_loss() -> None:

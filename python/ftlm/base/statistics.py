@@ -52,6 +52,14 @@ def robust_deviation(values: Floats) -> float:
     return float(np.median(np.abs(values))) / MAD if values.size else 0.0
 
 
+def orthonormal(columns: Floats, least: float) -> Floats:
+    """An orthonormal basis of columns of any size; what is left of one below a share ``least`` is rounding."""
+    sizes = np.linalg.norm(columns, axis=0)
+    directions, spread, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
+    kept: Floats = directions[:, spread > least * spread[0]]
+    return kept
+
+
 def huber_excess(few: Floats, many: Floats) -> float:
     """By how much Huber's loss of residuals exceeds that of residuals of a larger model, in units of their noise.
 

@@ -12,7 +12,7 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.colour import autoregression
 from ftlm.base.errors import FtlmError
-from ftlm.base.statistics import LEVEL, ROUNDING, chi_squared
+from ftlm.base.statistics import LEVEL, ROUNDING, chi_squared, orthonormal
 from ftlm.data.equations import Term
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
@@ -127,7 +127,7 @@ def offset_test(
     before = np.stack(columns, axis=1)
     sizes = np.linalg.norm(before, axis=0)
     left = before / np.where(sizes > 0, sizes, 1.0)
-    basis = _orthonormal(others.T) if others.size else np.zeros((residuals.size, 0))
+    basis = orthonormal(others.T, 1e-12) if others.size else np.zeros((residuals.size, 0))
     for _ in range(2):
         left = left - basis @ (basis.T @ left)
     directions, spread, _ = np.linalg.svd(left, full_matrices=False)
@@ -173,13 +173,6 @@ def _blocks(grid: Grid) -> list[list[tuple[int, int]]]:
             at += count
         blocks.append(own)
     return blocks
-
-
-def _orthonormal(columns: Floats) -> Floats:
-    sizes = np.linalg.norm(columns, axis=0)
-    directions, spread, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
-    kept: Floats = directions[:, spread > 1e-12 * spread[0]]
-    return kept
 
 
 def _coloured(directions: Floats, noise: Floats, blocks: list[list[tuple[int, int]]], degrees: int) -> Floats:

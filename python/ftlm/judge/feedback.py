@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.statistics import chi_squared
+from ftlm.base.statistics import chi_squared, orthonormal
 from ftlm.judge.metrics import finite
 
 #: Future samples of the input that are looked at: an answer within a few samples hides among many.
@@ -129,7 +129,7 @@ def _statistic(
     target = np.concatenate(residuals)
     if target.size < 2 * (past.shape[1] + future.shape[1]):
         return None
-    basis = _basis(past)
+    basis = orthonormal(past, SPANNED)
     left = target - basis @ (basis.T @ target)
     own = np.linalg.norm(future, axis=0)
     future = future - basis @ (basis.T @ future)
@@ -140,7 +140,7 @@ def _statistic(
         kept = future[:, : horizon + 1 - first][:, new[: horizon + 1 - first]]
         if not kept.size:
             continue
-        seen = _basis(kept)
+        seen = orthonormal(kept, SPANNED)
         explained, total = float(np.sum((seen.T @ left) ** 2)), float(left @ left)
         degrees = target.size - basis.shape[1] - seen.shape[1]
         rest = (total - explained) / degrees
@@ -150,11 +150,3 @@ def _statistic(
         if worst is None or found[0] / found[1] > worst[0] / worst[1]:
             worst = found
     return worst
-
-
-def _basis(columns: Floats) -> Floats:
-    """An orthonormal basis of columns; what is left of one below a millionth of it is rounding."""
-    sizes = np.linalg.norm(columns, axis=0)
-    directions, spread, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
-    kept: Floats = directions[:, spread > SPANNED * spread[0]]
-    return kept
