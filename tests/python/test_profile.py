@@ -247,8 +247,10 @@ def test_progress_counts_ends_and_stops_the_work(found: ftlm.Identification) -> 
         found.profile(threads=2, progress=interrupt)
     stop = threading.Event()
     stop.set()
+    search = valley_of(found).end(0, 1.0, half_width(0.95), stop)
+    next(search)
     with pytest.raises(KeyboardInterrupt):
-        valley_of(found).end(0, 1.0, half_width(0.95), stop)
+        search.send(1000)
 
 
 def test_numbers_that_are_known_well_are_not_profiled(bent: ftlm.Run) -> None:
@@ -268,7 +270,7 @@ def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
     bent: ftlm.Run, found: ftlm.Identification, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ftlm.identification.intervals.UNASKED", 0)
-    monkeypatch.setattr("ftlm.identification.intervals.FEWEST", 1)
+    monkeypatch.setattr("ftlm.identification.intervals.FEWEST", 6)
     structure = found.task.structure
     short = ftlm.identify(bent, structure)
     assert "c" not in short.profiles
@@ -279,6 +281,20 @@ def test_a_profile_that_nobody_asked_for_is_left_where_it_takes_long(
     assert short.intervals["c"] == pytest.approx((short.coefficients["c"] - half, short.coefficients["c"] + half))
     # Asked for, it takes what it needs.
     assert "c" in ftlm.identify(bent, structure, intervals="profile").profiles
+
+
+def test_what_one_end_does_not_need_goes_to_the_others(found: ftlm.Identification) -> None:
+    valley = valley_of(found)
+    free = profiled(valley, valley.names, 0.95)
+    took = {n: i.evaluations for n, i in free.intervals.items()}
+    # Dealt out evenly alone, this budget would not do for the number that takes most.
+    scarce = sum(took.values()) + 10 * len(took)
+    assert max(took.values()) > scarce / len(took)
+    dealt = profiled(valley, valley.names, 0.95, most=scarce)
+    assert dealt.left == ()
+    for name, interval in dealt.intervals.items():
+        assert (interval.low, interval.high) == (free.intervals[name].low, free.intervals[name].high)
+    assert max(took, key=took.__getitem__) in profiled(valley, valley.names, 0.95, most=max(took.values())).left
 
 
 def test_a_number_that_is_not_seen_has_the_whole_line() -> None:
@@ -411,7 +427,7 @@ def test_the_link_of_the_real_arm_is_bounded_from_one_side_alone() -> None:
         units=run.units, intersample={"theta11": "foh"},
     )  # fmt: skip
     words = "D^2 theta12 = d D^mu theta12 + a theta12 + b D^2 theta11"
-    link = ftlm.identify(thin, ftlm.equation(words, initial="caputo"), threads=1, intervals="profile")
+    link = ftlm.identify(thin, ftlm.equation(words, initial="caputo"), threads=1)
     assert link.standard_errors["d"] > 100 * abs(link.coefficients["d"])
     d, a, mu = (link.profiles[n] for n in ("d", "a", "mu"))
     assert d.low == -math.inf

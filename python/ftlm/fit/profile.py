@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from statistics import NormalDist
@@ -36,6 +36,8 @@ FOUND = 0.02
 #: Evaluations of one refit, and refits an end at most.
 LAP = 120
 REFITS = 40
+#: Free runs below which an end is not gone on with.
+LEAST_SHARE = 10
 #: An end that far out, in half-widths of the quadratic interval, is none: the cost does not rise.
 FARTHEST = 1e3
 #: The first step is that of the quadratic picture or the number itself, but not below this share of the former; a
@@ -145,12 +147,11 @@ class Valley:
                 worst = max(worst, abs(self.rise(i, float(left @ left)) / width - 1.0))
         return worst
 
-    def end(
-        self, i: int, side: float, width: float, stop: threading.Event | None = None, most: int | None = None
-    ) -> End | None:
-        """The end of a number's interval on one side, by Newton's method between what is in and what is out.
+    def end(self, i: int, side: float, width: float, stop: threading.Event | None = None) -> Search:
+        """The search for the end of a number's interval on one side, by Newton's method between in and out.
 
-        None where it would take more than ``most`` free runs.
+        It asks, as a generator, for the free runs that it may have taken in all by the next refit, tells whenever these
+        do not suffice how many it took, and returns the end.
 
         At a refit the cost's slope along the number alone is the slope of the profile; the root of its rise is linear
         where the cost is a parabola, so that one refit finds the end there.
@@ -163,20 +164,23 @@ class Valley:
         within, inside, outside = self.best, 0.0, math.inf
         way, points, evaluations = min(first, farthest), [], 0
         reached, gained = 0.0, math.inf
+        allowed = yield 0
         for _ in range(REFITS):
             if not way > inside:
                 break
             if stop is not None and stop.is_set():
                 raise KeyboardInterrupt
-            lap = LAP if most is None else min(LAP, most - evaluations)
-            if lap <= 0:
-                return None
-            there, following = self.refitted(i, start + side * way, within, lap), math.inf
-            if there is None:
-                evaluations += lap
+            while True:
+                lap = max(min(LAP, allowed - evaluations), 0)
+                there, following = self.refitted(i, start + side * way, within, lap) if lap > 0 else None, math.inf
+                took = lap if there is None else int(there.outcome["evaluations"])
+                evaluations += took
+                if lap == LAP or took < lap:
+                    break
+                # Cut short, a refit tells nothing.
+                allowed = yield evaluations
             rise = math.inf
             if there is not None:
-                evaluations += int(there.outcome["evaluations"])
                 rise = self.rise(i, 2.0 * float(there.outcome["cost"]))
                 points.append((start + side * way + float(self.shift[i]), rise**2))
                 slope = side * _slope(there, i) / (float(self.units[i]) * rise) if rise > 0 else 0.0
@@ -278,6 +282,10 @@ class Valley:
         return self.grid.descend(_attempt(self.grid, values), evaluations, plain=True, held=i, tolerance=tolerance)
 
 
+#: A search for an end: it yields the free runs it took, is sent how many it may have taken, and returns the end.
+Search = Generator[int, int, "End"]
+
+
 @dataclass(frozen=True)
 class End:
     """One end of an interval: its value on the grid, the points on the way, free runs."""
@@ -326,7 +334,8 @@ def profiled(
     threads, progress
         Threads, and what is called with (ends found, ends in all).
     most
-        Free runs that an end may take at most; None for as many as it needs.
+        Free runs for all ends together; None for as many as they need. They are dealt out evenly, and what an end does
+        not need goes to those that are not found yet.
 
     Raises
     ------
@@ -368,20 +377,39 @@ def _ends(
     """Both ends of every number that the runs see, or the lower optimum that the way there led to."""
     width, stop = half_width(level), threading.Event()
     asked = [(n, side) for n in names if valley.seen(valley.names.index(n)) for side in (-1.0, 1.0)]
+    searches = {one: valley.end(valley.names.index(one[0]), one[1], width, stop) for one in asked}
+    for search in searches.values():
+        next(search)
 
-    def found(one: tuple[str, float]) -> End | _LowerError | None:
+    def followed(one: tuple[str, float], allowed: int) -> int | End | _LowerError:
         try:
-            return valley.end(valley.names.index(one[0]), one[1], width, stop, most)
+            return searches[one].send(allowed)
+        except StopIteration as found:
+            end: End = found.value
+            return end
         except _LowerError as lower:
             return lower
 
-    out: dict[tuple[str, float], End | _LowerError | None] = {}
+    out: dict[tuple[str, float], End | _LowerError | None] = dict.fromkeys(asked)
+    took = dict.fromkeys(asked, 0)
+    left = asked
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         try:
-            for one, end in zip(asked, pool.map(found, asked), strict=True):
-                out[one] = end
-                if progress is not None:
-                    progress(len(out), len(asked))
+            while left:
+                share = LAP * REFITS * 2 if most is None else (most - sum(took.values())) // len(left)
+                if share < LEAST_SHARE:
+                    break
+                # In whole rounds, so that what an end may take does not depend on the number of threads.
+                allowed = [took[o] + share for o in left]
+                for one, found in zip(left, pool.map(followed, left, allowed), strict=True):
+                    if isinstance(found, int):
+                        took[one] = found
+                    else:
+                        out[one] = found
+                        took[one] = found.evaluations if isinstance(found, End) else took[one]
+                        if progress is not None:
+                            progress(sum(e is not None for e in out.values()), len(asked))
+                left = [o for o in left if out[o] is None]
         except BaseException:
             stop.set()
             pool.shutdown(cancel_futures=True)

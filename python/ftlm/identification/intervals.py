@@ -22,7 +22,7 @@ PRINTED = 0.95
 #: How often a fit goes on from a lower optimum that its intervals came upon.
 REFITS = 2
 #: Pulses that may be spent on profiles nobody asked for, all numbers together, and free runs on an end at least.
-UNASKED, FEWEST = 3_000_000, 20
+UNASKED, FEWEST = 6_000_000, 20
 
 
 def with_intervals(
@@ -46,8 +46,8 @@ def with_intervals(
             # No finite free run where the weights of the last descent are taken anew: what is known stays.
             return joint, warnings
         names = valley.names if intervals == "profile" else bent_numbers(valley, PRINTED)
-        runs_allowed = UNASKED // (joint.samples * joint.refinement)
-        most = None if intervals == "profile" else max(runs_allowed // max(2 * len(names), 1), FEWEST)
+        runs_allowed = max(UNASKED // (joint.samples * joint.refinement), FEWEST * 2 * len(names))
+        most = None if intervals == "profile" else runs_allowed
         found = profiled(valley, names, PRINTED, threads=threads, progress=progress, most=most)
         if found.lower is None or turn == REFITS:
             break
