@@ -1,5 +1,7 @@
 """The printed fit is that of the printed model: sample by sample, as SciPy and the model's own simulation have it."""
 
+import control
+import mpmath
 import numpy as np
 import pytest
 from scipy import signal
@@ -65,6 +67,62 @@ def test_orders_one_to_three_are_scipys(order, poles):
     y = exact([3.0], denominator, u, step, "zoh")
     model = ftlm.Model(ftlm.equation(words, initial="rest"))
     np.testing.assert_allclose(model.simulate(run_of(u, 0 * y, step))["y"], y, atol=1e-6 * np.max(np.abs(y)))
+
+
+@pytest.mark.parametrize("kind", ["zoh", "foh"])
+@pytest.mark.parametrize("through", [0.0, 0.5])
+@pytest.mark.parametrize(("zeta", "per_period"), [(0.005, 6), (0.02, 8), (0.1, 20), (1.0, 200)])
+def test_simulation_is_that_of_python_control(zeta, per_period, through, kind):
+    step, rows = 2 * np.pi / per_period, 300
+    numerator, words = oscillator(zeta, through)
+    u, plant = commands(rows, 4), control.tf(numerator, [1, 2 * zeta, 1])
+    if kind == "zoh":
+        plant = control.sample_system(control.ss(plant), step, "zoh")
+    y = control.forced_response(plant, step * np.arange(rows), u).outputs
+    found = ftlm.Model(ftlm.equation(words, initial="rest")).simulate(run_of(u, 0 * y, step, kind))["y"]
+    np.testing.assert_allclose(found, y, atol=1e-6 * np.max(np.abs(y)))
+
+
+def mittag_leffler(alpha, second, arguments):
+    """E_{alpha, second} of some arguments between -20 and 0, by its series in 60 digits."""
+    with mpmath.workdps(60):
+        weights = [mpmath.rgamma(alpha * k + second) for k in range(400)]
+        return [mpmath.polyval(weights[::-1], z) for z in arguments]
+
+
+@pytest.mark.parametrize("kind", ["zoh", "foh"])
+@pytest.mark.parametrize("through", [0.0, 0.5])
+@pytest.mark.parametrize("alpha", ["0.4", "0.9", "1.3", "1.9"])
+def test_simulation_of_a_fractional_order_is_that_of_sixty_digits(alpha, through, kind):
+    # D^alpha y = -a y + b u + d D^alpha u: the response to a step is d E_{alpha, 1} + b t^alpha E_{alpha, alpha + 1},
+    # that to a ramp d t E_{alpha, 2} + b t^{alpha + 1} E_{alpha, alpha + 2}, all of -a t^alpha.
+    a, b, step, rows, hold = "2.25", "1.5", 0.05, 48, 12
+    u = commands(rows, 5, hold)
+    with mpmath.workdps(60):
+        order, times = mpmath.mpf(alpha), [mpmath.mpf(step) * k for k in range(rows)]
+
+        def response(power):
+            z = [-mpmath.mpf(a) * t**order for t in times]
+            direct = mittag_leffler(order, power + 1, z)
+            delayed = mittag_leffler(order, order + power + 1, z)
+            return np.array([
+                float(t**power * (through * d + mpmath.mpf(b) * t**order * e))
+                for t, d, e in zip(times, direct, delayed, strict=True)
+            ])  # fmt: skip
+
+        steps, ramps = response(0), response(1) / step
+    slopes = np.diff(u, append=u[-1])
+    y = np.zeros(rows)
+    for k in range(rows):
+        if kind == "zoh":
+            y[k:] += (u[k] - (u[k - 1] if k else 0.0)) * steps[: rows - k]
+        else:
+            y[k:] += (slopes[k] - (slopes[k - 1] if k else 0.0)) * ramps[: rows - k]
+    if kind == "foh":
+        y += u[0] * steps
+    words = f"D^{alpha} y = -{a} y + {b} u" + (f" + {through} D^{alpha} u" if through else "")
+    found = ftlm.Model(ftlm.equation(words, initial="rest")).simulate(run_of(u, 0 * y, step, kind))["y"]
+    np.testing.assert_allclose(found, y, atol=1e-6 * np.max(np.abs(y)))
 
 
 @pytest.mark.parametrize("per_period", [8, 12, 20])
