@@ -37,7 +37,7 @@ test-rust:
 
 # A file is the work of one of two workers, so that what its tests share is made once.
 test-python: $(VENV)/.built
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist loadgroup
 
 test-slow: $(VENV)/.built
 	$(BIN)/python -m pytest -m slow --timeout 7200

@@ -21,6 +21,13 @@ settings.register_profile("ftlm", derandomize=True, deadline=None)
 settings.load_profile("ftlm")
 
 
+def pytest_collection_modifyitems(items):
+    """One worker takes a file; those tests of several files that share the dear reproduction go to one as well."""
+    for item in items:
+        shared = "reproduction" in getattr(item, "fixturenames", ())
+        item.add_marker(pytest.mark.xdist_group("reproduction" if shared else item.path.stem))
+
+
 @pytest.fixture(scope="session")
 def root():
     """Folder of the repository."""
