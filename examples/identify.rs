@@ -97,7 +97,7 @@ fn main() -> Result<()> {
         }],
         order_bounds: vec![(1.5, 2.0), (0.0, 1.4)],
         coordinates: vec![Coordinate::Plain; 3],
-        delays: Vec::new(),
+        inputs: Vec::new(),
         coupled: false,
         initial: Initial::Rest,
     };
@@ -106,7 +106,7 @@ fn main() -> Result<()> {
     let start = Point {
         orders: vec![structure.order, structure.terms[1].order],
         coefficients: best.coefficients.clone(),
-        delays: Vec::new(),
+        inputs: Vec::new(),
     };
     let found = fit(&model, &[experiment], &start, Settings::default())?;
     println!("joint output error: orders {:.3?}, coefficients {:.3?}", found.point.orders, found.point.coefficients);

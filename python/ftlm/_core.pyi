@@ -138,7 +138,7 @@ class _FoundStage(TypedDict):
 class _Fit(TypedDict):
     orders: list[float]
     coefficients: list[float]
-    delays: list[float]
+    inputs: list[float]
     #: half the weighted sum of squared residuals
     cost: float
     #: weighted residuals, records one after the other, outputs within
@@ -215,7 +215,7 @@ def output_error(
     terms: _Initial,
     start_orders: Sequence[float],
     start_coefficients: Sequence[float],
-    delays: Sequence[tuple[int, tuple[float, float], float]],
+    inputs: Sequence[tuple[int, str, tuple[float, float], float]],
     evaluations: int,
     tolerance: float,
 ) -> _Fit: ...
@@ -242,6 +242,7 @@ def friction_error(
     terms: _Initial,
     orders: Sequence[float],
     coefficients: Sequence[float],
+    inputs: Sequence[tuple[int, str, tuple[float, float], float]],
     states: Sequence[Sequence[float]],
     evaluations: int,
     tolerance: float,

@@ -13,6 +13,8 @@ pub struct Start {
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
+    /// Free numbers of inputs.
+    pub inputs: Vec<f64>,
     /// States of each run; empty: those that suit the start best.
     pub states: Vec<Vec<f64>>,
 }
@@ -24,6 +26,8 @@ pub struct Fit {
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
+    /// Free numbers of inputs.
+    pub inputs: Vec<f64>,
     /// States of each run.
     pub states: Vec<Vec<f64>>,
     /// The initial terms that they are, (exponent, coefficient), run by run.
@@ -32,7 +36,7 @@ pub struct Fit {
     pub cost: f64,
     /// Weighted residuals, run after run.
     pub residuals: Vec<f64>,
-    /// Their derivatives with respect to orders and coefficients, what states can follow taken out.
+    /// Their derivatives with respect to orders, coefficients and inputs, what states can follow taken out.
     pub jacobian: Vec<Vec<f64>>,
     /// Evaluations of residuals.
     pub evaluations: usize,
@@ -65,7 +69,8 @@ impl Problem for OutputError<'_> {
         let mut next = point.clone();
         let mut moved: f64 = 0.0;
         let (orders, rest) = steps.split_at(point.orders.len());
-        let (coefficients, mut states) = rest.split_at(point.coefficients.len());
+        let (coefficients, rest) = rest.split_at(point.coefficients.len());
+        let (inputs, mut states) = rest.split_at(point.inputs.len());
         for ((order, &(low, high)), step) in next.orders.iter_mut().zip(&self.model.order_bounds).zip(orders) {
             let before = *order;
             *order = (before + step).clamp(low, high);
@@ -79,6 +84,11 @@ impl Problem for OutputError<'_> {
                 *value = value.max(0.0);
             }
             moved = moved.max(share(before, *value));
+        }
+        for ((value, input), step) in next.inputs.iter_mut().zip(&self.model.inputs).zip(inputs) {
+            let (before, (low, high)) = (*value, input.bounds);
+            *value = (before + step).clamp(low, high);
+            moved = moved.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
         }
         for run in &mut next.states {
             let (own, others) = states.split_at(run.len());
@@ -98,13 +108,17 @@ impl Problem for OutputError<'_> {
             .map_or(1.0, |j| self.model.coordinates[j].stretch(point.coefficients[j]))
     }
 
-    /// Orders have bounds, and friction is not negative.
+    /// Orders and inputs' numbers have bounds, and friction is not negative.
     fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
         if let Some(order) = point.orders.get(parameter) {
             let (low, high) = self.model.order_bounds[parameter];
             return (order - low, high - order);
         }
         let j = parameter - point.orders.len();
+        let input = j.checked_sub(point.coefficients.len());
+        if let Some((value, free)) = input.and_then(|i| point.inputs.get(i).zip(self.model.inputs.get(i))) {
+            return (value - free.bounds.0, free.bounds.1 - value);
+        }
         let plain = self.model.coordinates.get(j).is_some_and(|c| c.stretch(2.0) == 1.0);
         match self.model.rubs() {
             Some(rubs) if rubs == j && plain => (point.coefficients[j], f64::INFINITY),
@@ -128,11 +142,17 @@ struct Begun<'a> {
     experiment: &'a Experiment,
     orders: &'a [f64],
     coefficients: &'a [f64],
+    inputs: &'a [f64],
 }
 
 impl Begun<'_> {
     fn at(&self, states: &[f64]) -> Point {
-        Point { orders: self.orders.to_vec(), coefficients: self.coefficients.to_vec(), states: vec![states.to_vec()] }
+        Point {
+            orders: self.orders.to_vec(),
+            coefficients: self.coefficients.to_vec(),
+            inputs: self.inputs.to_vec(),
+            states: vec![states.to_vec()],
+        }
     }
 }
 
@@ -173,8 +193,14 @@ const BEGUN: [f64; 3] = [0.0, 0.5, -0.5];
 const BEGUN_SETTINGS: Settings = Settings { evaluations: 30, tolerance: 1e-6 };
 
 /// States of a run at given numbers: the best that descents from its first samples reach.
-fn begun(model: &FrictionModel, orders: &[f64], coefficients: &[f64], experiment: &Experiment) -> Vec<f64> {
-    let problem = Begun { model, experiment, orders, coefficients };
+fn begun(
+    model: &FrictionModel,
+    orders: &[f64],
+    coefficients: &[f64],
+    inputs: &[f64],
+    experiment: &Experiment,
+) -> Vec<f64> {
+    let problem = Begun { model, experiment, orders, coefficients, inputs };
     let plain = model.first_states(orders, experiment, 0.0);
     let mut best = (f64::INFINITY, plain.clone());
     for share in BEGUN {
@@ -203,23 +229,27 @@ pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, set
     check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
     check_finite("orders of the start", &start.orders)?;
     check_finite("coefficients of the start", &start.coefficients)?;
+    check_length("inputs", model.inputs.len(), start.inputs.len())?;
+    check_finite("inputs of the start", &start.inputs)?;
     let orders: Vec<f64> =
         start.orders.iter().zip(&model.order_bounds).map(|(o, &(low, high))| o.clamp(low, high)).collect();
     let mut coefficients = start.coefficients.clone();
     if let Some(j) = model.rubs() {
         coefficients[j] = coefficients[j].max(0.0);
     }
+    let inputs: Vec<f64> =
+        start.inputs.iter().zip(&model.inputs).map(|(v, i)| v.clamp(i.bounds.0, i.bounds.1)).collect();
     let count = model.states(&orders).len();
     let mut states = start.states.clone();
     if states.len() != experiments.len() || states.iter().any(|s| s.len() != count) {
-        states = experiments.iter().map(|e| begun(model, &orders, &coefficients, e)).collect();
+        states = experiments.iter().map(|e| begun(model, &orders, &coefficients, &inputs, e)).collect();
     }
     for values in &states {
         check_finite("states of the start", values)?;
     }
     let problem = OutputError { model, experiments };
-    let found = minimise(&problem, Point { orders, coefficients, states }, settings)?;
-    let numbers = found.point.orders.len() + found.point.coefficients.len();
+    let found = minimise(&problem, Point { orders, coefficients, inputs, states }, settings)?;
+    let numbers = found.point.orders.len() + found.point.coefficients.len() + found.point.inputs.len();
     let mut basis = Vec::new();
     for column in &found.jacobian[numbers..] {
         dense::extend_orthonormal(&mut basis, column.clone(), SPANNED);
@@ -232,11 +262,12 @@ pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, set
             column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
         }
     }
-    let Point { orders, coefficients, states } = found.point;
+    let Point { orders, coefficients, inputs, states } = found.point;
     Ok(Fit {
         initial: states.iter().map(|values| model.powers(&orders, &coefficients, values)).collect(),
         orders,
         coefficients,
+        inputs,
         states,
         cost: found.cost,
         residuals: found.evaluation.residuals,

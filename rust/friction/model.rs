@@ -4,7 +4,7 @@ use super::dynamics::{product, Body, Integrated, Operators, Run};
 use super::states::{together, Forcing, State};
 use crate::equation::{Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
-use crate::estimate::output_error::{Coordinate, Experiment, FreeEquation, Monomial};
+use crate::estimate::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
 use crate::regressors::Record;
 use crate::series::Kernel;
 
@@ -15,6 +15,8 @@ pub struct FrictionModel {
     pub equation: FreeEquation,
     /// f of − f sgn(Dy).
     pub friction: Monomial,
+    /// What is free of inputs, one number of an input at most.
+    pub inputs: Vec<FreeInput>,
     /// Bounds of each free order.
     pub order_bounds: Vec<(f64, f64)>,
     /// Coordinate of each free coefficient.
@@ -28,6 +30,8 @@ pub struct FrictionModel {
 pub(super) struct Point {
     pub(super) orders: Vec<f64>,
     pub(super) coefficients: Vec<f64>,
+    /// Free numbers of inputs.
+    pub(super) inputs: Vec<f64>,
     /// Of each run.
     pub(super) states: Vec<Vec<f64>>,
 }
@@ -42,6 +46,8 @@ pub(super) struct Evaluation {
 struct Part {
     operators: Operators,
     run: Run,
+    /// How the means of each input with a free number move with it.
+    bent: Vec<Vec<f64>>,
 }
 
 /// Samples from which a run's first velocity is taken.
@@ -52,10 +58,12 @@ const SHIFT: f64 = 1e-5;
 
 /// What a parameter moves.
 enum Moved {
-    /// A free order, a free coefficient or a state of one run.
+    /// A free order, a free coefficient, a state of one run.
     Order(usize),
     Coefficient(usize),
     State(usize, usize),
+    /// A free number of an input.
+    Input(usize),
 }
 
 impl FrictionModel {
@@ -75,6 +83,17 @@ impl FrictionModel {
         }
         if !known(&self.friction) || self.friction.powers.len() > 1 || self.friction.factor < 0.0 {
             return refuse("friction is no multiple of one free coefficient", "give it one that is not negative");
+        }
+        for (k, &FreeInput { signal, law, bounds: (low, high) }) in self.inputs.iter().enumerate() {
+            if signal >= signals || signal == self.equation.output {
+                return refuse("a free limit of what is no input", "limit inputs only");
+            }
+            if law == InputLaw::Delay || self.inputs[..k].iter().any(|i| i.signal == signal) {
+                return refuse("a free delay beside friction, or two free numbers of an input", "give the delay");
+            }
+            if !(0.0 <= low && low <= high && high.is_finite()) {
+                return refuse("bounds of a limit that do not rise from 0", "give two rising values from 0");
+            }
         }
         for order in terms.iter().map(|t| &t.1).chain([&self.equation.order]) {
             check_length("weights of an order", self.order_bounds.len(), order.weights.len())?;
@@ -168,6 +187,21 @@ impl FrictionModel {
         Forcing::of(&self.powers(orders, coefficients, values), &own, record.m(), record.step())
     }
 
+    /// The record as its inputs act, none where that is as they are, and how these move with their free numbers.
+    fn acting(&self, record: &Record, values: &[f64]) -> Result<(Option<Record>, Vec<Vec<f64>>)> {
+        if self.inputs.is_empty() {
+            return Ok((None, Vec::new()));
+        }
+        let mut signals: Vec<Vec<f64>> = (0..record.len()).map(|s| record.signal(s).to_vec()).collect();
+        let mut bent = Vec::with_capacity(self.inputs.len());
+        for (input, &value) in self.inputs.iter().zip(values) {
+            let (means, slope) = input.law.acted(&signals[input.signal], value, record.step(), 0.0)?;
+            signals[input.signal] = means;
+            bent.push(slope);
+        }
+        Ok((Some(Record::new(record.step(), signals, None)?), bent))
+    }
+
     pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point) -> Result<Evaluation> {
         let body = self.body(&point.orders, &point.coefficients);
         // Reported like a step too far, so that a search shortens it.
@@ -175,7 +209,8 @@ impl FrictionModel {
         body.check(usize::MAX).map_err(far)?;
         let mut out = Evaluation { residuals: Vec::new(), size: 0.0, parts: Vec::with_capacity(experiments.len()) };
         for (experiment, values) in experiments.iter().zip(&point.states) {
-            let operators = Operators::new(&body, &experiment.record);
+            let (acting, bent) = self.acting(&experiment.record, &point.inputs)?;
+            let operators = Operators::new(&body, acting.as_ref().unwrap_or(&experiment.record));
             let forcing = self.forcing(&point.orders, &point.coefficients, values, &experiment.record);
             let run = Run::new(&body, &operators, &forcing)?;
             let mut residuals = experiment.measured();
@@ -183,7 +218,7 @@ impl FrictionModel {
             let sampled = experiment.sampled(std::slice::from_ref(&run.output));
             residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
             out.residuals.extend(residuals);
-            out.parts.push(Part { operators, run });
+            out.parts.push(Part { operators, run, bent });
         }
         Ok(out)
     }
@@ -201,6 +236,7 @@ impl FrictionModel {
         if numbers {
             all.extend((0..point.orders.len()).map(Moved::Order));
             all.extend((0..point.coefficients.len()).map(Moved::Coefficient));
+            all.extend((0..point.inputs.len()).map(Moved::Input));
         }
         for (run, states) in point.states.iter().enumerate() {
             all.extend((0..states.len()).map(|state| Moved::State(run, state)));
@@ -254,6 +290,11 @@ impl FrictionModel {
                     add(c * deta, &driver.of(signal, 1));
                 }
             }
+            if let (Moved::Input(i), Some((driver, _))) = (moved, &operators.drivers[k]) {
+                if self.equation.terms[k].0 == self.inputs[*i].signal {
+                    add(c, &driver.of(&Kernel::new(&part.bent[*i]), 0));
+                }
+            }
             if let Some(kernels) = &operators.own[k] {
                 if dc != 0.0 {
                     add(dc, &spectra.own(kernels, 0));
@@ -292,7 +333,7 @@ impl FrictionModel {
                 terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect(),
                 self.friction.slope(&point.coefficients, j),
             ),
-            Moved::State(..) => (0.0, vec![(0.0, 0.0); terms.len()], 0.0),
+            Moved::State(..) | Moved::Input(_) => (0.0, vec![(0.0, 0.0); terms.len()], 0.0),
         }
     }
 
@@ -304,6 +345,8 @@ impl FrictionModel {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
                 self.forcing(&point.orders, &point.coefficients, &unit, record)
             }
+            // What a run starts with knows nothing of its inputs.
+            Moved::Input(_) => Forcing::none(record.m()),
             _ if idle => Forcing::none(record.m()),
             Moved::Coefficient(j) => {
                 let own = |k: usize| self.equation.terms[k].0 == self.equation.output;

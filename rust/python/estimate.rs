@@ -196,6 +196,25 @@ pub fn status(status: joint::Status) -> &'static str {
     }
 }
 
+/// What is free of inputs: signal, law, bounds, value at the start.
+pub(super) type FreeInputArg = (usize, String, (f64, f64), f64);
+
+pub(super) fn free_inputs(inputs: &[FreeInputArg]) -> PyResult<Vec<joint::FreeInput>> {
+    let law = |name: &str| match name {
+        "delay" => Ok(joint::InputLaw::Delay),
+        "saturation" => Ok(joint::InputLaw::Saturation),
+        "dead_zone" => Ok(joint::InputLaw::DeadZone),
+        other => Err(Error::Structure {
+            what: format!("law '{other}' of an input is not known"),
+            remedy: "use delay, saturation or dead_zone".into(),
+        }),
+    };
+    let free = |(signal, name, bounds, _): &FreeInputArg| {
+        Ok::<_, Error>(joint::FreeInput { signal: *signal, law: law(name)?, bounds: *bounds })
+    };
+    Ok(inputs.iter().map(free).collect::<Result<Vec<_>, _>>()?)
+}
+
 #[pyfunction]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
 pub fn output_error<'py>(
@@ -208,7 +227,7 @@ pub fn output_error<'py>(
     terms: InitialArg,
     start_orders: Vec<f64>,
     start_coefficients: Vec<f64>,
-    delays: Vec<(usize, (f64, f64), f64)>,
+    inputs: Vec<FreeInputArg>,
     evaluations: usize,
     tolerance: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
@@ -218,17 +237,17 @@ pub fn output_error<'py>(
     let start = joint::Point {
         orders: start_orders,
         coefficients: start_coefficients,
-        delays: delays.iter().map(|&(_, _, delay)| delay).collect(),
+        inputs: inputs.iter().map(|input| input.3).collect(),
     };
-    let free = delays.into_iter().map(|(signal, bounds, _)| joint::FreeDelay { signal, bounds }).collect();
+    let free = free_inputs(&inputs)?;
     let model =
-        joint::FreeModel { equations, order_bounds, coordinates, delays: free, coupled, initial: initial(terms)? };
+        joint::FreeModel { equations, order_bounds, coordinates, inputs: free, coupled, initial: initial(terms)? };
     let settings = joint::Settings { evaluations, tolerance };
     let fit = detached(py, || joint::fit(&model, &experiments, &start, settings))?;
     let dict = PyDict::new(py);
     dict.set_item("orders", fit.point.orders)?;
     dict.set_item("coefficients", fit.point.coefficients)?;
-    dict.set_item("delays", fit.point.delays)?;
+    dict.set_item("inputs", fit.point.inputs)?;
     dict.set_item("cost", fit.cost)?;
     dict.set_item("residuals", PyArray1::from_vec(py, fit.residuals))?;
     dict.set_item("jacobian", stacked(py, &fit.jacobian)?)?;

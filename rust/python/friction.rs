@@ -6,7 +6,10 @@ use pyo3::types::PyDict;
 
 use super::arrays::{initial, record, stacked, structure, InitialArg, RecordArg, StructureArg};
 use super::errors::detached;
-use super::estimate::{coordinates, experiment, free_equation, status, ExperimentArg, FreeEquationArg, MonomialArg};
+use super::estimate::{
+    coordinates, experiment, free_equation, free_inputs, status, ExperimentArg, FreeEquationArg, FreeInputArg,
+    MonomialArg,
+};
 use crate::estimate::output_error as joint;
 use crate::friction::march::Phase;
 use crate::friction::{self, Body, FrictionModel, Start};
@@ -46,6 +49,7 @@ pub fn friction_error<'py>(
     terms: InitialArg,
     orders: Vec<f64>,
     coefficients: Vec<f64>,
+    inputs: Vec<FreeInputArg>,
     states: Vec<Vec<f64>>,
     evaluations: usize,
     tolerance: f64,
@@ -54,17 +58,18 @@ pub fn friction_error<'py>(
     let model = FrictionModel {
         equation: free_equation(law),
         friction: joint::Monomial { factor: strength.0, powers: strength.1 },
+        inputs: free_inputs(&inputs)?,
         order_bounds,
         coordinates: coordinates(&names)?,
         initial: initial(terms)?,
     };
-    let start = Start { orders, coefficients, states };
+    let start = Start { orders, coefficients, inputs: inputs.iter().map(|input| input.3).collect(), states };
     let settings = joint::Settings { evaluations, tolerance };
     let fit = detached(py, || friction::fit(&model, &experiments, &start, settings))?;
     let dict = PyDict::new(py);
     dict.set_item("orders", fit.orders)?;
     dict.set_item("coefficients", fit.coefficients)?;
-    dict.set_item("delays", Vec::<f64>::new())?;
+    dict.set_item("inputs", fit.inputs)?;
     dict.set_item("states", fit.states.clone())?;
     dict.set_item("initial", fit.states.into_iter().map(|states| vec![states]).collect::<Vec<_>>())?;
     dict.set_item("powers", fit.initial)?;

@@ -94,7 +94,7 @@ def test_an_input_that_is_linear_in_between_is_delayed_to_second_order():
         prepared = [experiment(run, problem, [1.0], every=every)]
         start = Attempt([2.2, 0.9], [plants.THREE_TERMS[n] for n in ("a1", "a0", "b0")], "truth", {}, [DELAY])
         end = descend(problem, prepared, start, evaluations=40, plain=True)
-        errors.append(abs(end.delays[0] - DELAY))
+        errors.append(abs(end.inputs[0] - DELAY))
     assert errors[0] < 0.02 * plants.clean_run("3T").step
     assert errors[2] < errors[0] / 6
 
@@ -184,13 +184,13 @@ def test_the_core_refuses_delays_that_are_none():
     def core(delays):
         return _core.output_error(
             prepared, problem.laws(("y", "u")), list(problem.bounds), ["plain"] * 3, False, (False, []),
-            [2.2, 0.9], [-0.6, -1.2, 1.2], delays, 1, 1e-9,
+            [2.2, 0.9], [-0.6, -1.2, 1.2], [(s, "delay", ends, v) for s, ends, v in delays], 1, 1e-9,
         )  # fmt: skip
 
     for delays in ([(0, (0.0, 0.1), 0.0)], [(7, (0.0, 0.1), 0.0)], [(1, (0.2, 0.1), 0.1)], [(1, (0.0, 0.1), np.nan)]):
         with pytest.raises(ftlm.ModelError):
             core(delays)
-    assert core([(1, (0.0, 0.1), 5.0)])["delays"] == [pytest.approx(0.1)]
+    assert core([(1, (0.0, 0.1), 5.0)])["inputs"] == [pytest.approx(0.1)]
 
 
 def test_on_the_command_line(tmp_path):

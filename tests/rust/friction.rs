@@ -75,11 +75,12 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
             terms: vec![(0, order(1.0, 0.0), free(0, -1.0)), (1, order(0.0, 0.0), free(1, 1.0))],
         },
         friction: free(2, 1.0),
+        inputs: vec![],
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
         initial: Initial::Rest,
     };
-    let start = Start { orders: vec![2.0], coefficients: vec![0.7, 1.2, 0.5], states: vec![] };
+    let start = Start { orders: vec![2.0], coefficients: vec![0.7, 1.2, 0.5], inputs: vec![], states: vec![] };
     let found =
         fit(&model, std::slice::from_ref(&experiment), &start, Settings { evaluations: 200, tolerance: 1e-14 })?;
     assert!((found.orders[0] - 1.9).abs() < 1e-5, "{:?}", found.orders);

@@ -15,6 +15,7 @@ mod iv;
 mod joint;
 mod kernels;
 mod levenberg_marquardt;
+mod limits;
 mod means;
 mod metrics;
 mod output_error;

@@ -3,7 +3,8 @@
 use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimate::output_error::{
-    fit, Coordinate, Experiment, Fit, FreeDelay, FreeEquation, FreeModel, Instant, Monomial, Point, Settings, Status,
+    fit, Coordinate, Experiment, Fit, FreeEquation, FreeInput, FreeModel, InputLaw, Instant, Monomial, Point, Settings,
+    Status,
 };
 use ftlm::means::{delayed, point_samples};
 use ftlm::regressors::Record;
@@ -46,7 +47,7 @@ fn two_link(coupled: bool, initial: Initial) -> FreeModel {
             FreeEquation { output: 1, order, terms: deflection },
         ],
         order_bounds: vec![(0.5, 1.2), (0.0, 0.6), (0.5, 1.2)],
-        delays: Vec::new(),
+        inputs: Vec::new(),
         coordinates: vec![
             Coordinate::Logarithm,
             Coordinate::Logarithm,
@@ -88,7 +89,7 @@ fn run(intervals: usize, every: usize, initial: &[Vec<(f64, f64)>], noise: f64, 
 }
 
 fn point(orders: &[f64], coefficients: &[f64]) -> Point {
-    Point { orders: orders.to_vec(), coefficients: coefficients.to_vec(), delays: Vec::new() }
+    Point { orders: orders.to_vec(), coefficients: coefficients.to_vec(), inputs: Vec::new() }
 }
 
 /// Residuals, cost and Jacobian at given parameters, no step taken.
@@ -337,7 +338,10 @@ fn late(delay: f64, every: usize, noise: f64, seed: u64) -> Experiment {
 }
 
 fn with_delay(coupled: bool) -> FreeModel {
-    FreeModel { delays: vec![FreeDelay { signal: 2, bounds: (0.0, 0.2) }], ..two_link(coupled, Initial::Rest) }
+    FreeModel {
+        inputs: vec![FreeInput { signal: 2, law: InputLaw::Delay, bounds: (0.0, 0.2) }],
+        ..two_link(coupled, Initial::Rest)
+    }
 }
 
 #[test]
@@ -346,7 +350,7 @@ fn the_slope_towards_a_delay_is_that_of_the_residuals() {
         let (model, experiments) = (with_delay(coupled), [late(0.057, 2, 0.02, 500)]);
         let settings = Settings { evaluations: 1, ..Settings::default() };
         let here = |delay: f64| {
-            let start = Point { delays: vec![delay], ..point(&START.0, &START.1) };
+            let start = Point { inputs: vec![delay], ..point(&START.0, &START.1) };
             fit(&model, &experiments, &start, settings).unwrap()
         };
         // Inside a step residuals are linear in the delay, so the difference is exact; 0.057 s is 5.7 steps.
@@ -363,10 +367,10 @@ fn a_delay_is_found_with_the_rest() {
     for (coupled, every, delay) in [(true, 1, 0.05), (true, 2, 0.033), (false, 1, 0.11), (true, 1, 0.0), (true, 1, 0.2)]
     {
         let model = with_delay(coupled);
-        let start = Point { delays: vec![0.08], ..point(&START.0, &START.1) };
+        let start = Point { inputs: vec![0.08], ..point(&START.0, &START.1) };
         let found = fit(&model, &[late(delay, every, 0.0, 510)], &start, Settings::default()).unwrap();
-        let miss = (found.point.delays[0] - delay).abs();
-        assert!(miss < 1e-6, "delay {delay}: {} s", found.point.delays[0]);
+        let miss = (found.point.inputs[0] - delay).abs();
+        assert!(miss < 1e-6, "delay {delay}: {} s", found.point.inputs[0]);
         check("orders beside a delay", relative_distance(&found.point.orders, &ORDERS), 1e-5);
         check("coefficients beside a delay", relative_distance(&found.point.coefficients, &COEFFICIENTS), 1e-5);
     }
@@ -375,7 +379,7 @@ fn a_delay_is_found_with_the_rest() {
 #[test]
 fn a_delay_is_estimated_as_well_as_its_slope_says() {
     let (model, delay) = (with_delay(true), 0.047);
-    let start = Point { delays: vec![0.08], ..point(&START.0, &START.1) };
+    let start = Point { inputs: vec![0.08], ..point(&START.0, &START.1) };
     let mut scores = Vec::new();
     for seed in 0..40 {
         let found = fit(&model, &[late(delay, 1, 0.02, 600 + 2 * seed)], &start, Settings::default()).unwrap();
@@ -384,7 +388,7 @@ fn a_delay_is_estimated_as_well_as_its_slope_says() {
             .map(|(i, j)| found.jacobian[i].iter().zip(&found.jacobian[j]).map(|(a, b)| a * b).sum())
             .collect();
         let last: Vec<f64> = (0..9).map(|i| f64::from(i == 8)).collect();
-        scores.push((found.point.delays[0] - delay) / dense_solve(&normal, &last)[8].sqrt());
+        scores.push((found.point.inputs[0] - delay) / dense_solve(&normal, &last)[8].sqrt());
     }
     let mean = scores.iter().sum::<f64>() / scores.len() as f64;
     // Of forty standard normal numbers: the mean scatters by 0.16, the deviation by 0.11.
@@ -393,7 +397,7 @@ fn a_delay_is_estimated_as_well_as_its_slope_says() {
 }
 
 /// Two equations that feed through: each output drives the other at once, and the input both.
-fn at_once(coupled: bool, initial: Initial, delays: Vec<FreeDelay>) -> FreeModel {
+fn at_once(coupled: bool, initial: Initial, inputs: Vec<FreeInput>) -> FreeModel {
     let fixed = |order: f64| AffineOrder { constant: order, weights: Vec::new() };
     let equation = |output: usize, other: usize, order: f64, first: usize| FreeEquation {
         output,
@@ -409,7 +413,7 @@ fn at_once(coupled: bool, initial: Initial, delays: Vec<FreeDelay>) -> FreeModel
         equations: vec![equation(0, 1, 1.2, 0), equation(1, 0, 0.7, 3)],
         order_bounds: Vec::new(),
         coordinates: vec![Coordinate::Plain; 6],
-        delays,
+        inputs,
         coupled,
         initial,
     }
@@ -418,7 +422,7 @@ fn at_once(coupled: bool, initial: Initial, delays: Vec<FreeDelay>) -> FreeModel
 #[test]
 fn what_feeds_through_has_the_slope_of_its_residuals() {
     let coefficients = [1.5, 0.4, 0.7, 0.9, -0.3, 0.5];
-    let delayed = || vec![FreeDelay { signal: 2, bounds: (0.0, 0.2) }];
+    let delayed = || vec![FreeInput { signal: 2, law: InputLaw::Delay, bounds: (0.0, 0.2) }];
     for (name, model) in [
         ("coupled", at_once(true, Initial::Rest, Vec::new())),
         ("measured coupling", at_once(false, Initial::Rest, Vec::new())),
@@ -429,8 +433,8 @@ fn what_feeds_through_has_the_slope_of_its_residuals() {
         let instants = experiment.samples.iter().cloned().map(|values| Instant { values: Some(values), held: false });
         experiment.instants = instants.chain([Instant { values: Some(held), held: true }]).collect();
         let at = |c: &[f64], delay: f64| {
-            let delays = model.delays.iter().map(|_| delay).collect();
-            let start = Point { orders: Vec::new(), coefficients: c.to_vec(), delays };
+            let inputs = model.inputs.iter().map(|_| delay).collect();
+            let start = Point { orders: Vec::new(), coefficients: c.to_vec(), inputs };
             let settings = Settings { evaluations: 1, ..Settings::default() };
             fit(&model, std::slice::from_ref(&experiment), &start, settings).unwrap()
         };
@@ -490,7 +494,7 @@ fn a_fit_that_its_grid_stops_says_so() {
         }],
         order_bounds: Vec::new(),
         coordinates: vec![Coordinate::Logarithm],
-        delays: Vec::new(),
+        inputs: Vec::new(),
         coupled: false,
         initial: Initial::Rest,
     };

@@ -12,7 +12,7 @@ from typer import Argument, Option
 
 from ftlm.arm.link import Law, flexible_link
 from ftlm.base.errors import DataError, ModelError
-from ftlm.cli.words import delays, interval, numbers, pairs
+from ftlm.cli.words import interval, numbers, pairs, ranges
 from ftlm.data.language import equation
 from ftlm.data.lattice import Lattice, lattice
 from ftlm.data.run import Run
@@ -149,6 +149,13 @@ class StructureOptions:
     delay: Annotated[Texts, Option(metavar="INPUT=SECONDS", help="Delay of an input; LEAST:LARGEST is estimated.")] = (
         None
     )
+    saturation: Annotated[
+        Texts, Option(metavar="INPUT=LIMIT", help="How far an input acts at most; LEAST:LARGEST is estimated.")
+    ] = None
+    dead_zone: Annotated[
+        Texts,
+        Option("--dead-zone", metavar="INPUT=LIMIT", help="What an input exceeds before it acts; or LEAST:LARGEST."),
+    ] = None
     initial: Annotated[str, Option(help="auto, rest, caputo, history, or exponents of t: 0,1.")] = "auto"
     offset: Annotated[
         Literal["none", "constant", "ramp", "auto"] | None,
@@ -170,7 +177,10 @@ class StructureOptions:
             built = built.equation(self.only)
         if self.offset is not None:
             built = replace(built, offset=self.offset)
-        built = replace(built, initial=check_initial(self._initial())).with_delays(delays(self.delay))
+        built = replace(built, initial=check_initial(self._initial())).with_delays(ranges("--delay", self.delay))
+        built = built.with_limits(
+            saturation=ranges("--saturation", self.saturation), dead_zone=ranges("--dead-zone", self.dead_zone)
+        )
         return built.with_orders(numbers("--order", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
 
     def _check_equation(self, count: int) -> None:

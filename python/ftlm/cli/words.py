@@ -74,13 +74,14 @@ def numbers(option: str, given: list[str] | None) -> dict[str, float]:
     return values
 
 
-def delays(given: list[str] | None) -> dict[str, float | tuple[float, float]]:
-    """INPUT=SECONDS options, or INPUT=LEAST:LARGEST where the delay is to be estimated."""
+def ranges(option: str, given: list[str] | None) -> dict[str, float | tuple[float, float]]:
+    """INPUT=NUMBER options, or INPUT=LEAST:LARGEST where the number is to be estimated."""
+    what, example = ("seconds", "0:0.02") if option == "--delay" else ("a number", "0.5:1.5")
     values: dict[str, float | tuple[float, float]] = {}
-    for name, value in pairs("--delay", given).items():
+    for name, value in pairs(option, given).items():
         ends = joined(value)
         if len(ends) not in (1, 2):
-            raise ModelError(f"--delay {name}={value}: {value!r} is neither seconds nor LEAST:LARGEST, as in 0:0.02")
+            raise ModelError(f"{option} {name}={value}: {value!r} is neither {what} nor LEAST:LARGEST, as in {example}")
         values[name] = ends[0] if len(ends) == 1 else (ends[0], ends[1])
     return values
 

@@ -43,13 +43,17 @@ class Term:
         """Value of factor * coefficient, if it is known."""
         return None if isinstance(self.coefficient, str) else self.factor * self.coefficient
 
-    def __str__(self) -> str:
+    def written(self, signal: str) -> str:
+        """Write the term with another name for its signal."""
         if isinstance(self.coefficient, str):
             factor = "" if self.factor == 1 else "-" if self.factor == -1 else f"{self.factor!r} "
             text = f"{factor}{self.coefficient} "
         else:
             text = f"{self.factor * self.coefficient!r} "
-        return text + derivative(self.order, self.signal)
+        return text + derivative(self.order, signal)
+
+    def __str__(self) -> str:
+        return self.written(self.signal)
 
 
 def derivative(order: Order, signal: str) -> str:
@@ -247,16 +251,20 @@ class Equation:
         """Whether every order and every coefficient is a number."""
         return not self.order_names and not self.coefficient_names
 
-    def __str__(self) -> str:
-        right = " + ".join(str(t) for t in self.terms).replace("+ -", "- ")
+    def written(self, inputs: Mapping[str, str]) -> str:
+        """Write the equation, inputs as they act."""
+        right = " + ".join(t.written(inputs.get(t.signal, t.signal)) for t in self.terms).replace("+ -", "- ")
         friction = "" if self.friction is None else f" {self.friction.written(self.output)}"
         return f"{derivative(self.order, self.output)} = {right}{friction}"
 
+    def __str__(self) -> str:
+        return self.written({})
 
-def numeric(item: Equation, delay: Mapping[str, float] | None = None) -> str:
-    """Write an identified equation with six significant digits, inputs with their delays [s]: ``u(t - 0.035 s)``."""
-    late = {n: f"{n}(t - {d:.6g} s)" for n, d in (delay or {}).items() if d > 0}
-    parts = [f"{t.fixed or 0.0:+.6g} {derivative(t.order, late.get(t.signal, t.signal))}" for t in item.terms]
+
+def numeric(item: Equation, inputs: Mapping[str, str] | None = None) -> str:
+    """Write an identified equation with six significant digits, inputs as they act: ``u(t - 0.035 s)``."""
+    texts = inputs or {}
+    parts = [f"{t.fixed or 0.0:+.6g} {derivative(t.order, texts.get(t.signal, t.signal))}" for t in item.terms]
     right = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])
     if item.friction is not None:
         right += f" - {item.friction.strength or 0.0:.6g} sign(D {item.output})"

@@ -5,16 +5,20 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from typing import Literal
 
 from msgspec import UNSET
 
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Friction, Term
+from ftlm.data.limits import SHORT, Limit, Value, in_order
 from ftlm.data.orders import Order, Values
 from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial, check_offset
 
 NAME = r"[^\W\d]\w*"
+#: What words may say of an input.
+LIMITS: tuple[Literal["saturation", "dead_zone"], ...] = ("saturation", "dead_zone")
 #: A term that is such a name alone is an offset.
 _OFFSET = re.compile(r"c\d*")
 
@@ -25,6 +29,8 @@ def equation(
     orders: Mapping[str, Values] | None = None,
     fixed: Mapping[str, float] | None = None,
     delay: Mapping[str, float | tuple[float, float]] | None = None,
+    saturation: Mapping[str, Value] | None = None,
+    dead_zone: Mapping[str, Value] | None = None,
     initial: str | Iterable[float] = "auto",
     sensor_filter: SensorFilter | None = None,
     offset: str | None = None,
@@ -46,6 +52,10 @@ def equation(
         Known coefficients, by name.
     delay
         Delay of inputs [s], by name, not negative: a number is known, (least, largest) is estimated by output error.
+    saturation, dead_zone
+        How far inputs act at most, and what they must exceed before they act, on either side of 0 and in their units:
+        a number is known, (least, largest) is estimated by output error. In words ``sat(u, 0.94)``,
+        ``dead(u, 0.05)``, ``sat(u, 0.5:1.5)``.
     initial
         What the run did before its start, as powers of t: ``"rest"`` (nothing), ``"caputo"`` (held still, at any
         level), ``"history"`` (anything: powers in quarters, as many as stand out of the noise), or the exponents to
@@ -75,23 +85,25 @@ def equation(
     if not lines:
         raise ModelError("the equation is empty; write it as in 'D^1.5 y = a0 y + b0 u'")
     parsed = [_parse(line) for line in lines]
-    equations = [item for item, _ in parsed]
+    equations = [item for item, _, _ in parsed]
     fixed = dict(fixed or {})
     check_known("fixed coefficient", fixed, [n for e in equations for n in e.coefficient_names])
     for name, value in fixed.items():
         if not math.isfinite(real_number(f"fixed coefficient {name}", value)):
             raise ModelError(f"fixed coefficient {name} = {value} is not finite; give a number")
     equations = [e.with_coefficients(fixed) for e in equations]
-    return (
+    structure = (
         Structure(
             equations=tuple(equations),
             initial=check_initial(initial),
             sensor_filter=sensor_filter,
-            offset=_offset_of(parsed, offset),
+            offset=_offset_of([(item, found) for item, found, _ in parsed], offset),
+            limits=_limits_of([words for _, _, words in parsed]),
         )
         .with_delays(delay or {})
         .with_orders(orders or {})
     )
+    return structure.with_limits(saturation=saturation, dead_zone=dead_zone)
 
 
 def _offset_of(parsed: Sequence[tuple[Equation, bool]], offset: str | None) -> Offset:
@@ -111,7 +123,7 @@ def _offset_of(parsed: Sequence[tuple[Equation, bool]], offset: str | None) -> O
 
 
 _TOKEN = re.compile(
-    rf"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>{NAME})|(?P<symbol>[-+*/^(){{}}=]))"
+    rf"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)|(?P<name>{NAME})|(?P<symbol>[-+*/^(){{}}=,:]))"
 )
 
 
@@ -131,6 +143,9 @@ class _Words:
             self.tokens.append((kind, token[kind], token.start(kind)))
             at = token.end()
         self.position = 0
+        #: Limits of inputs by signal and law, and signals that stand there as they are.
+        self.limits: dict[tuple[str, str], Value] = {}
+        self.plain: set[str] = set()
 
     def peek(self, ahead: int = 0) -> tuple[str, str, int]:
         index = self.position + ahead
@@ -157,14 +172,32 @@ class _Words:
 
 def parse_equation(text: str) -> Equation:
     """Read one equation without an offset; see :func:`equation`."""
-    item, offset = _parse(text)
-    if offset:
-        raise ModelError(f"equation {text!r}: an offset belongs to a structure; use equation(…)")
+    item, offset, words = _parse(text)
+    if offset or words.limits:
+        what = "an offset" if offset else "a limit of an input"
+        raise ModelError(f"equation {text!r}: {what} belongs to a structure; use equation(…)")
     return item
 
 
-def _parse(text: str) -> tuple[Equation, bool]:
-    """Read one equation, and whether it has an offset."""
+def _limits_of(parsed: Sequence[_Words]) -> tuple[Limit, ...]:
+    """Limits of inputs in equations in words; an actuator limits all that it drives."""
+    found: dict[tuple[str, str], Value] = {}
+    for words in parsed:
+        for key, limit in words.limits.items():
+            if found.setdefault(key, limit) != limit:
+                raise ModelError(f"{key[0]} has two limits of one kind in these equations; an actuator has one")
+    bare = {signal for words in parsed for signal in words.plain}
+    both = next((signal for signal, _ in found if signal in bare), None)
+    if both is not None:
+        raise ModelError(
+            f"{both} stands there limited and as it is, but an actuator limits all that it drives; limit it in each "
+            "term, or give the run the limited input as a signal of its own"
+        )
+    return tuple(in_order([Limit(s, law, v) for law in LIMITS for (s, own), v in found.items() if own == law]))
+
+
+def _parse(text: str) -> tuple[Equation, bool, _Words]:
+    """Read one equation, whether it has an offset, and what it says of its inputs."""
     words = _Words(text)
     order, output = _parse_derivative(words)
     if words.take()[1] != "=":
@@ -206,7 +239,7 @@ def _parse(text: str) -> tuple[Equation, bool]:
             break
         if not (kind == "symbol" and value in "+-"):
             raise words.fail("'+', '-' or the end")
-    return Equation(output, order, tuple(terms), friction or UNSET), offset
+    return Equation(output, order, tuple(terms), friction or UNSET), offset, words
 
 
 def _parse_friction(words: _Words, sign: float) -> tuple[Friction, str] | None:
@@ -262,11 +295,49 @@ def _parse_derivative(words: _Words) -> tuple[Order | None, str]:
         if words.peek()[1] == "^":
             words.take()
             order = _parse_order(words)
+    return order, _parse_signal(words)
+
+
+def _parse_signal(words: _Words) -> str:
+    """A signal, or what of an input acts: ``sat(u, 0.94)``, ``dead(u, 0.05)``, ``sat(dead(u, 0.05), 0.5:1.2)``."""
     kind, value, _ = words.peek()
     if kind != "name" or value == "D":
         raise words.fail("the name of a signal")
+    law = next((law for law in LIMITS if SHORT[law] == value and words.peek(1)[1] == "("), None)
     words.take()
-    return order, value
+    if law is None:
+        words.plain.add(value)
+        return value
+    words.take()
+    before = set(words.plain)
+    signal = _parse_signal(words)
+    words.plain = before | (words.plain - {signal})
+    if law == "dead_zone" and (signal, "saturation") in words.limits:
+        raise ModelError(
+            f"equation {words.text!r}: a dead zone acts before a saturation: write sat(dead({signal}, …), …)"
+        )
+    if words.take()[1] != ",":
+        words.position -= 1
+        raise words.fail("',' and the limit, as in sat(u, 0.94)")
+    ends = [_parse_number(words)]
+    if words.peek()[1] == ":":
+        words.take()
+        ends.append(_parse_number(words))
+    if words.take()[1] != ")":
+        words.position -= 1
+        raise words.fail("')'")
+    limit = ends[0] if len(ends) == 1 else (ends[0], ends[1])
+    if words.limits.setdefault((signal, law), limit) != limit:
+        raise ModelError(f"equation {words.text!r}: {signal} has two limits of one kind; an actuator has one")
+    return signal
+
+
+def _parse_number(words: _Words) -> float:
+    kind, value, _ = words.peek()
+    if kind != "number":
+        raise words.fail("a limit, or LEAST:LARGEST where it is estimated")
+    words.take()
+    return float(value)
 
 
 def _parse_order(words: _Words) -> Order:

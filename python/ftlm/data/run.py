@@ -15,6 +15,7 @@ from ftlm.base.checks import as_mapping, bad_rows, listed, names_to_columns, nea
 from ftlm.base.errors import DataError
 from ftlm.data.advice import Advice, advise
 from ftlm.data.asked import Asked, how_read
+from ftlm.data.limits import Limit
 from ftlm.data.measured import Measured
 from ftlm.data.names import check_signal_name
 from ftlm.data.readings import Readings, read
@@ -309,6 +310,15 @@ class Run(Measured):
                 readings = readings.changed(**{name: readings.data[name] - trend(readings.times)})
             facts.append(f"detrended: {words} subtracted from {name}")
         return self._with(_data=data, facts=tuple(facts), readings=readings)
+
+    def bent(self, limits: Sequence[Limit]) -> Run:
+        """Return this run with inputs as known saturations and dead zones let them act, sample by sample."""
+        data, readings = dict(self._data), self.readings
+        for limit in limits:
+            data[limit.signal] = limit.of(data[limit.signal])
+            if readings is not None:
+                readings = readings.changed(**{limit.signal: limit.of(readings.data[limit.signal])})
+        return self._with(_data=data, readings=readings)
 
     def rename(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with other signal names.

@@ -67,9 +67,10 @@ class Solved:
         if self.m is not None:
             check_pulses(self.m)
         check_decided(self.structure.offset)
-        if self.structure.free_delays:
-            late = ", ".join(self.structure.free_delays)
-            raise ModelError(f"the delay of {late} is still free; identify it first, or set it by with_delays")
+        if self.structure.free_inputs:
+            numbers = ", ".join(item.words for item in self.structure.free_inputs)
+            way = "with_delays" if self.structure.free_delays else "with_limits"
+            raise ModelError(f"the {numbers} is still free; identify it first, or set it by {way}")
         for item in self.structure.equations:
             if not item.is_identified:
                 free = [*item.order_names, *item.coefficient_names]

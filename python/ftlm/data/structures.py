@@ -14,6 +14,7 @@ from msgspec import UNSET, UnsetType
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Term, numeric
+from ftlm.data.limits import FreeInput, Limit, Value, check_limits, with_values
 from ftlm.data.orders import MAX_ORDER, Order, Values, parse_values
 
 
@@ -184,6 +185,8 @@ class Structure:
         Known delay of inputs [s].
     free_delays
         Least and largest delay of inputs whose delay is to be estimated [s].
+    limits
+        Saturations and dead zones of inputs, known or to be estimated.
     initial
         Initial terms, see :func:`equation`.
     sensor_filter
@@ -207,6 +210,7 @@ class Structure:
     coupling: Literal["measured", "simulated"] = "measured"
     delay: Mapping[str, float] = field(default_factory=dict)
     free_delays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    limits: tuple[Limit, ...] = ()
     initial: Initial = "auto"
     sensor_filter: SensorFilter | None = None
     coefficient_law: tuple[tuple[str, float, tuple[str, ...]], ...] = ()
@@ -237,8 +241,11 @@ class Structure:
             numbers = real_number(f"least delay of {name}", low), real_number(f"largest delay of {name}", high)
             if not 0 <= numbers[0] < numbers[1] < math.inf:
                 raise ModelError(f"delay of {name} from {low} to {high} s is no interval; give two rising times from 0")
-            if delay_name(name) in names or delay_name(name) in self.order_names:
-                raise ModelError(f"{delay_name(name)} is the delay of {name}; call the coefficient otherwise")
+        check_known("limited input", [limit.signal for limit in self.limits], external)
+        check_limits(self.limits, self.delay, self.free_delays)
+        for item in self.free_inputs:
+            if item.name in names or item.name in self.order_names:
+                raise ModelError(f"{item.name} is the {item.words}; call the coefficient otherwise")
         if self.sensor_filter is not None:
             check_known("filtered signal", self.sensor_filter.signals, self.signals)
         self._check_offset()
@@ -381,6 +388,7 @@ class Structure:
             coupling=coupling,
             delay={n: v for n, v in self.delay.items() if n in signals},
             free_delays={n: v for n, v in self.free_delays.items() if n in signals},
+            limits=tuple(limit for limit in self.limits if limit.signal in signals),
             sensor_filter=narrowed(self.sensor_filter, signals),
             coefficient_law=(),
             name=f"{self.name}, {', '.join(e.output for e in equations)}",
@@ -464,12 +472,52 @@ class Structure:
                 known[name] = delay
         return replace(self, delay=known, free_delays=free)
 
+    def with_limits(
+        self, *, saturation: Mapping[str, Value] | None = None, dead_zone: Mapping[str, Value] | None = None
+    ) -> Structure:
+        """Set saturations and dead zones of inputs, in their units: a number is known, (least, largest) is estimated.
+
+        Raises
+        ------
+        ModelError
+            A name that is no input, a limit that is no number above 0, no interval, or not estimated beside others.
+        """
+        limits = with_values(self.limits, "dead_zone", dead_zone or {})
+        return replace(self, limits=with_values(limits, "saturation", saturation or {}))
+
+    @property
+    def free_inputs(self) -> tuple[FreeInput, ...]:
+        """What is to be estimated of inputs: delays, then limits."""
+        late = [FreeInput(n, "delay", (ends[0], ends[1])) for n, ends in self.free_delays.items()]
+        return tuple([*late, *(limit.free for limit in self.limits if limit.free is not None)])
+
+    def with_inputs(self, values: Mapping[str, float]) -> Structure:
+        """Set free delays and limits by the names of their estimates, such as ``delay_u`` and ``sat_u``."""
+        delays = {n: values[delay_name(n)] for n in self.free_delays if delay_name(n) in values}
+        limits = tuple(
+            replace(limit, value=float(values[limit.name])) if limit.free and limit.name in values else limit
+            for limit in self.limits
+        )
+        return replace(self.with_delays(delays), limits=limits)
+
+    def as_given(self) -> Structure:
+        """The structure without free delays and limits: inputs as they were given."""
+        return replace(self, free_delays={}, limits=tuple(limit for limit in self.limits if limit.free is None))
+
+    def acting(self, digits: str = "r") -> dict[str, str]:
+        """How inputs are written that do not act as they are: ``sat(u(t - 0.035 s), 0.94)``."""
+        out = {n: f"{n}(t - {d:.6g} s)" for n, d in self.delay.items() if d > 0 and digits != "r"}
+        for limit in self.limits:
+            out[limit.signal] = limit.written(out.get(limit.signal, limit.signal), digits)
+        return out
+
     def __str__(self) -> str:
-        return "\n".join(f"{e}{self.offset_in_words}" for e in self.equations)
+        inputs = self.acting()
+        return "\n".join(f"{e.written(inputs)}{self.offset_in_words}" for e in self.equations)
 
     def written(self, item: Equation) -> str:
-        """Write an identified equation of this structure with its delays and its offset."""
-        return numeric(item, self.delay) + self.offset_in_words
+        """Write an identified equation of this structure with its delays, its limits and its offset."""
+        return numeric(item, self.acting(".6g")) + self.offset_in_words
 
     @property
     def offset_in_words(self) -> str:

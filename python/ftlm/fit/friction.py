@@ -101,8 +101,8 @@ def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str)
 
 def at(problem: FreeProblem, values: dict[str, float], origin: str) -> Attempt:
     """A start at named values."""
-    orders, coefficients, delays = problem.split([values[n] for n in problem.names])
-    return Attempt(orders, coefficients, origin, {}, delays)
+    orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
+    return Attempt(orders, coefficients, origin, {}, inputs)
 
 
 def driving(runs: Sequence[Run], structure: Structure) -> float:

@@ -18,7 +18,7 @@ from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
-from ftlm.solve.records import Record, initial_tuple, record, sensor_series
+from ftlm.solve.records import Record, acting, initial_tuple, record, sensor_series
 
 #: A descent ends where a whole step would lower the cost by a smaller share than this.
 TOLERANCE = 1e-9
@@ -37,8 +37,8 @@ def experiment(
     ``shares`` are those of the weights with which the compared samples of each output count; what was not read counts
     for nothing anyway.
     """
-    # Free delays are the core's to apply, to inputs as they were given.
-    structure = replace(problem.structure, free_delays={})
+    # What is free of inputs is the core's to apply, to inputs as they were given.
+    structure = problem.structure.as_given()
     rows = (run.length - 1) // decimation * decimation + 1
     if rows != run.length:
         run = run.slice(None, rows * run.step - run.step / 2)
@@ -105,7 +105,7 @@ def _instant(
     if name not in run or name in run.missing or (rec.sensor is not None and not structure.measured_through(name)):
         return None, False
     held = name in run.inputs and run.intersample[name] == "zoh"
-    values, delay = run[name], structure.delay.get(name, 0.0)
+    values, delay = acting(run, structure, name)[name], structure.delay.get(name, 0.0)
     if delay and held:
         # A command switches between samples after a delay: what it is then is the pulse that follows.
         means = rec.of(name)[::every]
@@ -123,12 +123,12 @@ class Attempt:
     coefficients: list[float]
     origin: str
     outcome: Any
-    delays: list[float] = field(default_factory=list)
+    inputs: list[float] = field(default_factory=list)
 
     @property
     def values(self) -> Floats:
-        """Orders, coefficients, delays."""
-        return np.array(self.orders + self.coefficients + self.delays)
+        """Orders, coefficients, numbers of inputs."""
+        return np.array(self.orders + self.coefficients + self.inputs)
 
     @property
     def level(self) -> float:
@@ -149,7 +149,7 @@ def descend(
     structure, signals = problem.structure, problem.structure.signals
     states = structure.filter_states(structure.initial) if structure.behind_filter else 0
     coordinates = problem.coordinates(attempt.coefficients, plain=plain)
-    bounds, ends = list(problem.bounds), [structure.free_delays[n] for n in problem.delays]
+    bounds, ends = list(problem.bounds), [item.bounds for item in problem.inputs]
     if held is not None:
         coefficient = held - len(bounds)
         if coefficient < 0:
@@ -157,35 +157,37 @@ def descend(
         elif coefficient < len(coordinates):
             coordinates[coefficient] = "held"
         else:
-            late = coefficient - len(coordinates)
-            ends[late] = (attempt.delays[late],) * 2
+            place = coefficient - len(coordinates)
+            ends[place] = (attempt.inputs[place],) * 2
+    inputs = [
+        (signals.index(item.signal), item.law, own, value)
+        for item, own, value in zip(problem.inputs, ends, attempt.inputs, strict=True)
+    ]
     if structure.has_friction:
-        outcome = _with_friction(problem, experiments, attempt, bounds, coordinates, evaluations, tolerance)
-        return Attempt(list(outcome["orders"]), list(outcome["coefficients"]), attempt.origin, outcome)
+        outcome = _with_friction(problem, experiments, attempt, bounds, coordinates, inputs, evaluations, tolerance)
+        numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
+        return Attempt(numbers[0], numbers[1], attempt.origin, outcome, numbers[2])
     outcome = _core.output_error(
         experiments, problem.laws(signals), bounds, coordinates, structure.coupling == "simulated",
         initial_tuple(structure.initial, structure.offset, states), attempt.orders, attempt.coefficients,
-        [
-            (signals.index(n), own, delay)
-            for n, own, delay in zip(problem.delays, ends, attempt.delays, strict=True)
-        ],
-        evaluations, tolerance,
+        inputs, evaluations, tolerance,
     )  # fmt: skip
-    orders, coefficients, delays = (list(outcome[n]) for n in ("orders", "coefficients", "delays"))
-    return Attempt(orders, coefficients, attempt.origin, outcome, delays)
+    numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
+    return Attempt(numbers[0], numbers[1], attempt.origin, outcome, numbers[2])
 
 
 def _with_friction(
     problem: FreeProblem, experiments: list[Any], attempt: Attempt, bounds: list[tuple[float, float]],
-    coordinates: list[str], evaluations: int, tolerance: float,
+    coordinates: list[str], inputs: Sequence[tuple[int, str, tuple[float, float], float]], evaluations: int,
+    tolerance: float,
 ) -> Any:  # fmt: skip
     """The same of a body that may stick: what its runs start with is no projection, and goes on from where it was."""
     structure = problem.structure
     known = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
     return _core.friction_error(
         experiments, problem.laws(structure.signals)[0], problem.strength(), bounds, coordinates,
-        initial_tuple(structure.initial, structure.offset), attempt.orders, attempt.coefficients, known, evaluations,
-        tolerance,
+        initial_tuple(structure.initial, structure.offset), attempt.orders, attempt.coefficients, inputs, known,
+        evaluations, tolerance,
     )  # fmt: skip
 
 

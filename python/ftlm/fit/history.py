@@ -87,7 +87,7 @@ def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
     """Whether what a fit from rest leaves over asks for a history."""
     problem = FreeProblem.of(structure)
     numbers = problem.named(list(joint.coefficients.values()))
-    solved = structure.with_orders(joint.orders).with_coefficients(numbers).with_delays(joint.delays)
+    solved = structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
     excess, terms, spread = 0.0, 0, 1.0
     for run in runs:
         ends = []

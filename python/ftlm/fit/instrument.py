@@ -62,12 +62,12 @@ def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], ans
             break
     attempt, slopes, instruments = here
     covariance = _covariance(measured, attempt, np.linalg.pinv(instruments @ slopes.T) @ instruments)
-    orders, coefficients, delays = problem.split(values.tolist())
+    orders, coefficients, inputs = problem.split(values.tolist())
     levels = measured.levels(attempt)
     return replace(
         joint, orders=dict(zip(problem.orders, orders, strict=True)),
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
-        delays=dict(zip(problem.delays, delays, strict=True)), covariance=covariance,
+        inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)), covariance=covariance,
         noise={o: level / w for (o, level), w in zip(levels.items(), weights, strict=True)},
         cost=float(attempt.outcome["cost"]), residuals=measured.residuals(attempt), refinement=every,
         converged=converged,
@@ -76,8 +76,8 @@ def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], ans
 
 def _moment(measured: Grid, clean: Grid, values: Floats) -> tuple[Attempt, Floats, Floats]:
     """Residuals and sensitivities on the measured inputs, and sensitivities on the clean ones."""
-    orders, coefficients, delays = measured.problem.split(values.tolist())
-    start = Attempt(orders, coefficients, "instruments", {}, delays)
+    orders, coefficients, inputs = measured.problem.split(values.tolist())
+    start = Attempt(orders, coefficients, "instruments", {}, inputs)
     at = measured.descend(start, 1, plain=True)
     instruments = clean.descend(start, 1, plain=True)
     return at, np.asarray(at.outcome["jacobian"]), np.asarray(instruments.outcome["jacobian"])

@@ -19,7 +19,7 @@ from ftlm.base.statistics import NORMAL_95, noise_of
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss
-from ftlm.data.structures import Initial, Structure, delay_name
+from ftlm.data.structures import Initial, Structure
 from ftlm.fit.extrapolation import feasible
 from ftlm.fit.friction import race_with_friction
 from ftlm.fit.grid import FINEST, Attempt, Grid
@@ -53,8 +53,8 @@ class JointFit:
     orders, coefficients
         Free orders and free coefficients by name; under a coefficient law the free ones of the law.
     covariance
-        Of orders, coefficients, then delays, robust to coloured residuals. Variances of what takes part in a direction
-        that the runs do not see are infinite, their covariances not numbers.
+        Of orders, coefficients, then numbers of inputs, robust to coloured residuals. Variances of what takes part in
+        a direction that the runs do not see are infinite, their covariances not numbers.
     noise
         Standard deviation of the residuals by output; under a robust loss from the median of their sizes.
     cost
@@ -74,8 +74,9 @@ class JointFit:
         By run and output, over the noise; NaN where nothing was read.
     products
         Coefficients that the coefficient law gives: sign and factors by name.
-    delays
-        Estimated delays [s] by input; in covariance and errors they stand last, as ``delay_`` and the input's name.
+    inputs
+        Estimated delays [s] and limits of inputs by name, such as ``delay_u`` and ``sat_u``; in covariance and errors
+        they stand last.
     initial, initial_terms
         Initial terms that were fitted, and how many coefficients they have on all runs together.
     robust
@@ -102,7 +103,7 @@ class JointFit:
     starts: list[tuple[float, str]]
     residuals: list[dict[str, Floats]]
     products: Mapping[str, tuple[float, tuple[str, ...]]] = field(default_factory=dict)
-    delays: dict[str, float] = field(default_factory=dict)
+    inputs: dict[str, float] = field(default_factory=dict)
     initial: Initial = "rest"
     initial_terms: int = 0
     robust: Robust | None = None
@@ -134,14 +135,20 @@ class JointFit:
         return out
 
     @property
+    def delays(self) -> dict[str, float]:
+        """Estimated delays [s] by input."""
+        late = "delay_"
+        return {n.removeprefix(late): v for n, v in self.inputs.items() if n.startswith(late)}
+
+    @property
     def names(self) -> list[str]:
         """Parameters in the order of the covariance."""
-        return [*self.orders, *self.coefficients, *map(delay_name, self.delays)]
+        return [*self.orders, *self.coefficients, *self.inputs]
 
     @property
     def values(self) -> Floats:
         """Parameters in the order of the covariance."""
-        return np.array([*self.orders.values(), *self.coefficients.values(), *self.delays.values()])
+        return np.array([*self.orders.values(), *self.coefficients.values(), *self.inputs.values()])
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -202,8 +209,8 @@ def fit_output_error(
         reached = runners(alike, floor, threads, progress)
         starts, contenders = [(a.level, a.origin) for a in reached], finalists(reached)
     else:
-        orders, coefficients, delays = problem.split([start[n] for n in problem.names])
-        contenders = [Attempt(orders, coefficients, "given start", {}, delays)]
+        orders, coefficients, inputs = problem.split([start[n] for n in problem.names])
+        contenders = [Attempt(orders, coefficients, "given start", {}, inputs)]
     if not contenders:
         raise ConvergenceError(
             f"no start of {', '.join(outputs)} has a finite free run; check the signs of the data and the bounds"
@@ -284,13 +291,13 @@ def joint_fit(optimum: Optimum, starts: list[tuple[float, str]]) -> JointFit:
     best, grid = optimum.attempt, optimum.grid
     problem = grid.problem
     low, high = np.array(problem.all_bounds).T
-    orders, coefficients, delays = problem.split(np.clip(optimum.estimate, low, high).tolist())
+    orders, coefficients, inputs = problem.split(np.clip(optimum.estimate, low, high).tolist())
     levels = grid.levels(best) if grid.shares is None else scales(grid, best)
     residuals = grid.residuals(best)
     return JointFit(
         orders=dict(zip(problem.orders, orders, strict=True)),
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
-        delays=dict(zip(problem.delays, delays, strict=True)), products=dict(problem.products),
+        inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)), products=dict(problem.products),
         covariance=covariance(best, grid), residuals=residuals,
         robust=None if grid.shares is None else Robust.of(grid, best), shares=grid.shares, on_grid=best.values,
         noise={o: level / w for (o, level), w in zip(levels.items(), grid.weights, strict=True)},

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.arrays import Floats
+from ftlm.data.limits import FreeInput
 from ftlm.data.orders import MAX_ORDER, SEARCHED_ORDER, Order
-from ftlm.data.structures import Hints, Structure, delay_name
+from ftlm.data.structures import Hints, Structure
 from ftlm.solve.records import affine
 
 #: Own bounds of orders where the structure gives none.
@@ -32,21 +33,21 @@ class FreeProblem:
     coefficients: tuple[str, ...]
     bounds: tuple[tuple[float, float], ...]
     products: Mapping[str, tuple[float, tuple[str, ...]]]
-    delays: tuple[str, ...] = ()
+    inputs: tuple[FreeInput, ...] = ()
 
     @property
     def names(self) -> list[str]:
-        """Everything that is free: orders, coefficients, then delays."""
-        return [*self.orders, *self.coefficients, *map(delay_name, self.delays)]
+        """Everything that is free: orders, coefficients, then numbers of inputs."""
+        return [*self.orders, *self.coefficients, *(item.name for item in self.inputs)]
 
     @property
     def all_bounds(self) -> list[tuple[float, float]]:
         """Bounds of everything that is free; those of coefficients are infinite."""
-        ends = [self.structure.free_delays[n] for n in self.delays]
+        ends = [item.bounds for item in self.inputs]
         return [*self.bounds, *[(-math.inf, math.inf)] * len(self.coefficients), *ends]
 
     def split(self, values: Sequence[float]) -> tuple[list[float], list[float], list[float]]:
-        """Values of orders, coefficients and delays."""
+        """Values of orders, coefficients and numbers of inputs."""
         flat = list(map(float, values))
         first, second = len(self.orders), len(self.orders) + len(self.coefficients)
         return flat[:first], flat[first:second], flat[second:]
@@ -74,9 +75,7 @@ class FreeProblem:
             inertia = {n: (max(ends[n][0], FRICTION_BOUNDS[0]), min(ends[n][1], FRICTION_BOUNDS[1])) for n in highest}
             bounds = list((ends | inertia).values())
         coefficients = tuple(dict.fromkeys(free))
-        return cls(
-            structure, structure.order_names, coefficients, tuple(bounds), products, tuple(structure.free_delays)
-        )
+        return cls(structure, structure.order_names, coefficients, tuple(bounds), products, structure.free_inputs)
 
     def coordinates(self, start: Sequence[float], *, plain: bool) -> list[str]:
         """Logarithms where the start allows them."""
@@ -133,10 +132,10 @@ class FreeProblem:
         """Derivatives of a model's numbers (rows) with respect to everything that is free (columns).
 
         Rows are, equation by equation, alpha, then order and coefficient of each term, then the coefficient of friction
-        where there is some; delays are none of them.
+        where there is some; numbers of inputs are none of them.
         """
         free = dict(zip(self.coefficients, coefficients, strict=True))
-        count, idle = len(self.orders), len(self.delays)
+        count, idle = len(self.orders), len(self.inputs)
         rows = []
 
         def of_order(order: Order) -> Floats:

@@ -429,8 +429,8 @@ def half_width(level: float) -> float:
 
 
 def _attempt(grid: Grid, values: Floats) -> Attempt:
-    orders, coefficients, delays = grid.problem.split(values.tolist())
-    return Attempt(orders, coefficients, "profile", {}, delays)
+    orders, coefficients, inputs = grid.problem.split(values.tolist())
+    return Attempt(orders, coefficients, "profile", {}, inputs)
 
 
 def _middle(start: float, side: float, inside: float, outside: float) -> float:

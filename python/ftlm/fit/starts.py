@@ -12,8 +12,9 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.equations import Equation
+from ftlm.data.limits import FreeInput
 from ftlm.data.orders import SEARCHED_ORDER
-from ftlm.data.readings import bridged
+from ftlm.data.readings import bridged, read
 from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Hints, Structure
@@ -53,6 +54,8 @@ SCANNED = 4
 #: and at most so many over all delayed inputs.
 DELAY_PHASE = 1.0
 DELAY_STARTS = 12
+#: Limits are tried at so many values from this share of the largest input.
+LIMIT_STARTS, LEAST_LIMIT = 4, 0.1
 
 
 def power_frequency(run: Run, output: str) -> float:
@@ -109,25 +112,38 @@ def natural_axes(problem: FreeProblem) -> dict[str, list[float]] | None:
 
 
 def delayed_attempts(runs: Sequence[Run], problem: FreeProblem, threads: int) -> list[Attempt]:
-    """Starts at several delays where some are free: a fit from too far away in time ends on a wrong oscillation."""
-    if not problem.delays:
+    """Starts at several delays and limits where some are free.
+
+    A fit from too far away in time ends on a wrong oscillation; a limit that no sample reaches moves nothing.
+    """
+    if not problem.inputs:
         return start_attempts(runs, problem, threads)
     fastest = max(power_frequency(run, o) for run in runs for o in problem.structure.outputs)
     axes = []
-    for name in problem.delays:
-        low, high = problem.structure.free_delays[name]
-        wanted = math.ceil((high - low) * fastest / DELAY_PHASE) + 1
-        most = max(2, int(DELAY_STARTS ** (1.0 / len(problem.delays))))
-        axes.append(np.linspace(low, high, min(max(wanted, 2), most)).tolist())
+    most = max(2, int(DELAY_STARTS ** (1.0 / len(problem.inputs))))
+    for item in problem.inputs:
+        low, high = item.bounds
+        if item.law == "delay":
+            wanted = math.ceil((high - low) * fastest / DELAY_PHASE) + 1
+            axes.append(np.linspace(low, high, min(max(wanted, 2), most)).tolist())
+        else:
+            largest = max(float(np.max(np.abs(read(run[item.signal])), initial=0.0)) for run in runs)
+            least, reached = max(low, LEAST_LIMIT * largest), min(high, largest)
+            axes.append(np.linspace(min(least, reached), reached, min(LIMIT_STARTS, most) + 1).tolist()[:-1])
     attempts = []
     for point in itertools.product(*axes):
-        known = problem.structure.with_delays(dict(zip(problem.delays, point, strict=True)))
-        words = ", ".join(f"{1e3 * v:.3g} ms" for v in point)
+        known = problem.structure.with_inputs({i.name: v for i, v in zip(problem.inputs, point, strict=True)})
+        words = ", ".join(_at(item, v) for item, v in zip(problem.inputs, point, strict=True))
         attempts += [
-            replace(attempt, origin=f"{attempt.origin}, delay {words}", delays=list(point))
+            replace(attempt, origin=f"{attempt.origin}, {words}", inputs=list(point))
             for attempt in start_attempts(runs, FreeProblem.of(known), threads)
         ]
     return attempts
+
+
+def _at(item: FreeInput, value: float) -> str:
+    """Where a start is, in words."""
+    return f"delay {1e3 * value:.3g} ms" if item.law == "delay" else f"{item.name} {value:.3g}"
 
 
 def start_attempts(runs: Sequence[Run], problem: FreeProblem, threads: int) -> list[Attempt]:

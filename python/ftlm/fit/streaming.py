@@ -54,9 +54,15 @@ class Streaming:
                 f"offset = {structure.offset!r} cannot be followed in a stream; identify the recorded run, or use "
                 "offset='none'"
             )
-        if structure.delay or structure.sensor_filter is not None or structure.initial not in ("auto", "rest"):
+        if (
+            structure.delay
+            or structure.limits
+            or structure.sensor_filter is not None
+            or structure.initial not in ("auto", "rest")
+        ):
             raise ModelError(
-                "delays, initial terms and sensor filters cannot be followed in a stream; identify the recorded run"
+                "delays, limits, initial terms and sensor filters cannot be followed in a stream; identify the "
+                "recorded run"
             )
         self.signals = tuple(structure.signals)
         self.structure = structure

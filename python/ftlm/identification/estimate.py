@@ -109,7 +109,7 @@ def by_output_error(
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
-    record = prepare(task.runs, replace(structure, free_delays={}), m, power_of_two=False, gaps=True)[0]
+    record = prepare(task.runs, structure.as_given(), m, power_of_two=False, gaps=True)[0]
     start = record.initial
     joint = fit_any_start(answers or task.runs, structure, start, threads=threads, progress=progress, loss=loss)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
@@ -134,7 +134,7 @@ def by_output_error(
     spread = moved @ joint.covariance @ moved.T
     return Fit(
         Task(task.runs, structure), "output-error",
-        solved(task, "output-error", identified.with_delays(joint.delays), {**known, **joint.orders}, record.m),
+        solved(task, "output-error", identified.with_inputs(joint.inputs), {**known, **joint.orders}, record.m),
         len(joint.names),
         {
             "method": "output-error", "m": record.m, "initial": in_words(joint.initial),

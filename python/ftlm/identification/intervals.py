@@ -81,9 +81,9 @@ def is_lower(grid: Grid, before: Floats, after: Floats) -> bool:
     """
     finer, costs = grid.finer, []
     for values in (before, after):
-        orders, coefficients, delays = grid.problem.split(values.tolist())
+        orders, coefficients, inputs = grid.problem.split(values.tolist())
         try:
-            there = finer.descend(Attempt(orders, coefficients, "finer grid", {}, delays), 1, plain=True)
+            there = finer.descend(Attempt(orders, coefficients, "finer grid", {}, inputs), 1, plain=True)
         except FtlmError:
             return False
         costs.append(float(there.outcome["cost"]))

@@ -98,8 +98,14 @@ class Judged:
         return dict(self.model.structure.delay)
 
     @property
+    def limits(self) -> dict[str, float]:
+        """Saturations (``sat_u``) and dead zones (``dead_u``) of inputs in their units, estimated or known."""
+        known = [(limit.name, limit.value) for limit in self.model.structure.limits]
+        return {n: float(v) for n, v in known if not isinstance(v, tuple)}
+
+    @property
     def joint_values(self) -> dict[str, float]:
-        """Orders, coefficients and delays of the joint fit by name; empty without one."""
+        """Orders, coefficients and numbers of inputs of the joint fit by name; empty without one."""
         return {} if self.joint is None else dict(zip(self.joint.names, self.joint.values.tolist(), strict=True))
 
     @property

@@ -145,5 +145,5 @@ class Around:
 
 def _moved(grid: Grid, values: Floats, evaluations: int) -> Attempt:
     """Descend from given values of everything free."""
-    orders, coefficients, delays = grid.problem.split(values.tolist())
-    return grid.descend(Attempt(orders, coefficients, "landscape", {}, delays), evaluations, plain=True)
+    orders, coefficients, inputs = grid.problem.split(values.tolist())
+    return grid.descend(Attempt(orders, coefficients, "landscape", {}, inputs), evaluations, plain=True)

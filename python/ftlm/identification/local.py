@@ -82,8 +82,8 @@ def at_point(
 ) -> tuple[Grid, Attempt]:
     """The output error at given numbers, each output weighing as its residuals ask for."""
     problem = FreeProblem.of(replace(structure, initial=decided_together(runs, structure)))
-    orders, coefficients, delays = problem.split([values[n] for n in problem.names])
-    start = Attempt(orders, coefficients, "given", {}, delays)
+    orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
+    start = Attempt(orders, coefficients, "given", {}, inputs)
     grid = Grid(problem, runs, [1.0] * len(structure.outputs), every=every)
     levels = grid.levels(grid.descend(start, 1, plain=True))
     grid = replace(grid, weights=[1.0 / max(level, 1e-300) for level in levels.values()])

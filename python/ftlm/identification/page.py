@@ -11,6 +11,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from ftlm.base.output import check_free
+from ftlm.data.limits import WORDS
 from ftlm.data.run import Run
 from ftlm.data.several import as_runs
 from ftlm.fit.joint import JointFit
@@ -124,7 +125,7 @@ def first_sections(
     points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
     drawn = [f for label, c in compared for f in comparison_charts(c, units=units, label=label, points=points)]
     equations = [
-        *(equation_html(e, model.structure.delay) for e in model.equations),
+        *(equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations),
         STICKS if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
     ]
     sections = [
@@ -159,6 +160,9 @@ def frequency_section(model: Model, steps: Sequence[tuple[float, float]]) -> Sec
     """Gain and phase as far as runs of these steps and durations show them."""
     if model.structure.has_friction:
         words = "A body that may stick has none: its answer is not in proportion to what drives it."
+        return Section("Frequency response", words)
+    if model.structure.limits:
+        words = "A model whose inputs saturate or have a dead zone has none: its answer is not in proportion to them."
         return Section("Frequency response", words)
     omega = response_frequencies(model, *min(steps)) if steps else response_frequencies(model)
     words = "Exact, orders as they are; the equations together, from what is not modelled."
@@ -291,6 +295,7 @@ def settings_table(result: Judged, *, title: str = "What the result depends on")
         *settings_rows(result.settings, searched=bool(result.searches)),
     ]
     rows += [[f"delay of {symbol(name)}", f"{delay:g} s"] for name, delay in structure.delay.items()]
+    rows += [[f"{WORDS[limit.law]} of {symbol(limit.signal)}", f"{limit.value:g}"] for limit in structure.limits]
     if structure.sensor_filter is not None:
         filtered = ", ".join(symbol(o) for o in structure.sensor_filter.signals)
         rows.append(["known sensor filter on", filtered])
@@ -309,7 +314,10 @@ def identification_html(result: Judged) -> str:
     """Return warnings, equations, parameters with intervals, both errors and the residual verdicts."""
     model = result.model
     parts = [warned(result.warnings)]
-    parts += [Markup("<p>{}</p>").format(equation_html(e, model.structure.delay)) for e in model.equations]
+    parts += [
+        Markup("<p>{}</p>").format(equation_html(e, model.structure.delay, model.structure.limits))
+        for e in model.equations
+    ]
     parts.append(parameter_table(model, result.joint).to_html())
     parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
     if result.residuals is not None:

@@ -196,6 +196,7 @@ class Identification(Judged):
             "orders": self.orders,
             "coefficients": self.coefficients,
             "delays": self.delays,
+            **({"limits": self.limits} if self.limits else {}),
             "standard_errors": {n: finite(e) for n, e in self.standard_errors.items()},
             "intervals": {n: [finite(low), finite(high)] for n, (low, high) in self.intervals.items()},
             "profiled": list(self.profiles),

@@ -14,7 +14,7 @@ from ftlm.base.statistics import ROUNDING, is_white, robust_deviation
 from ftlm.data.advice import excitation_for
 from ftlm.data.readings import read
 from ftlm.data.run import Run
-from ftlm.data.structures import Structure, delay_name
+from ftlm.data.structures import Structure
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.robust import FAR
@@ -70,16 +70,15 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             warnings.append(f"order {name} cannot be told from these runs: its standard error exceeds its bounds")
         elif min(value - low, high - value) < 1e-6 and high > low and value != 0:
             warnings.append(f"order {name} = {value:g} is on its bound; widen it")
-    for signal, value in joint.delays.items():
-        low, high = problem.structure.free_delays[signal]
-        if delay_name(signal) in unseen:
+    for item in problem.inputs:
+        value, (low, high) = joint.inputs[item.name], item.bounds
+        if item.name in unseen:
             continue
-        if not errors[delay_name(signal)] <= high - low and not _bounded(joint, delay_name(signal)):
-            warnings.append(
-                f"the delay of {signal} cannot be told from these runs: its standard error exceeds its bounds"
-            )
+        if not errors[item.name] <= high - low and not _bounded(joint, item.name):
+            warnings.append(f"the {item.words} cannot be told from these runs: its standard error exceeds its bounds")
         elif high - value < 1e-6 * (high - low) or (low > 0 and value - low < 1e-6 * (high - low)):
-            warnings.append(f"the delay of {signal} = {value:g} s is on its bound; widen it")
+            unit = " s" if item.law == "delay" else ""
+            warnings.append(f"the {item.words} = {value:g}{unit} is on its bound; widen it")
     for name, value in joint.coefficients.items():
         # Where the cost is no parabola, its profile knows better.
         told = name in joint.profiles and 0.0 not in joint.profiles[name]

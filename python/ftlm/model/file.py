@@ -14,6 +14,7 @@ from msgspec import UNSET, UnsetType
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import write_atomically
 from ftlm.data.equations import Equation, Friction, Term
+from ftlm.data.limits import Limit
 from ftlm.data.orders import Order
 from ftlm.data.solved import Estimate, Solved
 from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
@@ -21,8 +22,9 @@ from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
 #: Largest model file read: a model is a few kilobytes.
 MAX_MODEL_BYTES = 1 << 20
 #: Schema of a model that every version since the first reads, of one that has an offset, of one that has intervals by
-#: profile likelihood or whose sensor filter names what is no output, and of one that has friction.
-SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA = 2, 3, 4, 5
+#: profile likelihood or whose sensor filter names what is no output, of one that has friction, and of
+#: one whose inputs have limits.
+SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA = 2, 3, 4, 5, 6
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -41,6 +43,14 @@ class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
     coefficient: float
     factor: float = -1.0
     name: str | None = None
+
+
+class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
+    """A saturation or a dead zone of an input, in its unit."""
+
+    signal: str
+    law: Literal["saturation", "dead_zone"]
+    value: float
 
 
 class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -117,6 +127,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
     about: dict[str, str | float | int | bool | None]
     estimate: Estimate | None = None
     offset: Offset | UnsetType = UNSET
+    limits: list[LimitFile] | UnsetType = UNSET
 
     @classmethod
     def of(cls, model: Solved) -> ModelFile:
@@ -125,11 +136,14 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         # Written only where there is one, so that what has none is as it was.
         offset: Offset | UnsetType = UNSET if s.offset == "none" else s.offset
         sensor = FilterFile.of(s)
+        known = [(limit, limit.value) for limit in s.limits]
+        limits = [LimitFile(limit.signal, limit.law, v) for limit, v in known if not isinstance(v, tuple)] or UNSET
+        least = FRICTION_SCHEMA if s.has_friction else schema_of(offset, sensor, model.estimate)
         return cls(
-            "ftlm-model", FRICTION_SCHEMA if s.has_friction else schema_of(offset, sensor, model.estimate), s.name,
+            "ftlm-model", least if limits is UNSET else LIMIT_SCHEMA, s.name,
             [EquationFile.of(e) for e in s.equations], s.coupling, dict(s.delay),
             s.initial if isinstance(s.initial, str) else list(s.initial), sensor, dict(model.units),
-            dict(model.orders), model.m, dict(model.about), model.estimate, offset,
+            dict(model.orders), model.m, dict(model.about), model.estimate, offset, limits,
         )  # fmt: skip
 
     def solved(self) -> Solved:
@@ -146,6 +160,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             equations=tuple(e.equation() for e in self.equations), coupling=self.coupling, delay=self.delay,
             initial=check_initial(self.initial), sensor_filter=sensor, name=self.name,
             offset="none" if self.offset is UNSET else self.offset,
+            limits=() if self.limits is UNSET else tuple(Limit(x.signal, x.law, x.value) for x in self.limits),
         )  # fmt: skip
         if self.estimate is not None and self.estimate.covariance is not None:
             count = sum(1 + 2 * len(e.terms) + (e.friction is not UNSET) for e in self.equations)
@@ -188,7 +203,13 @@ def read_model(path: str | os.PathLike[str]) -> Solved:
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
     rubs = any(e.friction is not UNSET for e in read.equations)
-    latest = FRICTION_SCHEMA if rubs else schema_of(read.offset, read.sensor_filter, read.estimate)
+    latest = (
+        LIMIT_SCHEMA
+        if read.limits is not UNSET
+        else FRICTION_SCHEMA
+        if rubs
+        else schema_of(read.offset, read.sensor_filter, read.estimate)
+    )
     if read.schema > latest or read.schema < 1:
         raise DataError(f"{file} has schema {read.schema}, this version reads up to {latest}; upgrade ftlm")
     try:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from markupsafe import Markup
 from msgspec import UNSET
 
 from ftlm.base.statistics import NORMAL_95
 from ftlm.data.equations import Equation
+from ftlm.data.limits import SHORT, WORDS, Limit
 from ftlm.data.orders import Order
 from ftlm.data.solved import Solved
 from ftlm.data.structures import delay_name
@@ -21,10 +22,11 @@ from ftlm.paint.text import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_h
 ORDER_DECIMALS = 4
 THIN = Markup('<mspace width="0.17em"></mspace>')  # our constant
 _LATE = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
+_LIMITED = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
 _PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
-def equation_html(item: Equation, delay: Mapping[str, float] | None = None) -> Markup:
+def equation_html(item: Equation, delay: Mapping[str, float] | None = None, limits: Sequence[Limit] = ()) -> Markup:
     """Return an identified equation typeset as MathML, a piece for each term so that it breaks between terms.
 
     Parameters
@@ -33,6 +35,8 @@ def equation_html(item: Equation, delay: Mapping[str, float] | None = None) -> M
         The equation.
     delay
         Delays of inputs [s]; a delayed input is written u(t − 0.035 s).
+    limits
+        Known saturations and dead zones of inputs; one that saturates is written sat(u, 0.94).
     """
     parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
     for k, term in enumerate(item.terms):
@@ -41,7 +45,7 @@ def equation_html(item: Equation, delay: Mapping[str, float] | None = None) -> M
         # The first sign belongs to its number; the others stand between two terms.
         lead = Markup('<mo form="{}">{}</mo>').format("infix" if k else "prefix", sign) if sign else Markup("")
         parts.append(_math(lead + _number_math(abs(value)) + THIN +
-                           _derivative_math(term.order, term.signal, (delay or {}).get(term.signal, 0.0)),
+                           _derivative_math(term.order, term.signal, (delay or {}).get(term.signal, 0.0), limits),
                            "term"))  # fmt: skip
     if item.friction is not None:
         rubs = Markup('<mo form="infix">−</mo>') + _number_math(item.friction.strength or 0.0) + THIN
@@ -74,10 +78,13 @@ def _symbol_math(name: str) -> Markup:
     return Markup("<msub>{}<mn>{}</mn></msub>").format(stem, parts[2]) if parts[2] else stem
 
 
-def _derivative_math(order: Order, signal: str, delay: float = 0.0) -> Markup:
+def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequence[Limit] = ()) -> Markup:
     written = _symbol_math(signal)
     if delay > 0:
         written += _LATE.format(_number_math(Exact(delay)), THIN)
+    for limit in limits:
+        if limit.signal == signal and not isinstance(limit.value, tuple):
+            written = _LIMITED.format(SHORT[limit.law], written, _number_math(Exact(float(limit.value))))
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return written
     value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed(order.constant)
@@ -151,11 +158,15 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
             shown.add(name)
             place = Markup("Coulomb friction in the equation of {}").format(symbol_html(item.output))
             rows.append(row(name, float(item.friction.coefficient), reference.get(name), place))
-    delays = {delay_name(n): (n, v) for n, v in model.structure.delay.items() if delay_name(n) in errors}
+    inputs = {delay_name(n): (f"delay of {symbol(n)} in s", v) for n, v in model.structure.delay.items()}
+    for limit in model.structure.limits:
+        if not isinstance(limit.value, tuple):
+            inputs[limit.name] = (f"{WORDS[limit.law]} of {symbol(limit.signal)}", limit.value)
+    inputs = {n: known_of for n, known_of in inputs.items() if n in errors}
     rows += [
-        row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown and n not in delays
+        row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown and n not in inputs
     ]
-    rows += [row(n, v, None, f"delay of {symbol(signal)} in s") for n, (signal, v) in delays.items()]
+    rows += [row(n, v, None, place) for n, (place, v) in inputs.items()]
     columns = ["parameter", "value", "standard error", "from", "to", "stated", "what it is"]
     if known:
         note = "A coefficient without an interval follows from the law. Intervals hold as far as the model does."
@@ -175,7 +186,8 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
 def model_html(model: Solved) -> str:
     """Return the equations of a model and its parameters."""
     lines = Markup("").join(
-        Markup("<p>{}</p>").format(equation_html(e, model.structure.delay)) for e in model.equations
+        Markup("<p>{}</p>").format(equation_html(e, model.structure.delay, model.structure.limits))
+        for e in model.equations
     )
     known = model.orders or any(t.name for e in model.equations for t in e.terms)
     return str(lines + parameter_table(model).to_html() if known else lines)

@@ -42,7 +42,7 @@ def stage_section(
     """The joint model's equations, then tables with that of all searches, and figures."""
     searches = {f"{n}, {o}": s for n, r in results.items() if r is not None for o, s in r.searches.items()}
     words = "Joint output error, order law and coefficient law imposed:"
-    equations = [equation_html(e, joint.structure.delay) for e in joint.equations]
+    equations = [equation_html(e, joint.structure.delay, joint.structure.limits) for e in joint.equations]
     return Section(
         heading, [words, *equations, *notes], warnings=grouped_warnings(results),
         tables=[*shown, search_summary(searches)], figures=charts,
@@ -214,6 +214,6 @@ def reproduction_text(found: Recomputed) -> str:
         }  # fmt: skip
         lines += fits_text(fits, 26, [16] * 4)
         best = stage.candidates["output error"].model
-        lines += [f"  {numeric(e, best.structure.delay)}" for e in best.equations]
+        lines += [f"  {numeric(e, best.structure.acting('.6g'))}" for e in best.equations]
     lines += [f"note: {n}" for n in found.notes]
     return "\n".join(lines)

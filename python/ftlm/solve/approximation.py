@@ -17,7 +17,7 @@ from ftlm.base.arrays import Floats
 from ftlm.base.checks import real_number, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.data.solved import Solved
-from ftlm.solve.frequency import frequency_response, response_inputs
+from ftlm.solve.frequency import check_unlimited, frequency_response, response_inputs
 from ftlm.solve.records import check_linear
 from ftlm.solve.stability import stability
 
@@ -227,6 +227,7 @@ def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> 
     if count is None or not 1 <= count <= LARGEST_ORDER:
         raise ModelError(f"order = {order!r} is no whole number from 1 to {LARGEST_ORDER}")
     check_linear(model.equations, "a linear system in state space")
+    check_unlimited(model, "a linear system in state space")
     inputs, outputs = response_inputs(model, coupled=True), model.outputs
     builder = _Builder(len(inputs), len(outputs))
     delays = model.structure.delay

@@ -13,7 +13,7 @@ from ftlm.base.errors import ModelError
 from ftlm.data.equations import numeric
 from ftlm.data.solved import Solved
 from ftlm.solve.approximation import approximate, identifier
-from ftlm.solve.frequency import transfer_functions
+from ftlm.solve.frequency import check_unlimited, transfer_functions
 
 
 def _comment(text: str, mark: str) -> str:
@@ -24,6 +24,7 @@ def _comment(text: str, mark: str) -> str:
 
 def json_text(model: Solved) -> str:
     """The transfer functions of a model as JSON, exact in powers and coefficients."""
+    check_unlimited(model, "a transfer function")
     transfer = transfer_functions(model)
     document = {
         "format": "ftlm-transfer-functions",
@@ -46,6 +47,7 @@ def json_text(model: Solved) -> str:
 
 def matlab_text(model: Solved) -> str:
     """A MATLAB script: the transfer functions as vectors, and as FOMCON's ``fotf`` objects where FOMCON is there."""
+    check_unlimited(model, "a transfer function")
     transfer = transfer_functions(model)
 
     def vector(values: Sequence[float]) -> str:
@@ -53,7 +55,7 @@ def matlab_text(model: Solved) -> str:
 
     lines = [
         _comment(f"{model.structure.name}, written by ftlm {__version__}", "%"),
-        *(_comment(numeric(e, model.structure.delay), "%") for e in model.equations),
+        *(_comment(numeric(e, model.structure.acting(".6g")), "%") for e in model.equations),
         "% G_y_u = (b(1)*s^nb(1) + ...)/(a(1)*s^na(1) + ...)*exp(-s*delay); SI units.",
         "% FOMCON (https://fomcon.net) makes fotf objects of them; without it the vectors remain.",
     ]
@@ -93,7 +95,7 @@ def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) ->
 
     lines = [
         _comment(f"{model.structure.name}, written by ftlm {__version__}", "#"),
-        *(_comment(numeric(e, model.structure.delay), "#") for e in model.equations),
+        *(_comment(numeric(e, model.structure.acting(".6g")), "#") for e in model.equations),
         *(_comment(line, "#") for line in str(near).splitlines()),
         "import control",
         "import numpy as np",

@@ -14,7 +14,7 @@ from ftlm.base.errors import ConvergenceError, DataError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved, check_solved
 from ftlm.data.structures import check_initial
-from ftlm.solve.records import MAX_M, Record, equation_tuple, records, sensor_series
+from ftlm.solve.records import MAX_M, Record, acting, equation_tuple, records, sensor_series
 from ftlm.solve.sampled import refined
 
 
@@ -188,6 +188,7 @@ def explicit_euler(model: Solved, run: Run, *, step: Literal["record"] = "record
     if step != "record":
         raise ModelError(f"step = {step!r} is not known; Euler steps at the record's own step: resample the run")
     signals = model.structure.signals
+    run = acting(run, model.structure)
     rows = [run[s] if s not in model.outputs else np.zeros(run.length) for s in signals]
     equations = [equation_tuple(e, signals) for e in model.equations]
     inputs = [s not in model.outputs for s in signals]

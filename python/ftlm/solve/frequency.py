@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ftlm.base.arrays import Complex, Floats
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.equations import Equation, Term
+from ftlm.data.limits import WORDS
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
@@ -28,6 +29,15 @@ GRAIN = 1e-9
 CANCELLED = 1e-13
 #: Relative step of the numerical derivatives of the delta method.
 DELTA = 1e-6
+
+
+def check_unlimited(model: Solved, what: str) -> None:
+    """Refuse saturations and dead zones where only what is linear is known."""
+    for limit in model.structure.limits:
+        raise ModelError(
+            f"{limit.signal} passes a {WORDS[limit.law]} before it acts, which {what} does not know; use free runs "
+            "(simulate, compare), or a model of the equation without it"
+        )
 
 
 def response_inputs(model: Solved, *, coupled: bool) -> tuple[str, ...]:
@@ -190,8 +200,9 @@ def frequency_response(model: Solved, w: ArrayLike, *, coupling: str = "simulate
     DataError
         Frequencies that are not finite numbers from 0.
     ModelError
-        Another coupling.
+        Another coupling, an input that saturates or has a dead zone.
     """
+    check_unlimited(model, "a frequency response")
     coupled = is_coupled(coupling)
     omega = np.asarray(w, dtype=np.float64)
     if omega.ndim != 1 or omega.size == 0:
@@ -342,9 +353,12 @@ def step_response(model: Solved, time: ArrayLike, *, tolerance: float = 1e-6) ->
     ------
     DataError
         Instants that are not regular from 0.
+    ModelError
+        An input that saturates or has a dead zone.
     ConvergenceError
         A model so unstable that the response leaves the range of numbers.
     """
+    check_unlimited(model, "a step response")
     t = np.asarray(time, dtype=np.float64)
     if t.ndim != 1 or t.size < 3 or not np.all(np.isfinite(t)) or t[0] != 0:
         raise DataError("time must be a vector of at least three instants [s] that begins with 0, such as numpy.arange")

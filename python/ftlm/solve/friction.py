@@ -64,7 +64,7 @@ def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | 
     )  # fmt: skip
     strength = 0.0 if item.friction is None else float(item.friction.strength or 0.0)
     return _core.friction_error(
-        [experiment], law, (strength, []), [], [], initial_tuple(rec.initial, rec.offset), [], [],
+        [experiment], law, (strength, []), [], [], initial_tuple(rec.initial, rec.offset), [], [], [],
         [] if near is None else [near], EVALUATIONS, STILL,
     )  # fmt: skip
 

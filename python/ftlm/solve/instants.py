@@ -12,7 +12,7 @@ from ftlm.data.readings import Readings
 from ftlm.data.run import Run
 from ftlm.data.samples import HELD
 from ftlm.data.structures import Structure
-from ftlm.solve.records import Record
+from ftlm.solve.records import Record, acting
 
 
 def has_own_times(run: Run, structure: Structure) -> bool:
@@ -45,6 +45,7 @@ class Instants:
     @classmethod
     def of(cls, run: Run, record: Record, structure: Structure, times: Floats) -> Instants:
         """At some times of a run; a regular one was read on its grid."""
+        run = acting(run, structure)
         readings = run.readings or Readings(run.time, {n: run[n] for n in run.signals})
         return cls(run, record, structure, readings, times)
 

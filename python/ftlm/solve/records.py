@@ -15,6 +15,7 @@ from ftlm.base.arrays import Floats
 from ftlm.base.checks import check_pulses, nearest
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.equations import Equation, Term
+from ftlm.data.limits import WORDS
 from ftlm.data.orders import Order
 from ftlm.data.readings import bridged
 from ftlm.data.run import Run
@@ -151,6 +152,18 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
     )
 
 
+def acting(run: Run, structure: Structure, name: str | None = None) -> Run:
+    """The run with its inputs, or one of them, as known saturations and dead zones let them act."""
+    free = next((limit for limit in structure.limits if limit.free is not None), None)
+    if free is not None:
+        raise ModelError(
+            f"the {WORDS[free.law]} of {free.signal} is free: only method='output-error' estimates limits; give its "
+            "value"
+        )
+    limits = [limit for limit in structure.limits if limit.signal in run and name in (None, limit.signal)]
+    return run.bent(limits) if limits else run
+
+
 def check_held(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
     """Refuse the derivative of a jump: a held input above the order of the output that it drives.
 
@@ -182,7 +195,8 @@ def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool
     if not isinstance(runs, Runs) or m >= min(run.length for run in runs):
         return made()
     filtered = filtered or structure.sensor_filter is None
-    read = (structure.signals, structure.delay, structure.free_delays, structure.sensor_filter, structure.initial)
+    inputs = (structure.delay, structure.free_delays, structure.limits)
+    read = (structure.signals, inputs, structure.sensor_filter, structure.initial)
     start = (
         structure.offset,
         structure.outputs,
@@ -246,6 +260,7 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
             f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
             f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs= (commands: -u and -y)"
         )
+    run = acting(run, structure, name)
     samples = bridged(run[name])
     if name in structure.free_delays:
         raise ModelError(

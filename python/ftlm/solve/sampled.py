@@ -22,7 +22,7 @@ from ftlm.data.structures import History, Initial, Offset, SensorFilter, Structu
 from ftlm.solve.friction import begun, motion_with_friction
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
 from ftlm.solve.motion import decided, misfit, missed, needed
-from ftlm.solve.records import MAX_M, Record, equation_tuple, record, sensor_series
+from ftlm.solve.records import MAX_M, Record, acting, equation_tuple, record, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
 #: least from which a sample follows that no jump of a held input at its instant has reached.
@@ -364,7 +364,7 @@ def _at_instants(
         return _core.read_at(rec.of(name)[None], at.places)[0] if values is None else values
     delay, filtered = structure.delay.get(name, 0.0), rec.sensor is not None
     if not delay and not filtered:
-        return run[name]
+        return acting(run, structure, name)[name]
     means = rec.of(name)
     if filtered or run.intersample.get(name) != "zoh":
         return _core.point_samples(means)[::every]

@@ -42,7 +42,7 @@ pub struct OwnTimes {
 pub struct Instant {
     /// Its values at the samples, after it changed; none: the mean of the pulses on either side.
     pub values: Option<Vec<f64>>,
-    /// Whether it holds in between, which decides what it is after a free delay.
+    /// Whether it holds in between, which decides what it is once it acts.
     pub held: bool,
 }
 
@@ -193,11 +193,11 @@ impl Experiment {
         }
     }
 
-    /// The same of a signal after a free delay, from its means and their slope: half the jump of one that holds.
-    pub(super) fn lacking_behind(&self, signal: usize, shifted: &(Vec<f64>, Vec<f64>)) -> (Vec<f64>, Vec<f64>) {
+    /// The same of an input with a free number, from its means and their slope: half the jump of one that holds.
+    pub(super) fn lacking_behind(&self, signal: usize, acted: &(Vec<f64>, Vec<f64>)) -> (Vec<f64>, Vec<f64>) {
         let half = if self.instants.get(signal).is_some_and(|instant| instant.held) { 0.5 } else { 0.0 };
         let jump = |means: &[f64]| self.sides(means).map(|(a, b)| half * (b - a)).collect();
-        (jump(&shifted.0), jump(&shifted.1))
+        (jump(&acted.0), jump(&acted.1))
     }
 
     /// Weighted samples of pulse means, all outputs after one another.

@@ -18,7 +18,7 @@ pub(super) const AT_ONCE: f64 = 1e-9;
 pub(super) struct Direct {
     /// (I − C)⁻¹ with C the gains between simulated outputs, row by row; none where outputs do not drive each other at once.
     between: Option<Vec<f64>>,
-    /// δ of each signal that drives an output at once, and its derivative with respect to its free delay.
+    /// δ of each signal that drives an output at once, and its derivative with respect to its free number.
     lacking: Vec<Option<(Vec<f64>, Vec<f64>)>>,
     /// Whether each term of each equation feeds through.
     terms: Vec<Vec<bool>>,
@@ -36,7 +36,7 @@ impl Direct {
         experiment: &Experiment,
         structures: &[Structure],
         point: &Point,
-        shifted: &[(Vec<f64>, Vec<f64>)],
+        acted: &[(Vec<f64>, Vec<f64>)],
     ) -> Result<Option<Self>> {
         let terms: Vec<Vec<bool>> = structures
             .iter()
@@ -54,8 +54,8 @@ impl Direct {
                 if let Some(j) = model.unknown(i, term.signal) {
                     between[i * n + j] -= model.equations[i].terms[k].2.at(&point.coefficients);
                 } else if lacking[term.signal].is_none() {
-                    lacking[term.signal] = Some(match model.delay_of(term.signal) {
-                        Some(d) => experiment.lacking_behind(term.signal, &shifted[d]),
+                    lacking[term.signal] = Some(match model.law_of(term.signal) {
+                        Some(d) => experiment.lacking_behind(term.signal, &acted[d]),
                         None => (experiment.lacking(term.signal), Vec::new()),
                     });
                 }
@@ -132,10 +132,10 @@ pub(super) fn add_slope(
         let slope = |i: usize, k: usize| model.equations[i].terms[k].2.slope(&point.coefficients, parameter - orders);
         direct.add_driven(model, &mut driven, slope, |l| &l.0);
     } else {
-        let delayed = model.delays[parameter - numbers].signal;
+        let acting = model.inputs[parameter - numbers].signal;
         let weight = |i: usize, k: usize| {
             let (signal, _, c) = &model.equations[i].terms[k];
-            if *signal == delayed {
+            if *signal == acting {
                 c.at(&point.coefficients)
             } else {
                 0.0
@@ -150,7 +150,7 @@ pub(super) fn add_slope(
 /// the first pulse after it answers, of which only the direct gain is there at the sample. Without this a first-order
 /// equation is off by a share of the step.
 pub(super) struct Early {
-    /// Half the jump of each held signal at each compared sample, and its derivative with respect to its free delay.
+    /// Half the jump of each held signal at each compared sample, and its derivative with respect to its free number.
     jumps: Vec<Option<(Vec<f64>, Vec<f64>)>>,
 }
 
@@ -159,14 +159,14 @@ const SHIFT: f64 = 1e-5;
 
 impl Early {
     /// The jumps of what holds in between.
-    pub(super) fn of(model: &FreeModel, experiment: &Experiment, shifted: &[(Vec<f64>, Vec<f64>)]) -> Self {
+    pub(super) fn of(model: &FreeModel, experiment: &Experiment, acted: &[(Vec<f64>, Vec<f64>)]) -> Self {
         let jumps = (0..experiment.record.len())
             .map(|signal| {
                 // Corners of samples at times of their own are known one by one.
                 experiment.instants.get(signal).filter(|instant| instant.held && experiment.own.is_none())?;
                 let still = (experiment.record.signal(signal).to_vec(), Vec::new());
-                Some(match model.delay_of(signal) {
-                    Some(d) => experiment.lacking_behind(signal, &shifted[d]),
+                Some(match model.law_of(signal) {
+                    Some(d) => experiment.lacking_behind(signal, &acted[d]),
                     None => {
                         (experiment.lacking_behind(signal, &(still.0, vec![0.0; experiment.record.m()])).0, still.1)
                     }
@@ -263,9 +263,9 @@ impl Early {
         let (orders, numbers) = (point.orders.len(), point.orders.len() + point.coefficients.len());
         let gains = |point: &Point| Self::gains(model, experiment.record.step(), self.jumps.len(), &at_once, point);
         if parameter >= numbers {
-            let delayed = model.delays[parameter - numbers].signal;
+            let acting = model.inputs[parameter - numbers].signal;
             let mut gains = gains(point)?;
-            gains.iter_mut().enumerate().filter(|(at, _)| at % self.jumps.len() != delayed).for_each(|(_, g)| *g = 0.0);
+            gains.iter_mut().enumerate().filter(|(at, _)| at % self.jumps.len() != acting).for_each(|(_, g)| *g = 0.0);
             self.add(experiment, &gains, true, column);
             return Ok(());
         }

@@ -2,20 +2,21 @@
 
 use super::experiment::Experiment;
 use super::free_run::Evaluation;
+use super::input::FreeInput;
 use super::levenberg_marquardt::{minimise, Problem, Settings, Status};
-use super::model::{FreeDelay, FreeModel, Point};
+use super::model::{FreeModel, Point};
 use crate::error::{check_finite, check_length, Error, Result};
 
 /// The optimum and what describes it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Fit {
-    /// Free orders, coefficients and delays.
+    /// Free orders, coefficients and numbers of inputs.
     pub point: Point,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
     /// Weighted residuals (y − ŷ)/σ, records one after the other, outputs within.
     pub residuals: Vec<f64>,
-    /// Their derivatives with respect to orders, coefficients (plain coordinates), then delays, initial terms projected
+    /// Their derivatives with respect to orders, coefficients (plain coordinates), then inputs, initial terms projected
     /// out.
     pub jacobian: Vec<Vec<f64>>,
     /// Coefficients of the initial terms per record and equation.
@@ -61,18 +62,19 @@ impl Problem for OutputError<'_> {
             .map_or(1.0, |j| self.model.coordinates[j].stretch(point.coefficients[j]))
     }
 
-    /// Distance of orders and delays from their bounds; coefficients have none.
+    /// Distance of orders and of inputs' numbers from their bounds; coefficients have none.
     fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
         let behind = point.orders.len() + point.coefficients.len();
         let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
             (Some(order), _) => (*order, self.model.order_bounds[parameter]),
-            (None, Some(delay)) => (point.delays[delay], self.model.delays[delay].bounds),
+            (None, Some(input)) => (point.inputs[input], self.model.inputs[input].bounds),
             (None, None) => return (f64::INFINITY, f64::INFINITY),
         };
         (value - low, high - value)
     }
 
-    /// The response is linear in a delay between whole numbers of steps, where its slope jumps.
+    /// The response is linear in a delay between whole numbers of steps, and in a limit between values of the input; there
+    /// its slope jumps.
     fn kinked(&self, point: &Point, parameter: usize) -> bool {
         parameter >= point.orders.len() + point.coefficients.len()
     }
@@ -88,12 +90,12 @@ impl Problem for OutputError<'_> {
 }
 
 /// A point moved by steps in its coordinates, within bounds, and how far: orders as they are, coefficients as a share
-/// of themselves, delays as a share of their interval.
+/// of themselves, numbers of inputs as a share of their interval.
 fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
     let mut next = point.clone();
     let mut moved: f64 = 0.0;
     let (orders, rest) = deltas.split_at(point.orders.len());
-    let (coefficients, delays) = rest.split_at(point.coefficients.len());
+    let (coefficients, inputs) = rest.split_at(point.coefficients.len());
     for ((order, &(low, high)), delta) in next.orders.iter_mut().zip(&model.order_bounds).zip(orders) {
         let before = *order;
         *order = (before + delta).clamp(low, high);
@@ -104,11 +106,11 @@ fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
         *value = coordinate.shifted(before, delta);
         moved = moved.max((*value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
     }
-    for ((delay, FreeDelay { bounds: (low, high), .. }), delta) in next.delays.iter_mut().zip(&model.delays).zip(delays)
+    for ((value, FreeInput { bounds: (low, high), .. }), delta) in next.inputs.iter_mut().zip(&model.inputs).zip(inputs)
     {
-        let before = *delay;
-        *delay = (before + delta).clamp(*low, *high);
-        moved = moved.max((*delay - before).abs() / (high - low).max(f64::MIN_POSITIVE));
+        let before = *value;
+        *value = (before + delta).clamp(*low, *high);
+        moved = moved.max((*value - before).abs() / (high - low).max(f64::MIN_POSITIVE));
     }
     (next, moved)
 }
@@ -142,11 +144,11 @@ fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
 ///     }],
 ///     order_bounds: vec![(0.1, 2.0)],
 ///     coordinates: vec![Coordinate::Logarithm],
-///     delays: vec![],
+///     inputs: vec![],
 ///     coupled: false,
 ///     initial: Initial::Rest,
 /// };
-/// let start = Point { orders: vec![1.0], coefficients: vec![1.0], delays: vec![] };
+/// let start = Point { orders: vec![1.0], coefficients: vec![1.0], inputs: vec![] };
 /// let found = fit(&model, &[experiment], &start, Settings::default())?;
 /// assert!((found.point.orders[0] - 0.8).abs() < 1e-6 && (found.point.coefficients[0] - 3.0).abs() < 1e-6);
 /// # Ok(())
@@ -155,12 +157,12 @@ fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
 pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
     check_length("orders", model.order_bounds.len(), start.orders.len())?;
     check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
-    check_length("delays", model.delays.len(), start.delays.len())?;
+    check_length("inputs", model.inputs.len(), start.inputs.len())?;
     model.check(experiments)?;
     check_start(model, start)?;
     let mut point = start.clone();
     point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
-    point.delays.iter_mut().zip(&model.delays).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
+    point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
     let found = minimise(&OutputError { model, experiments }, point, settings)?;
     Ok(Fit {
         point: found.point,
@@ -187,13 +189,13 @@ fn check_start(model: &FreeModel, start: &Point) -> Result<()> {
         }
     }
     check_finite("orders of the start", &start.orders)?;
-    match start.delays.iter().position(|v| !v.is_finite()) {
+    match start.inputs.iter().position(|v| !v.is_finite()) {
         None => Ok(()),
         Some(index) => Err(Error::OutOfRange {
-            name: format!("start of delay {index}"),
-            value: start.delays[index],
-            range: "times within its bounds".into(),
-            remedy: "start each delay at a finite time [s]".into(),
+            name: format!("start of the number of input {index}"),
+            value: start.inputs[index],
+            range: "numbers within its bounds".into(),
+            remedy: "start each delay and limit at a finite number".into(),
         }),
     }
 }

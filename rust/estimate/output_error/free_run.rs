@@ -42,8 +42,8 @@ pub(super) struct Part {
     pub(super) response: Vec<Vec<f64>>,
     /// Orthonormal basis of the sampled responses to the initial terms.
     pub(super) basis: Vec<Vec<f64>>,
-    /// Pulse means of each freely delayed input after its delay, and their derivative with respect to it \[1/s\].
-    pub(super) shifted: Vec<(Vec<f64>, Vec<f64>)>,
+    /// Pulse means of each input with a free number once it acts, and their derivative with respect to it.
+    pub(super) acted: Vec<(Vec<f64>, Vec<f64>)>,
     /// What feeds through at once.
     pub(super) direct: Option<Direct>,
     /// What pulses see too early.
@@ -80,8 +80,8 @@ impl FreeModel {
         out: &mut Evaluation,
     ) -> Result<()> {
         let record = &experiment.record;
-        let shifted = (self.delays.iter().zip(&point.delays))
-            .map(|(d, &delay)| self.shifted(record, d.signal, delay))
+        let acted = (self.inputs.iter().zip(&point.inputs))
+            .map(|(&input, &value)| self.acted(record, input, value))
             .collect::<Result<Vec<_>>>()?;
         let (m, n) = (record.m(), structures.len());
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
@@ -114,7 +114,7 @@ impl FreeModel {
                     matrix[i][j].iter_mut().zip(&kernel).for_each(|(a, v)| *a -= c * v);
                 } else {
                     let driver = drivers[term.signal].get_or_insert_with(|| {
-                        Kernel::new(self.delay_of(term.signal).map_or(record.signal(term.signal), |d| &shifted[d].0))
+                        Kernel::new(self.law_of(term.signal).map_or(record.signal(term.signal), |d| &acted[d].0))
                     });
                     sum.add(c, &Kernel::new(&kernel), driver);
                 }
@@ -127,10 +127,10 @@ impl FreeModel {
         let mut residuals = experiment.measured();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
         let mut sampled = experiment.sampled(&response);
-        let early = Early::of(self, experiment, &shifted);
+        let early = Early::of(self, experiment, &acted);
         early.correct(self, experiment, point, &mut sampled)?;
         residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
-        let direct = Direct::of(self, experiment, structures, point, &shifted)?;
+        let direct = Direct::of(self, experiment, structures, point, &acted)?;
         if let Some(direct) = &direct {
             residuals.iter_mut().zip(direct.samples(experiment)).for_each(|(e, v)| *e -= v);
         }
@@ -187,7 +187,7 @@ impl FreeModel {
         }
         out.residuals.extend(residuals);
         out.initial.push(initial);
-        out.parts.push(Part { matrix, inverse, operators, response, basis, shifted, direct, early, corners });
+        out.parts.push(Part { matrix, inverse, operators, response, basis, acted, direct, early, corners });
         Ok(())
     }
 }

@@ -12,11 +12,13 @@ pub mod experiment;
 mod feedthrough;
 pub mod fit;
 mod free_run;
+pub mod input;
 pub mod levenberg_marquardt;
 pub mod model;
 mod sensitivities;
 
 pub use experiment::{Experiment, Instant, OwnTimes};
 pub use fit::{fit, Fit};
+pub use input::{FreeInput, InputLaw};
 pub use levenberg_marquardt::{Settings, Status};
-pub use model::{Coordinate, FreeDelay, FreeEquation, FreeModel, Monomial, Point};
+pub use model::{Coordinate, FreeEquation, FreeModel, Monomial, Point};

@@ -1,9 +1,10 @@
-//! What is estimated: equations whose orders and coefficients follow from free ones, free delays, coordinates, bounds.
+//! What is estimated: equations whose orders and coefficients follow from free ones, free numbers of inputs,
+//! coordinates, bounds.
 
 use super::experiment::Experiment;
+use super::input::FreeInput;
 use crate::equation::{AffineOrder, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
-use crate::means::delayed;
 use crate::regressors::Record;
 use crate::simulate::nyquist_margin;
 
@@ -87,15 +88,6 @@ pub struct FreeEquation {
     pub terms: Vec<(usize, AffineOrder, Monomial)>,
 }
 
-/// A free delay of an input.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct FreeDelay {
-    /// Index of the input in the record; no equation's output.
-    pub signal: usize,
-    /// Least and largest delay \[s\].
-    pub bounds: (f64, f64),
-}
-
 /// Values of all that is free.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct Point {
@@ -103,8 +95,8 @@ pub struct Point {
     pub orders: Vec<f64>,
     /// Free coefficients.
     pub coefficients: Vec<f64>,
-    /// Free delays \[s\].
-    pub delays: Vec<f64>,
+    /// Free numbers of inputs: delays, limits.
+    pub inputs: Vec<f64>,
 }
 
 /// What is estimated.
@@ -116,8 +108,8 @@ pub struct FreeModel {
     pub order_bounds: Vec<(f64, f64)>,
     /// Coordinate of each free coefficient.
     pub coordinates: Vec<Coordinate>,
-    /// Free delays of inputs.
-    pub delays: Vec<FreeDelay>,
+    /// What is free of inputs, one number of an input at most.
+    pub inputs: Vec<FreeInput>,
     /// Whether the equations' outputs drive each other as simulated, or as measured.
     pub coupled: bool,
     /// Initial terms of each record.
@@ -151,13 +143,16 @@ impl FreeModel {
                 check_length("weights of an order", orders, order.weights.len())?;
             }
         }
-        for delay in &self.delays {
-            let (signal, (low, high)) = (delay.signal, delay.bounds);
+        for (k, &FreeInput { signal, bounds: (low, high), .. }) in self.inputs.iter().enumerate() {
             if signal >= signals || self.equations.iter().any(|e| e.output == signal) {
-                return refuse(format!("signal {signal} has a free delay and is no input"), "delay inputs only");
+                let what = format!("signal {signal} has a free delay or limit and is no input");
+                return refuse(what, "delay and limit inputs only");
+            }
+            if self.law_of(signal) != Some(k) {
+                return refuse(format!("signal {signal} has two free numbers"), "free one of an input");
             }
             if !(0.0 <= low && low <= high && high.is_finite()) {
-                return refuse(format!("bounds {low} to {high} s of a delay"), "give two rising times from 0");
+                return refuse(format!("bounds {low} to {high} of a delay or limit"), "give two rising values from 0");
             }
         }
         if let Some((low, high)) =
@@ -168,31 +163,24 @@ impl FreeModel {
         for experiment in experiments {
             experiment.check()?;
             check_length("outputs", self.equations.len(), experiment.samples.len())?;
-            if experiment.own.is_some() && !self.delays.is_empty() {
-                let what = "a free delay with samples at times of their own".to_owned();
-                return refuse(what, "give the delay, or samples at regular times");
+            if experiment.own.is_some() && !self.inputs.is_empty() {
+                let what = "a free delay or limit with samples at times of their own".to_owned();
+                return refuse(what, "give its value, or samples at regular times");
             }
         }
         self.initial.check()
     }
 
-    /// Place of a signal's delay among the free ones, if it has one.
-    pub(super) fn delay_of(&self, signal: usize) -> Option<usize> {
-        self.delays.iter().position(|d| d.signal == signal)
+    /// Place of a signal's law among the free ones, if it has one.
+    pub(super) fn law_of(&self, signal: usize) -> Option<usize> {
+        self.inputs.iter().position(|d| d.signal == signal)
     }
 
-    /// Pulse means of a signal after a delay \[s\], and their derivative with respect to it.
-    ///
-    /// Held inputs are shifted exactly; an input that is linear in between to second order in the step. The derivative
-    /// is that towards longer delays where the delay is a whole number of steps.
-    pub(super) fn shifted(&self, record: &Record, signal: usize, delay: f64) -> Result<(Vec<f64>, Vec<f64>)> {
-        let means = record.signal(signal);
+    /// Pulse means of an input once it acts, and their derivative with respect to the number of its law.
+    pub(super) fn acted(&self, record: &Record, input: FreeInput, value: f64) -> Result<(Vec<f64>, Vec<f64>)> {
+        let means = record.signal(input.signal);
         let before = if self.initial.at_rest() { 0.0 } else { means.first().copied().unwrap_or(0.0) };
-        let steps = delay / record.step();
-        let whole = steps.floor();
-        let (near, far) = (delayed(means, whole, before)?, delayed(means, whole + 1.0, before)?);
-        let slope = near.iter().zip(&far).map(|(near, far)| (far - near) / record.step()).collect();
-        Ok((delayed(means, steps, before)?, slope))
+        input.law.acted(means, value, record.step(), before)
     }
 
     pub(super) fn structures(&self, orders: &[f64]) -> Vec<Structure> {

@@ -10,9 +10,9 @@ use crate::series::{Buffers, Kernel, SumOfProducts};
 
 impl FreeModel {
     /// Derivatives of the residuals at an evaluated point with respect to orders, coefficients (plain coordinates),
-    /// then delays, initial terms projected out.
+    /// then inputs' numbers, initial terms projected out.
     pub(super) fn jacobian(&self, experiments: &[Experiment], point: &Point, at: &Evaluation) -> Result<Vec<Vec<f64>>> {
-        let count = point.orders.len() + point.coefficients.len() + point.delays.len();
+        let count = point.orders.len() + point.coefficients.len() + point.inputs.len();
         let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
         for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
             self.sensitivities(experiment, part, point, &at.initial[index], &mut jacobian)?;
@@ -61,11 +61,11 @@ impl FreeModel {
                     let (c, kernel, slope) = &part.operators[i][k];
                     let (kept, kept_slope) = &mut spectra[i][k];
                     if parameter >= numbers {
-                        // A delay moves only what it delays: kernel and coefficient stay, the driver is its slope.
-                        let delay = parameter - numbers;
-                        if self.delays[delay].signal == *signal && *c != 0.0 {
+                        // A number of an input moves only what it drives: kernel and coefficient stay, the driver is its slope.
+                        let input = parameter - numbers;
+                        if self.inputs[input].signal == *signal && *c != 0.0 {
                             moves[i] = true;
-                            let slope = spectrum(&part.shifted[delay].1);
+                            let slope = spectrum(&part.acted[input].1);
                             rights[i].add(*c, kept.get_or_insert_with(|| spectrum(kernel)), &slope);
                         }
                         continue;
@@ -85,7 +85,7 @@ impl FreeModel {
                     let driver = match self.unknown(i, *signal) {
                         Some(j) => &responses[j],
                         None => drivers[*signal].get_or_insert_with(|| {
-                            spectrum(self.delay_of(*signal).map_or(record.signal(*signal), |d| &part.shifted[d].0))
+                            spectrum(self.law_of(*signal).map_or(record.signal(*signal), |d| &part.acted[d].0))
                         }),
                     };
                     rights[i].add(weight, operator, driver);
