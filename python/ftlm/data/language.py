@@ -98,7 +98,7 @@ def equation(
             initial=check_initial(initial),
             sensor_filter=sensor_filter,
             offset=_offset_of([(item, found) for item, found, _ in parsed], offset),
-            limits=_limits_of([words for _, _, words in parsed]),
+            limited=_limits_of([words for _, _, words in parsed]) or UNSET,
         )
         .with_delays(delay or {})
         .with_orders(orders or {})
@@ -163,7 +163,9 @@ class _Words:
             raise ModelError(f"equation {self.text!r}: at character {at + 1}: {error}") from error
 
     def fail(self, wanted: str) -> ModelError:
-        _, value, at = self.peek()
+        kind, value, at = self.peek()
+        if kind == "symbol" and value in ",:":
+            return ModelError(f"equation {self.text!r}: {value!r} at character {at + 1} has no meaning there")
         return ModelError(
             f"equation {self.text!r}: expected {wanted} at character {at + 1}, found {value!r}; "
             "write it as in 'D^1.5 y = a1 D^0.5 y + a0 y + b0 u'"

@@ -185,7 +185,7 @@ class Structure:
         Known delay of inputs [s].
     free_delays
         Least and largest delay of inputs whose delay is to be estimated [s].
-    limits
+    limited
         Saturations and dead zones of inputs, known or to be estimated.
     initial
         Initial terms, see :func:`equation`.
@@ -210,7 +210,6 @@ class Structure:
     coupling: Literal["measured", "simulated"] = "measured"
     delay: Mapping[str, float] = field(default_factory=dict)
     free_delays: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    limits: tuple[Limit, ...] = ()
     initial: Initial = "auto"
     sensor_filter: SensorFilter | None = None
     coefficient_law: tuple[tuple[str, float, tuple[str, ...]], ...] = ()
@@ -218,6 +217,8 @@ class Structure:
     name: str = "equation"
     hints: Hints | UnsetType = field(default=UNSET, repr=False, compare=False)
     offset: Offset = "none"
+    # Absent where there is none, so that what is written of a structure without it is as it was.
+    limited: tuple[Limit, ...] | UnsetType = UNSET
 
     def __post_init__(self) -> None:
         if not self.equations:
@@ -388,7 +389,7 @@ class Structure:
             coupling=coupling,
             delay={n: v for n, v in self.delay.items() if n in signals},
             free_delays={n: v for n, v in self.free_delays.items() if n in signals},
-            limits=tuple(limit for limit in self.limits if limit.signal in signals),
+            limited=_or_unset([limit for limit in self.limits if limit.signal in signals]),
             sensor_filter=narrowed(self.sensor_filter, signals),
             coefficient_law=(),
             name=f"{self.name}, {', '.join(e.output for e in equations)}",
@@ -483,7 +484,12 @@ class Structure:
             A name that is no input, a limit that is no number above 0, no interval, or not estimated beside others.
         """
         limits = with_values(self.limits, "dead_zone", dead_zone or {})
-        return replace(self, limits=with_values(limits, "saturation", saturation or {}))
+        return replace(self, limited=_or_unset(with_values(limits, "saturation", saturation or {})))
+
+    @property
+    def limits(self) -> tuple[Limit, ...]:
+        """Saturations and dead zones of inputs, as inputs pass them."""
+        return () if isinstance(self.limited, UnsetType) else self.limited
 
     @property
     def free_inputs(self) -> tuple[FreeInput, ...]:
@@ -498,11 +504,12 @@ class Structure:
             replace(limit, value=float(values[limit.name])) if limit.free and limit.name in values else limit
             for limit in self.limits
         )
-        return replace(self.with_delays(delays), limits=limits)
+        return replace(self.with_delays(delays), limited=_or_unset(limits))
 
     def as_given(self) -> Structure:
         """The structure without free delays and limits: inputs as they were given."""
-        return replace(self, free_delays={}, limits=tuple(limit for limit in self.limits if limit.free is None))
+        known = [limit for limit in self.limits if limit.free is None]
+        return replace(self, free_delays={}, limited=_or_unset(known))
 
     def acting(self, digits: str = "r") -> dict[str, str]:
         """How inputs are written that do not act as they are: ``sat(u(t - 0.035 s), 0.94)``."""
@@ -529,6 +536,11 @@ class Structure:
 
     def _repr_html_(self) -> str:
         return f"<pre>{html.escape(str(self))}</pre>"
+
+
+def _or_unset(limits: Sequence[Limit]) -> tuple[Limit, ...] | UnsetType:
+    """Limits as a structure holds them."""
+    return tuple(limits) or UNSET
 
 
 def delay_name(signal: str) -> str:

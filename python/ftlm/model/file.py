@@ -160,7 +160,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             equations=tuple(e.equation() for e in self.equations), coupling=self.coupling, delay=self.delay,
             initial=check_initial(self.initial), sensor_filter=sensor, name=self.name,
             offset="none" if self.offset is UNSET else self.offset,
-            limits=() if self.limits is UNSET else tuple(Limit(x.signal, x.law, x.value) for x in self.limits),
+            limited=UNSET if self.limits is UNSET else tuple(Limit(x.signal, x.law, x.value) for x in self.limits),
         )  # fmt: skip
         if self.estimate is not None and self.estimate.covariance is not None:
             count = sum(1 + 2 * len(e.terms) + (e.friction is not UNSET) for e in self.equations)
