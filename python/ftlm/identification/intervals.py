@@ -14,15 +14,16 @@ from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.profile import Valley, bent_numbers, profiled
+from ftlm.fit.profile import Profiles, Valley, bent_numbers, profiled
 from ftlm.identification.judged import Judged
 
 #: Level of the intervals that are printed.
 PRINTED = 0.95
 #: How often a fit goes on from a lower optimum that its intervals came upon.
 REFITS = 2
-#: Pulses that may be spent on profiles nobody asked for, all numbers together, and free runs on an end at least.
-UNASKED, FEWEST = 6_000_000, 20
+#: Pulses that may be spent on profiles nobody asked for, all numbers together, free runs that an end is worth beginning
+#: with, and by how much these may exceed the former.
+UNASKED, FEWEST, STRETCH = 6_000_000, 20, 2
 
 
 def with_intervals(
@@ -46,8 +47,11 @@ def with_intervals(
             # No finite free run where the weights of the last descent are taken anew: what is known stays.
             return joint, warnings
         names = valley.names if intervals == "profile" else bent_numbers(valley, PRINTED)
-        runs_allowed = max(UNASKED // (joint.samples * joint.refinement), FEWEST * 2 * len(names))
-        most = None if intervals == "profile" else runs_allowed
+        allowed, least = UNASKED // (joint.samples * joint.refinement), FEWEST * 2 * len(names)
+        if intervals == "auto" and least > STRETCH * allowed:
+            found = Profiles({}, None, tuple(names))
+            break
+        most = None if intervals == "profile" else max(allowed, least)
         found = profiled(valley, names, PRINTED, threads=threads, progress=progress, most=most)
         if found.lower is None or turn == REFITS:
             break
