@@ -57,6 +57,7 @@ __all__ = [
     "series_divide",
     "series_multiply",
     "trace_errors",
+    "unit_responses",
 ]
 
 _Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -255,6 +256,9 @@ def respond(
     model: Sequence[_Equation],
     inputs: Sequence[bool],
     terms: Sequence[Sequence[tuple[float, float]]],
+) -> _Matrix: ...
+def unit_responses(
+    run: _Record, model: Sequence[_Equation], inputs: Sequence[bool], units: Sequence[tuple[int, float]]
 ) -> _Matrix: ...
 def respond_with_initial(
     run: _Record,

@@ -26,6 +26,21 @@ pub fn respond<'py>(
 }
 
 #[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn unit_responses<'py>(
+    py: Python<'py>,
+    run: RecordArg<'py>,
+    model: Vec<EquationArg>,
+    inputs: Vec<bool>,
+    units: Vec<(usize, f64)>,
+) -> PyResult<Bound<'py, PyArray2<f64>>> {
+    let record = record(&run)?;
+    let equations = equations(model, record.len(), &inputs)?;
+    let outputs = detached(py, || simulate::unit_responses(&equations, &record, &units))?;
+    stacked(py, &outputs.concat())
+}
+
+#[pyfunction]
 #[allow(clippy::needless_pass_by_value, clippy::type_complexity)]
 pub fn respond_with_initial<'py>(
     py: Python<'py>,

@@ -1,13 +1,14 @@
 //! Free runs against dense oracles, the two errors of a model, explicit Euler, and the stability margin of the scheme.
 
-use ftlm::equation::{Equation, Initial};
+use ftlm::equation::{Equation, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimate::least_squares;
 use ftlm::kernels::block_pulse_kernel;
 use ftlm::regressors::Record;
 use ftlm::series;
 use ftlm::simulate::{
-    equation_error, explicit_euler, nyquist_margin, respond, respond_with_initial, trace_errors, OutputFilter,
+    equation_error, explicit_euler, nyquist_margin, respond, respond_with_initial, trace_errors, unit_responses,
+    OutputFilter,
 };
 use proptest::prelude::*;
 
@@ -437,4 +438,46 @@ proptest! {
         prop_assert!(relative_distance(&response[0], record.signal(0)) < 1e-9);
         prop_assert_eq!(bits(&respond(one(&again), &record, &[]).unwrap()[0]), bits(&response[0]));
     }
+}
+
+#[test]
+fn units_of_initial_terms_answer_as_free_runs_of_nothing_else() {
+    let terms = |output: usize, other: usize| {
+        vec![
+            Term { signal: output, order: 0.0 },
+            Term { signal: output, order: 0.9 },
+            Term { signal: other, order: 0.3 },
+            Term { signal: 2, order: 0.0 },
+        ]
+    };
+    let equation = |output: usize, coefficients: [f64; 4]| Equation {
+        structure: Structure { output, order: 1.8, terms: terms(output, 1 - output) },
+        coefficients: coefficients.to_vec(),
+    };
+    let filter: Vec<f64> = (0..500).map(|k| 0.2 * 0.8_f64.powi(k)).collect();
+    let units = [(0, 0.0), (0, 1.0), (1, 0.35), (1, 1.8)];
+    // One that decays, and one that grows by 10^8 or so.
+    for own in [-9.0, 25.0] {
+        let model = [equation(0, [own, -1.0, 0.5, 1.0]), equation(1, [-16.0, -2.0, -0.5, 0.0])];
+        for filter in [None, Some(filter.clone())] {
+            let driven =
+                Record::new(0.01, vec![vec![0.3; 500], vec![0.1; 500], vec![1.0; 500]], filter.clone()).unwrap();
+            let still = Record::new(0.01, vec![vec![0.0; 500]; 3], filter).unwrap();
+            let found = unit_responses(&model, &driven, &units).unwrap();
+            for (&(i, exponent), outputs) in units.iter().zip(&found) {
+                let mut initial = vec![vec![], vec![]];
+                initial[i].push((exponent, 1.0));
+                let naive = respond(&model, &still, &initial).unwrap();
+                for (a, b) in outputs.iter().zip(&naive) {
+                    assert!(relative_distance(a, b) < 1e-11, "{own} {i} {exponent}");
+                    // At the beginning, too.
+                    assert!(relative_distance(&a[..50], &b[..50]) < 1e-9, "{own} {i} {exponent}");
+                }
+            }
+        }
+    }
+    let still = Record::new(0.01, vec![vec![0.0; 50]; 3], None).unwrap();
+    let model = [equation(0, [-9.0, -1.0, 0.5, 1.0])];
+    assert!(matches!(unit_responses(&model, &still, &[(1, 0.0)]), Err(Error::Structure { .. })));
+    assert!(unit_responses(&model, &still, &[(0, f64::NAN)]).is_err());
 }

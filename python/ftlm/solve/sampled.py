@@ -197,10 +197,10 @@ def sampled(
     driven = _read(model, run, rec, every, _responses(model, rec, none), none, at)
     if not names or not np.all(np.isfinite(driven)):
         return driven, none
-    columns = []
-    for output, power in names:
-        unit = {**none, output: {power: 1.0}}
-        columns.append(_read(model, None, still, every, _responses(model, still, unit), unit, at))
+    columns = [
+        _read(model, None, still, every, means, {**none, output: {power: 1.0}}, at)
+        for (output, power), means in zip(names, _unit_responses(model, still, names), strict=True)
+    ]
     return _fitted(model, measured_samples(model, run, every, rec), driven, names, columns)
 
 
@@ -252,6 +252,25 @@ def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
     if model.structure.coupling == "simulated":
         return _core.respond(rec.core(), equations, inputs, powers)
     return np.concatenate([_core.respond(rec.core(), [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
+
+
+def _unit_responses(model: Solved, still: Record, names: Sequence[tuple[str, float]]) -> list[Floats]:
+    """Pulse means of all outputs for a unit of each initial term (output, power), at rest but for it."""
+    equations = [equation_tuple(e, still.signals) for e in model.equations]
+    inputs, outputs, core = list(still.inputs), model.outputs, still.core()
+    if model.structure.coupling == "simulated":
+        units = [(outputs.index(output), power) for output, power in names]
+        rows = _core.unit_responses(core, equations, inputs, units)
+        return list(rows.reshape(len(names), len(outputs), still.m))
+    # Each equation alone: an initial term moves its own output.
+    out = [np.zeros((len(outputs), still.m)) for _ in names]
+    for i, (output, item) in enumerate(zip(outputs, equations, strict=True)):
+        own = [k for k, name in enumerate(names) if name[0] == output]
+        if own:
+            rows = _core.unit_responses(core, [item], inputs, [(0, names[k][1]) for k in own])
+            for k, row in zip(own, rows, strict=True):
+                out[k][i] = row
+    return out
 
 
 def _read(
