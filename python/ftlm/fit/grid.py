@@ -274,14 +274,18 @@ class Grid:
         return {o: read(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
 
     def matters(self, attempt: Attempt) -> bool:
-        """Whether halving the step moves the simulated samples by a share of their noise that the fit would notice."""
+        """Whether halving the step moves the simulated samples by a share of what is left over that the fit would notice.
+
+        What is left over is noise at least; of a structure that is not all of the machine's physics it is more.
+        """
         try:
             ends = [grid.descend(attempt, 1).outcome["residuals"] for grid in (self, self.finer)]
         except FtlmError:
             # Finite on one grid and not on the other: it matters.
             return True
         moved: Floats = np.asarray(ends[1]) - np.asarray(ends[0])
-        return bool(np.mean(moved**2) > NOTICED**2)
+        left = max(1.0, float(np.mean(np.asarray(ends[1]) ** 2)))
+        return bool(np.mean(moved**2) > NOTICED**2 * left)
 
     def ranked(self, attempts: Sequence[Attempt]) -> list[Attempt]:
         """Attempts by their cost on the grid they come from or on this finer one, whichever is the larger.

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ftlm.base.errors import FtlmError
+from ftlm.data.structures import History
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.simpler import LowerOrder, Simpler, lower_orders, simpler
@@ -69,6 +70,11 @@ class Laps:
 def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None) -> list[Attempt]:
     """Coarse fits from all starts, best first, every output weighing alike; noise alone leaves `floor` per residual."""
     problem, runs = alike.problem, alike.runs
+    if isinstance(problem.structure.initial, History):
+        # What a run remembers of the time before it moves an optimum by less than lies between two: the terms of its
+        # history, many a run, wait for those that go on.
+        problem = FreeProblem.of(replace(problem.structure, initial="caputo"))
+        alike = replace(alike, problem=problem)
     starts = delayed_attempts(runs, problem, threads)
     laps = Laps(len(starts), threads, progress)
     coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
