@@ -43,6 +43,7 @@ def _hints(form: Form) -> Hints:
         {f"{letter}{n}": f"{order}{n}" for letter, order in ORDER_OF.items() for n in range(1, 5)},
         {"j1": 0.0, "j2": 0.0} if form == "lagrange" else {"r1": 1.0, "r2": 1.0},
         ("a1", "d1", "a3", "d3") if form == "lagrange" else (),
+        {"b2": -1.0, "b4": -1.0} if form == "lagrange" else {},
     )
 
 

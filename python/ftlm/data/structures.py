@@ -159,6 +159,8 @@ class Hints:
     positive
         Coefficients of one equation that the law ties to those of another and physics makes positive. Least squares may
         take the one equation for the other; a start then has the other's coefficients by the law, with these signs.
+    known
+        Values of coefficients by a physics that is nearly right; a fit that frees one is tried with it held there first.
     """
 
     highest: tuple[float, float] | None = None
@@ -166,6 +168,7 @@ class Hints:
     freed: Mapping[str, str] = field(default_factory=dict)
     exceeds: Mapping[str, float] = field(default_factory=dict)
     positive: tuple[str, ...] = ()
+    known: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -91,6 +91,10 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
         ended = laps.run(coarse, delayed_attempts(runs, less.problem, threads), FIRST_LAP, less.problem)
         ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
         reached = sorted(reached + [less.embedded(a, problem) for a in ended[:1]], key=lambda a: a.level)
+    if reached and problem.structure.coupling == "measured" and problem.structure.offset != "none":
+        # An offset of each run hides which of the measured signals drives: also from where it ends without.
+        plain = replace(alike, problem=FreeProblem.of(replace(problem.structure, offset="none")))
+        reached = sorted(reached + race(plain, floor, threads, None)[:FINALISTS], key=lambda a: a.level)
     ahead = max(FEWEST, len(reached) // RUNNERS)
     rest = reached[ahead:]
     reached = laps.run(coarse, reached[:ahead], SECOND_LAP)

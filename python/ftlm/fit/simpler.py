@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from ftlm.base.errors import FtlmError
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
-from ftlm.data.structures import History
+from ftlm.data.structures import Hints, History
 from ftlm.fit.grid import Attempt
 from ftlm.fit.problem import FreeProblem
 
@@ -79,11 +79,12 @@ def lower_orders(problem: FreeProblem, runs: Sequence[Run]) -> list[LowerOrder]:
 
 @dataclass(frozen=True)
 class Simpler:
-    """A problem with one own term less: its coefficient, and the highest order of the equation that lacks it."""
+    """A problem with one term less, or known: its coefficient, and the highest order of the equation that lacks it."""
 
     problem: FreeProblem
     coefficient: str
     order: Order
+    value: float = 0.0
 
     def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
         """The same point of the whole problem; the order of a term that is 0 may be any, so it is half the highest."""
@@ -93,13 +94,18 @@ class Simpler:
         return replace(
             attempt,
             orders=[known.get(n, 0.5 * highest) for n in whole.orders],
-            coefficients=[values.get(n, 0.0) for n in whole.coefficients],
-            origin=f"{attempt.origin}, from {self.coefficient} = 0",
+            coefficients=[values.get(n, self.value) for n in whole.coefficients],
+            origin=f"{attempt.origin}, from {self.coefficient} = {self.value:g}",
         )
 
 
 def simpler(problem: FreeProblem) -> list[Simpler]:
-    """Problems with one own term less; none under a law, where no coefficient can be 0 by itself."""
+    """Problems with one term less; none under a law, where no coefficient can be 0 by itself.
+
+    A term of a measured signal is left out where it is not the only one that drives: signals of one machine go with each
+    other, and where one stands for the rest there is an optimum that tells nothing of the machine. For the same reason
+    a coefficient that physics knows is held there first.
+    """
     structure = problem.structure
     if structure.has_order_law or problem.products:
         return []
@@ -115,4 +121,16 @@ def simpler(problem: FreeProblem) -> list[Simpler]:
             values = {n: v for n, v in structure.order_values.items() if n in names}
             reduced = replace(structure, equations=equations, order_values=values)
             out.append(Simpler(FreeProblem.of(reduced), term.coefficient, item.order))
+        driving = [t for t in item.terms if t.signal != item.output and isinstance(t.coefficient, str)]
+        if structure.coupling == "measured" and len(driving) > 1:
+            # The signal stays, at 0: records have it.
+            out += [
+                Simpler(FreeProblem.of(structure.with_coefficients({t.coefficient: 0.0})), t.coefficient, item.order)
+                for t in driving
+                if isinstance(t.coefficient, str) and not t.order.names
+            ]
+        known = (structure.hints or Hints()).known
+        for name in [n for n in item.coefficient_names if n in known]:
+            held = structure.with_coefficients({name: known[name]})
+            out.append(Simpler(FreeProblem.of(held), name, item.order, known[name]))
     return out

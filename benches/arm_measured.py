@@ -1,0 +1,226 @@
+"""Real runs of the arm predicted: what each piece of physics and each fractional order is worth on runs never fitted.
+
+``python benches/arm.py measured`` fits deflections on the run of one laboratory (and on both) and judges them on each.
+``orders`` frees one order after another on each stage of the physics, ``steps`` fits five LQG steps and judges all others,
+``left-out`` leaves each of the eighteen steps out, ``rival`` sets linear state-space models of jax-sysid beside them.
+Every figure is the fit in percent of the free run, sample by sample, other angles as measured. Initial terms, the
+filter's state and, where the equation has one, the gauge's zero are the judged run's own; everything else is fitted.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+import ftlm
+
+FOLDER = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}
+
+
+def arm_run(name: str, thin: int = 4) -> ftlm.Run:
+    """One of the two laboratories' runs, thinned to 8 ms, in rad."""
+    run = ftlm.load(
+        FOLDER / f"two_link_{name}" / f"{name}.csv", time="t_s", inputs={"I1": "Im1_meas_A", "I2": "Im2_meas_A"},
+        outputs=ANGLES, units=dict.fromkeys(ANGLES, "deg"), intersample={"I1": "foh", "I2": "foh"},
+    )  # fmt: skip
+    if name == "psf":
+        run = run.slice(1.1, 19.5)
+    signals = {n: run[n][::thin] for n in (*run.inputs, *run.outputs)}
+    return ftlm.Run.from_arrays(
+        step=thin * run.step, inputs={n: signals[n] for n in run.inputs}, outputs={n: signals[n] for n in run.outputs},
+        units=run.units, intersample=run.intersample, name=name,
+    )  # fmt: skip
+
+
+def step_run(path: Path, thin: int = 4) -> ftlm.Run:
+    """A step of the single stage, both angles, thinned to 8 ms."""
+    angles = {n: ANGLES[n] for n in ("theta11", "theta12")}
+    run = ftlm.load(path, time="t_s", outputs=angles, units=dict.fromkeys(angles, "deg"))
+    return ftlm.Run.from_arrays(
+        step=thin * run.step, inputs={}, outputs={n: run[n][::thin] for n in angles}, name=path.stem
+    )
+
+
+#: The link's equation (15) and what physics adds, piece by piece: words, filtered signals, whether a gauge's zero is estimated.
+STAGES: dict[str, list[tuple[str, str, tuple[str, ...], bool]]] = {
+    "theta12": [
+        ("(15), no filter", "{a} + {d} - {h}", (), False),
+        ("filter", "{a} + {d} - {h}", ("theta12",), False),
+        ("stage coupling", "{a} + {d} - {h} + p D^2 theta21 + q D^2 theta22", ("theta12", "theta22"), False),
+        ("offset", "{a} + {d} - {h} + p D^2 theta21 + q D^2 theta22", ("theta12", "theta22"), True),
+        ("hub angle", "{a} + {d} - {h} + p D^2 theta21 + q D^2 theta22 + e theta11", ("theta12", "theta22"), True),
+        ("gain", "{a} + {d} + b {h} + p D^2 theta21 + q D^2 theta22 + e theta11", ("theta12", "theta22"), True),
+    ],
+    "theta22": [
+        ("(15), no filter", "{a} + {d} - {h}", (), False),
+        ("filter", "{a} + {d} - {h}", ("theta22",), False),
+        ("stage coupling", "{a} + {d} - {h} + p D^2 theta11 + q D^2 theta12", ("theta12", "theta22"), False),
+        ("offset", "{a} + {d} - {h} + p D^2 theta11 + q D^2 theta12", ("theta12", "theta22"), True),
+        ("hub angle", "{a} + {d} - {h} + p D^2 theta11 + q D^2 theta12 + e theta21", ("theta12", "theta22"), True),
+        ("gain", "{a} + {d} + b {h} + p D^2 theta11 + q D^2 theta12 + e theta21", ("theta12", "theta22"), True),
+    ],
+}  # fmt: skip
+#: What may be fractional: the link's elasticity, its damping, the hub's motion.
+FREED = {
+    "whole": {},
+    "D^beta elasticity": {"a": "a D^beta {y}"},
+    "D^mu damping": {"d": "d D^mu {y}"},
+    "D^gamma hub": {"h": "D^gamma {hub}"},
+}
+
+
+def words(output: str, text: str, freed: str = "whole") -> str:
+    """An equation of a deflection, one of its orders freed."""
+    hub = output[:-1] + "1"
+    parts = {"a": "a {y}", "d": "d D {y}", "h": "D^2 {hub}"} | FREED[freed]
+    return f"D^2 {output} = " + text.format(**{n: p.format(y=output, hub=hub) for n, p in parts.items()})
+
+
+def structure(text: str, filtered: Sequence[str], offset: bool) -> ftlm.Structure:
+    """Words with the stock filter; initial terms are Caputo's, so that whole and fractional orders have alike ones."""
+    sensor = ftlm.SensorFilter.low_pass(filtered) if filtered else None
+    bounds = {n: r for n, r in {"beta": (0.0, 0.95, 0.05), "mu": (0.05, 1.95, 0.05), "gamma": (1.5, 2.4, 0.05)}.items() if f"^{n} " in text}
+    return ftlm.equation(
+        text, sensor_filter=sensor, offset="constant" if offset else "none", initial="caputo", orders=bounds
+    )
+
+
+#: Beyond the stages: the torque of link 2's spring in place of its acceleration, the -1 of a rigid gauge, and
+#: what was best while a deflection that drives was filtered twice.
+OTHERS = [
+    ("spring torque of link 2, gauge, b = -1", "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21"
+     " + q theta22 + s theta21 + r theta11", ("theta12", "theta22"), False),
+    ("the same, offset", "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21"
+     " + q theta22 + s theta21 + r theta11", ("theta12", "theta22"), True),
+    ("the same, offset, b free", "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21"
+     " + q theta22 + s theta21 + r theta11", ("theta12", "theta22"), True),
+    ("theta22 filtered twice", "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21"
+     " + q theta22 + s theta21 + r theta11", ("theta12",), False),
+    ("theta22 filtered twice, a spring-pot", "D^2 theta12 = a D^beta theta12 + d D theta12 + b D^2 theta11"
+     " + p D^2 theta21 + q theta22 + s theta21 + r theta11", ("theta12",), False),
+    ("gain, no offset, no hub angle", "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11"
+     " + q D^2 theta12", ("theta12", "theta22"), False),
+    ("gain, no hub angle", "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12",
+     ("theta12", "theta22"), True),
+]  # fmt: skip
+
+
+def numbers(found: ftlm.Identification, asked: Sequence[str] = ()) -> str:
+    """Values with standard errors, orders with intervals."""
+    joint = found.joint
+    assert joint is not None
+    out = []
+    for name, value in zip(joint.names, joint.values.tolist(), strict=True):
+        if name in found.orders:
+            low, high = joint.intervals[name]
+            out.append(f"{name} {value:.3f} ({low:.3f} to {high:.3f})")
+        elif not asked or name in asked:
+            out.append(f"{name} {value:.4g} ± {joint.standard_errors[name]:.2g}")
+    return ", ".join(out)
+
+
+def fitted(runs: Sequence[ftlm.Run], made: ftlm.Structure) -> ftlm.Identification:
+    """A joint fit on one thread."""
+    return ftlm.identify(list(runs), made, method="output-error", threads=1, intervals="quadratic")
+
+
+def judged(runs: dict[str, ftlm.Run], made: ftlm.Structure, uses: Sequence[tuple[str, ...]]) -> Iterator[tuple[str, ...]]:
+    """Fitted on some of the runs, the fit on each of them, its numbers, processor time."""
+    output = made.outputs[0]
+    for used in uses:
+        begun = time.process_time()
+        try:
+            found = fitted([runs[u] for u in used], made)
+            fits = {n: found.model.compare(r).fit_percent[output] for n, r in runs.items()}
+        except ftlm.FtlmError as error:
+            yield "+".join(used), str(error), "", ""
+            continue
+        told = ", ".join(f"{v:.1f}" if n in used else f"**{v:.1f}**" for n, v in fits.items())
+        yield "+".join(used), told, numbers(found), f"{time.process_time() - begun:.0f} s"
+
+
+ONE_AND_BOTH = (("psf",), ("lqr",), ("psf", "lqr"))
+
+
+def measured() -> Iterator[str]:
+    """Physics piece by piece, whole orders; the run that was not fitted to in bold."""
+    runs = {n: arm_run(n) for n in ("psf", "lqr")}
+    yield "| output | physics | fitted on | psf, lqr | numbers | time |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    rows = [(o, name, words(o, text), seen, zero) for o, stages in STAGES.items() for name, text, seen, zero in stages]
+    rows += [(text[4:11], name, text, seen, zero) for name, text, seen, zero in OTHERS]
+    for output, name, text, seen, zero in rows:
+        for row in judged(runs, structure(text, seen, zero), ONE_AND_BOTH):
+            yield f"| {output} | {name} | {' | '.join(row)} |"
+
+
+def orders() -> Iterator[str]:
+    """Which orders earn their place on the run that was not fitted to, on each stage of the physics."""
+    runs = {n: arm_run(n) for n in ("psf", "lqr")}
+    yield "| output | physics so far | order free | fitted on | psf, lqr | the order, 95 % |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    for output, stages in STAGES.items():
+        for name, text, seen, zero in stages:
+            for freed in FREED:
+                for used, told, values, _ in judged(runs, structure(words(output, text, freed), seen, zero), ONE_AND_BOTH[:2]):
+                    order = next((v for v in values.split(", ") if v.startswith(("beta", "mu", "gamma"))), "")
+                    yield f"| {output} | {name} | {freed} | {used} | {told} | {order} |"
+
+
+# ------------------------------------------------------------------------------------- the single stage's eighteen steps
+
+#: LQG runs that are fitted: the steps up and half of those down, as they were chosen before any was judged.
+FIVE = ("lqg_30", "lqg_20", "lqg_10", "lqg_minus10", "lqg_minus20")
+SINGLE = {
+    "whole": ("{a} + {d} + b {h} + r theta11", "whole", False),
+    "whole, offset": ("{a} + {d} + b {h} + r theta11", "whole", True),
+    "D^mu": ("{a} + {d} + b {h} + r theta11", "D^mu damping", False),
+    "D^mu, offset": ("{a} + {d} + b {h} + r theta11", "D^mu damping", True),
+    "D^beta, offset": ("{a} + {d} + b {h} + r theta11", "D^beta elasticity", True),
+}
+
+
+def all_steps() -> dict[str, ftlm.Run]:
+    """All eighteen."""
+    return {p.stem: step_run(p) for p in sorted((FOLDER / "two_link_steps").glob("*.csv"))}
+
+
+def spread(fits: Sequence[float]) -> str:
+    """Median and least."""
+    return f"{np.median(fits):.1f} ({min(fits):.1f})"
+
+
+def steps() -> Iterator[str]:
+    """Five LQG runs fitted together, all others judged: median (least)."""
+    runs = all_steps()
+    yield "| θ₁₂ | five fitted | four other LQG | nine LQR | all thirteen | numbers |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    for name, (text, freed, zero) in SINGLE.items():
+        found = fitted([runs[n] for n in FIVE], structure(words("theta12", text, freed), ["theta12"], zero))
+        fits = {n: found.model.compare(r).fit_percent["theta12"] for n, r in runs.items()}
+        own = [fits[n] for n in FIVE]
+        lqg = [v for n, v in fits.items() if n.startswith("lqg") and n not in FIVE]
+        lqr = [v for n, v in fits.items() if n.startswith("lqr")]
+        yield f"| {name} | {spread(own)} | {spread(lqg)} | {spread(lqr)} | {spread(lqg + lqr)} | {numbers(found)} |"
+
+
+def left_out() -> Iterator[str]:
+    """Each of the eighteen steps judged by a fit on the seventeen others."""
+    runs = all_steps()
+    kinds = ("whole, offset", "D^mu, offset")
+    yield f"| left out | {' | '.join(kinds)} |"
+    yield "| --- | --- | --- |"
+    fits: dict[str, list[float]] = {k: [] for k in kinds}
+    for left, run in runs.items():
+        for kind in kinds:
+            text, freed, zero = SINGLE[kind]
+            made = structure(words("theta12", text, freed), ["theta12"], zero)
+            found = fitted([r for n, r in runs.items() if n != left], made)
+            fits[kind].append(found.model.compare(run).fit_percent["theta12"])
+        yield f"| {left} | {' | '.join(f'{v[-1]:.1f}' for v in fits.values())} |"
+    yield f"| median (least) | {' | '.join(spread(v) for v in fits.values())} |"
