@@ -1,8 +1,8 @@
 """Real runs of the arm predicted: what each piece of physics and each fractional order is worth on runs never fitted.
 
 ``python benches/arm.py measured`` fits deflections on the run of one laboratory (and on both) and judges them on each.
-``orders`` frees one order after another on each stage of the physics, ``steps`` fits five LQG steps and judges all others,
-``left-out`` leaves each of the eighteen steps out, ``rival`` sets linear state-space models of jax-sysid beside them.
+``orders`` frees one order after another on each stage of the physics, ``steps`` fits five LQG steps and judges all
+others, ``left-out`` leaves each of the eighteen steps out, ``rival`` sets linear state-space models of jax-sysid beside.
 Every figure is the fit in percent of the free run, sample by sample, other angles as measured. Initial terms, the
 filter's state and, where the equation has one, the gauge's zero are the judged run's own; everything else is fitted.
 """
@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import ftlm
+from arm_rival import rows as rival_rows
 
 FOLDER = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}
@@ -46,7 +47,8 @@ def step_run(path: Path, thin: int = 4) -> ftlm.Run:
     )
 
 
-#: The link's equation (15) and what physics adds, piece by piece: words, filtered signals, whether a gauge's zero is estimated.
+#: The link's equation (15) and what physics adds, piece by piece: words, filtered signals, whether a gauge's zero is
+#: estimated.
 STAGES: dict[str, list[tuple[str, str, tuple[str, ...], bool]]] = {
     "theta12": [
         ("(15), no filter", "{a} + {d} - {h}", (), False),
@@ -74,6 +76,10 @@ FREED = {
 }
 
 
+#: Where they are looked for.
+BOUNDS = {"beta": (0.0, 0.95), "mu": (0.05, 1.95), "gamma": (1.5, 2.4)}
+
+
 def words(output: str, text: str, freed: str = "whole") -> str:
     """An equation of a deflection, one of its orders freed."""
     hub = output[:-1] + "1"
@@ -84,7 +90,7 @@ def words(output: str, text: str, freed: str = "whole") -> str:
 def structure(text: str, filtered: Sequence[str], offset: bool) -> ftlm.Structure:
     """Words with the stock filter; initial terms are Caputo's, so that whole and fractional orders have alike ones."""
     sensor = ftlm.SensorFilter.low_pass(filtered) if filtered else None
-    bounds = {n: r for n, r in {"beta": (0.0, 0.95, 0.05), "mu": (0.05, 1.95, 0.05), "gamma": (1.5, 2.4, 0.05)}.items() if f"^{n} " in text}
+    bounds = {n: (*ends, 0.05) for n, ends in BOUNDS.items() if f"^{n} " in text}
     return ftlm.equation(
         text, sensor_filter=sensor, offset="constant" if offset else "none", initial="caputo", orders=bounds
     )
@@ -129,7 +135,9 @@ def fitted(runs: Sequence[ftlm.Run], made: ftlm.Structure) -> ftlm.Identificatio
     return ftlm.identify(list(runs), made, method="output-error", threads=1, intervals="quadratic")
 
 
-def judged(runs: dict[str, ftlm.Run], made: ftlm.Structure, uses: Sequence[tuple[str, ...]]) -> Iterator[tuple[str, ...]]:
+def judged(
+    runs: dict[str, ftlm.Run], made: ftlm.Structure, uses: Sequence[tuple[str, ...]]
+) -> Iterator[tuple[str, ...]]:
     """Fitted on some of the runs, the fit on each of them, its numbers, processor time."""
     output = made.outputs[0]
     for used in uses:
@@ -159,22 +167,32 @@ def measured() -> Iterator[str]:
             yield f"| {output} | {name} | {' | '.join(row)} |"
 
 
-def orders() -> Iterator[str]:
+def orders(outputs: Sequence[str] = ("theta12", "theta22")) -> Iterator[str]:
     """Which orders earn their place on the run that was not fitted to, on each stage of the physics."""
     runs = {n: arm_run(n) for n in ("psf", "lqr")}
     yield "| output | physics so far | order free | fitted on | psf, lqr | the order, 95 % |"
     yield "| --- | --- | --- | --- | --- | --- |"
-    for output, stages in STAGES.items():
+    for output, stages in ((o, STAGES[o]) for o in outputs):
         for name, text, seen, zero in stages:
             for freed in FREED:
-                for used, told, values, _ in judged(runs, structure(words(output, text, freed), seen, zero), ONE_AND_BOTH[:2]):
+                made = structure(words(output, text, freed), seen, zero)
+                for used, told, values, _ in judged(runs, made, ONE_AND_BOTH[:2]):
                     order = next((v for v in values.split(", ") if v.startswith(("beta", "mu", "gamma"))), "")
                     yield f"| {output} | {name} | {freed} | {used} | {told} | {order} |"
 
 
-# ------------------------------------------------------------------------------------- the single stage's eighteen steps
+def rival() -> Iterator[str]:
+    """Linear state-space models of jax-sysid on the same runs and inputs."""
+    yield "| output | order | numbers | fitted on | psf, lqr | time |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    uses = {"theta12": ("theta11", "theta21", "theta22"), "theta22": ("theta21", "theta11", "theta12")}
+    for row in rival_rows({n: arm_run(n) for n in ("psf", "lqr")}, uses):
+        yield f"| {' | '.join(row)} |" if len(row) > 1 else row[0]
 
-#: LQG runs that are fitted: the steps up and half of those down, as they were chosen before any was judged.
+
+# ------------------------------------------------------------------------------------ the single stage's eighteen steps
+
+#: LQG runs that are fitted: 5° and the way back are left to be judged, and the largest step down.
 FIVE = ("lqg_30", "lqg_20", "lqg_10", "lqg_minus10", "lqg_minus20")
 SINGLE = {
     "whole": ("{a} + {d} + b {h} + r theta11", "whole", False),

@@ -20,14 +20,14 @@ except ImportError:
     LinearModel = None
 
 #: What the words say where it is absent.
-ABSENT = "jax-sysid is not here, so the rival was not measured: pip install jax-sysid==1.1 (in an environment of its own)"
+ABSENT = "jax-sysid is not here, so nothing was set beside: pip install jax-sysid==1.1, in an environment of its own"
 ORDERS = (2, 4, 6)
 #: Random starts, of which the one that fits best is kept, and steps of both optimisers.
 SEEDS = 3
 ADAM, LBFGS = 300, 1000
 
 
-def rival(runs: dict[str, ftlm.Run], uses: dict[str, tuple[str, ...]]) -> Iterator[tuple[str, ...]]:
+def rows(runs: dict[str, ftlm.Run], uses: dict[str, tuple[str, ...]]) -> Iterator[tuple[str, ...]]:
     """Rows of output, order, numbers, runs fitted, fits, processor time; uses are the outputs with their inputs.
 
     Signals are standardised by the runs fitted. The initial state is the judged run's own, as an initial term is.

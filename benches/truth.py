@@ -1,13 +1,15 @@
 """Truth under noise, measured: bias against step, Monte-Carlo of the joint fit, the three-term table, random plants.
 
-``python benches/truth.py WHAT [--seeds 100] [--plants A,A2,3T] [--levels 20,40,60,80] [--outputs theta11,…] [--write]``
+``python benches/truth.py WHAT [--seeds 100] [--plants A,A2,3T] [--levels 20,40,60,80] [--write]``
 prints tables; ``--write`` appends them to benches/RESULTS.md. WHAT is bias, intervals, instruments, orders,
-three-terms, random-plants, arm or heating. Seeds are 0 to ``--seeds`` less one, and are never changed.
+three-terms, random-plants, arm (real runs, see arm_measured.py) or heating. Seeds are 0 to ``--seeds`` less one, and
+are never changed.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import sys
 import time
@@ -20,6 +22,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
 
+import arm_measured
 import ftlm
 import plants
 from ftlm.fit.grid import Attempt, descend, experiment
@@ -246,92 +249,6 @@ def orders(names: Iterable[str], seeds: int) -> Iterator[str]:
             )
 
 
-# ------------------------------------------------------------------------------------------------ the real arm
-
-
-ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}
-
-
-def measured(name: str, first: float, last: float) -> ftlm.Run:
-    """A run of the real arm, deviations from the first value."""
-    folder = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
-    run = ftlm.load(
-        folder / f"two_link_{name}" / f"{name}.csv", time="t_s",
-        inputs={"I1": "Im1_meas_A", "I2": "Im2_meas_A"},
-        outputs=ANGLES, units=dict.fromkeys(ANGLES, "deg"),
-        intersample={"I1": "foh", "I2": "foh"},
-    ).slice(first, last)  # fmt: skip
-    # Deviations from the first value: an offset of one signal would enter every other equation as a growing power of t.
-    signals = {n: run[n] - run[n][0] for n in (*run.inputs, *run.outputs)}
-    return ftlm.Run.from_arrays(
-        step=run.step, inputs={n: signals[n] for n in run.inputs}, outputs={n: signals[n] for n in run.outputs},
-        units=run.units, intersample=run.intersample, name=name,
-    )  # fmt: skip
-
-
-#: Every other signal of each equation of the arm: the stage's own ones, then the other stage's.
-ARM = {
-    "theta11": ("theta12", "I1", "theta21", "theta22", "I2"),
-    "theta12": ("theta11", "I1", "theta21", "theta22", "I2"),
-    "theta21": ("theta22", "I2", "theta11", "theta12", "I1"),
-    "theta22": ("theta21", "I2", "theta11", "theta12", "I1"),
-}
-#: Whole orders with the other angles as they are, with their rates, and all orders free.
-KINDS = ("angles", "rates", "fractional")
-
-
-def arm_structure(output: str, kind: str) -> ftlm.Structure:
-    """One equation with all measured signals: second order, or all orders free; the terms are the same."""
-    if kind == "fractional":
-        terms = [f"a1 D^beta {output}", f"a0 D^mu {output}"]
-        terms += [f"c{i} D^nu{i} {s}" for i, s in enumerate(ARM[output])]
-        words = f"D^alpha {output} = " + " + ".join(terms)
-    else:
-        order = {"angles": "0", "rates": "1"}[kind]
-        terms = [f"a1 D^1 {output}", f"a0 {output}"]
-        terms += [f"c{i} D^{'0' if s.startswith('I') else order} {s}" for i, s in enumerate(ARM[output])]
-        words = f"D^2 {output} = " + " + ".join(terms)
-    return replace(ftlm.equation(words), coupling="measured", initial=(0.0, 1.0))
-
-
-def arm_row(task: tuple[str, str, str]) -> tuple[tuple[str, str, str], dict[str, float], str]:
-    """Fit of one equation on some of the two runs, and its fit on each."""
-    output, kind, used = task
-    runs = {"psf": measured("psf", 1.1, 19.5), "lqr": measured("lqr", 0.1, 19.9)}
-    start = time.process_time()
-    try:
-        found = ftlm.identify([runs[u] for u in used.split("+")], arm_structure(output, kind), threads=1)
-    except ftlm.FtlmError as error:
-        return task, dict.fromkeys(runs, -np.inf), f"{output} {kind} on {used}: {error}"
-    fits = {n: found.model.compare(r).fit_percent[output] for n, r in runs.items()}
-    orders = ", ".join(f"{n} {v:.2f}±{found.standard_errors[n]:.2g}" for n, v in found.orders.items())
-    words = (
-        f"{output} {kind} on {used}: psf {fits['psf']:.1f} %, lqr {fits['lqr']:.1f} %"
-        f"{'; ' + orders if orders else ''} ({time.process_time() - start:.0f} s)"
-    )
-    return task, fits, words
-
-
-def arm(outputs: Iterable[str]) -> Iterator[str]:
-    """Whole against fractional orders on the real arm, on both runs and each predicting the other."""
-    tasks = [(o, k, u) for o in outputs for u in ("psf+lqr", "psf", "lqr") for k in KINDS]
-    fits: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
-    with ProcessPoolExecutor(workers()) as pool:
-        for (output, kind, used), found, words in pool.map(arm_row, tasks):
-            yield words
-            rows = fits.setdefault((output, used), {})
-            rows[kind] = found
-            if len(rows) == len(KINDS) and "+" not in used:
-                other = "lqr" if used == "psf" else "psf"
-                whole = max(("angles", "rates"), key=lambda k, r=rows, u=used: r[k][u])  # type: ignore[misc]
-                gain = rows["fractional"][other] - rows[whole][other]
-                yield (
-                    f"**{output} from {used} on {other}**: whole orders ({whole}) {rows[whole][other]:.1f} %, "
-                    f"fractional {rows['fractional'][other]:.1f} %: fractional validates "
-                    f"{'better' if gain > 0 else 'NOT better'}"
-                )
-
-
 # ------------------------------------------------------------------------------------------------ the heating system
 
 HEATING = {
@@ -374,7 +291,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--plants", default="A,A2,3T")
     parser.add_argument("--levels", default="20,40,60,80")
-    parser.add_argument("--outputs", default=",".join(ARM))
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     arguments = parser.parse_args()
     names = arguments.plants.split(",")
@@ -385,13 +301,14 @@ def main() -> None:
         "orders": lambda: orders([n for n in names if n in LATTICES], arguments.seeds),
         "three-terms": lambda: three_terms_table(arguments.seeds),
         "random-plants": lambda: random_plants(arguments.seeds),
-        "arm": lambda: arm(arguments.outputs.split(",")),
+        "arm": lambda: itertools.chain(arm_measured.measured(), arm_measured.orders(), arm_measured.steps()),
         "heating": heating,
     }[arguments.what]()
     lines = [f"{heading()}:", ""]
     print(lines[0])
     for row in rows:
-        lines.append(f"- {row}")
+        # Rows of a table stay one.
+        lines.append(str(row) if str(row).startswith("|") else f"- {row}")
         print(lines[-1], flush=True)
     if arguments.write:
         append(lines)
