@@ -19,7 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
 
 import ftlm
-from arm_measured import left_out, measured, orders, rival, steps
+from arm_measured import gains, left_out, measured, orders, rival, steps
 from lagrange import INPUTS, clean_run, structure, truth
 from plants import with_noise
 from results import append, heading
@@ -64,7 +64,7 @@ def recovery(seeds: range, levels: list[float]) -> None:
 
 
 SECTIONS: dict[str, Callable[[], Iterator[str]]] = {
-    "measured": measured, "orders": orders, "steps": steps, "left-out": left_out, "rival": rival,
+    "measured": measured, "orders": orders, "gains": gains, "steps": steps, "left-out": left_out, "rival": rival,
 }  # fmt: skip
 
 

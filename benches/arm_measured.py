@@ -1,10 +1,11 @@
 """Real runs of the arm predicted: what each piece of physics and each fractional order is worth on runs never fitted.
 
 ``python benches/arm.py measured`` fits deflections on the run of one laboratory (and on both) and judges them on each.
-``orders`` frees one order after another on each stage of the physics, ``steps`` fits five LQG steps and judges all
-others, ``left-out`` leaves each of the eighteen steps out, ``rival`` sets linear state-space models of jax-sysid beside.
-Every figure is the fit in percent of the free run, sample by sample, other angles as measured. Initial terms, the
-filter's state and, where the equation has one, the gauge's zero are the judged run's own; everything else is fitted.
+``orders`` frees one order after another on each stage of the physics, ``gains`` estimates the gains of the judged
+unit's gauges besides, ``steps`` fits five LQG steps and judges all others, ``left-out`` leaves each of the eighteen
+steps out, ``rival`` sets state-space models of jax-sysid beside. Every figure is the fit in percent of the free run,
+sample by sample, other angles as measured. Initial terms, the filter's state and, where the equation has one, the
+gauge's zero are the judged run's own; everything else is fitted.
 """
 
 from __future__ import annotations
@@ -179,6 +180,35 @@ def orders(outputs: Sequence[str] = ("theta12", "theta22")) -> Iterator[str]:
                 for used, told, values, _ in judged(runs, made, ONE_AND_BOTH[:2]):
                     order = next((v for v in values.split(", ") if v.startswith(("beta", "mu", "gamma"))), "")
                     yield f"| {output} | {name} | {freed} | {used} | {told} | {order} |"
+
+
+#: Terms of the equations whose gauges are compared: the hubs' share, which the own gauge's gain multiplies, and what
+#: the other gauge read, which the ratio of both multiplies.
+GAUGES = {
+    "theta12": (("- D^2 theta11", "p D^2 theta21", "s theta21", "r theta11"), ("q theta22",)),
+    "theta22": (("- D^2 theta21", "p D^2 theta11"), ("q D^2 theta12",)),
+}
+
+
+def gains() -> Iterator[str]:
+    """What two gains of the judged unit's gauges explain: everything else as fitted on the other unit."""
+    runs = {n: arm_run(n) for n in ("psf", "lqr")}
+    yield "| output | fitted on | judged on | as fitted | with its gains | own gain | ratio |"
+    yield "| --- | --- | --- | --- | --- | --- | --- |"
+    seen = ("theta12", "theta22")
+    for output, (hubs, other) in GAUGES.items():
+        text = f"D^2 {output} = a {output} + d D {output} {hubs[0]} + {' + '.join((*hubs[1:], *other))}"
+        for used, judge in (("psf", "lqr"), ("lqr", "psf")):
+            found = fitted([runs[used]], structure(text, seen, offset=True))
+            known = found.coefficients
+            scaled = [f"{known['a']:+.9g} {output}", f"{known['d']:+.9g} D {output}", f"-1.0 k {hubs[0][2:]}"]
+            for gain, terms in (("k", hubs[1:]), ("m", other)):
+                scaled += [f"{known[t[0]]:+.9g} {gain} {t[2:]}" for t in terms]
+            told = " ".join(t[0] + " " + t[1:] for t in scaled).removeprefix("+ ")
+            again = fitted([runs[judge]], structure(f"D^2 {output} = {told}", seen, offset=True))
+            fits = [m.compare(runs[judge]).fit_percent[output] for m in (found.model, again.model)]
+            k, m = (f"{again.coefficients[n]:.3f} ± {again.standard_errors[n]:.2g}" for n in "km")
+            yield f"| {output} | {used} | {judge} | **{fits[0]:.1f}** | {fits[1]:.1f} | {k} | {m} |"
 
 
 def rival() -> Iterator[str]:

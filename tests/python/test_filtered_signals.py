@@ -209,9 +209,9 @@ def test_the_arm_of_real_files_is_its_deflections():
     arm = StructureOptions().structure("arm")
     assert str(arm).splitlines() == [
         "D^2 theta12 = a2 D^beta2 theta12 - 1.0 D^2 theta11 + d2 D^1 theta12 + p2 D^2 theta21 + q2 D^2 theta22"
-        " + e2 theta11 + f2 theta21",
+        " + e2 theta11 + f2 theta21 + c",
         "D^2 theta22 = a4 D^beta4 theta22 - 1.0 D^2 theta21 + d4 D^1 theta22 + p4 D^2 theta11 + q4 D^2 theta12"
-        " + e4 theta21 + f4 theta11",
+        " + e4 theta21 + f4 theta11 + c",
     ]
     assert (arm.coupling, arm.coefficient_law) == ("measured", ())
     assert arm.sensor_filter == ftlm.SensorFilter.low_pass(["theta12", "theta22"])

@@ -221,7 +221,7 @@ class StructureOptions:
     def _arm(self, text: str) -> Structure:
         """Deflections of the arm that exists: whole orders but that of the link's elasticity, driven by all angles.
 
-        What reads a deflection is a gauge: its gain stands before the hub's acceleration, its zero is each run's own.
+        What reads a deflection is a gauge, whose zero is each run's own.
         """
         given = self._of_the_link() | {"--coupling": self.coupling is not None}
         given |= {"--filtered": bool(self.filtered), "--low-pass": self.low_pass is not None}
@@ -237,7 +237,7 @@ class StructureOptions:
             raise ModelError(f"--structure {text!r} is not known; use arm:1, :2 or :both")
         built = flexible_link(
             stage=stage, hub=False, cross_stage="inertial", cross_sensitivity=True, sensor_filter="stock",
-            laws=("orders", "velocities"), offset="constant",
+            laws=("orders", "coefficients", "velocities"), offset="constant",
         )  # fmt: skip
         return built.with_orders({n: 1.0 for n in built.order_names if n.startswith("mu")})
 

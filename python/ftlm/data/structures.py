@@ -160,7 +160,7 @@ class Hints:
         Coefficients of one equation that the law ties to those of another and physics makes positive. Least squares may
         take the one equation for the other; a start then has the other's coefficients by the law, with these signs.
     known
-        Values of coefficients by a physics that is nearly right; a fit that frees one is tried with it held there first.
+        Values of coefficients by a physics that is nearly right; a fit that frees one also starts with it held there.
     """
 
     highest: tuple[float, float] | None = None

@@ -274,7 +274,7 @@ class Grid:
         return {o: read(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
 
     def matters(self, attempt: Attempt) -> bool:
-        """Whether halving the step moves the simulated samples by a share of what is left over that the fit would notice.
+        """Whether halving the step moves the simulated samples by a share of the residuals that the fit would notice.
 
         What is left over is noise at least; of a structure that is not all of the machine's physics it is more.
         """

@@ -88,7 +88,11 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
     # with a pole too fast to see.
     others: list[Simpler | LowerOrder] = [*simpler(problem), *lower_orders(problem, runs)]
     for less in others if reached else []:
-        ended = laps.run(coarse, delayed_attempts(runs, less.problem, threads), FIRST_LAP, less.problem)
+        runners = delayed_attempts(runs, less.problem, threads)
+        if isinstance(less, Simpler) and less.driven:
+            # Driven by the measurement, most starts lead to one optimum: those that are nearest already will do.
+            runners = laps.run(coarse, runners, 1, less.problem)[:FEWEST]
+        ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
         ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
         reached = sorted(reached + [less.embedded(a, problem) for a in ended[:1]], key=lambda a: a.level)
     if reached and problem.structure.coupling == "measured" and problem.structure.offset != "none":

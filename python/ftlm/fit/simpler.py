@@ -79,12 +79,16 @@ def lower_orders(problem: FreeProblem, runs: Sequence[Run]) -> list[LowerOrder]:
 
 @dataclass(frozen=True)
 class Simpler:
-    """A problem with one term less, or known: its coefficient, and the highest order of the equation that lacks it."""
+    """A problem with one term less, or known: its coefficient, and the highest order of the equation that lacks it.
+
+    Whether it is an equation driven by measured signals, all of which it still has.
+    """
 
     problem: FreeProblem
     coefficient: str
     order: Order
     value: float = 0.0
+    driven: bool = False
 
     def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
         """The same point of the whole problem; the order of a term that is 0 may be any, so it is half the highest."""
@@ -102,9 +106,9 @@ class Simpler:
 def simpler(problem: FreeProblem) -> list[Simpler]:
     """Problems with one term less; none under a law, where no coefficient can be 0 by itself.
 
-    A term of a measured signal is left out where it is not the only one that drives: signals of one machine go with each
-    other, and where one stands for the rest there is an optimum that tells nothing of the machine. For the same reason
-    a coefficient that physics knows is held there first.
+    A term of a measured signal is left out where it is not the only one that drives: signals of one machine go with
+    each other, and where one stands for the rest there is an optimum that tells nothing of the machine. For the same
+    reason a coefficient that physics knows is held there first.
     """
     structure = problem.structure
     if structure.has_order_law or problem.products:
@@ -125,12 +129,17 @@ def simpler(problem: FreeProblem) -> list[Simpler]:
         if structure.coupling == "measured" and len(driving) > 1:
             # The signal stays, at 0: records have it.
             out += [
-                Simpler(FreeProblem.of(structure.with_coefficients({t.coefficient: 0.0})), t.coefficient, item.order)
+                Simpler(
+                    FreeProblem.of(structure.with_coefficients({t.coefficient: 0.0})),
+                    t.coefficient,
+                    item.order,
+                    driven=True,
+                )
                 for t in driving
                 if isinstance(t.coefficient, str) and not t.order.names
             ]
         known = (structure.hints or Hints()).known
         for name in [n for n in item.coefficient_names if n in known]:
             held = structure.with_coefficients({name: known[name]})
-            out.append(Simpler(FreeProblem.of(held), name, item.order, known[name]))
+            out.append(Simpler(FreeProblem.of(held), name, item.order, known[name], driven=True))
     return out
