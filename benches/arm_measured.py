@@ -11,13 +11,17 @@ gauge's zero are the judged run's own; everything else is fitted.
 from __future__ import annotations
 
 import os
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
+
 import ftlm
+import lsim_link
 from arm_rival import rows as rival_rows
 
 FOLDER = Path(os.environ.get("FTLM_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
@@ -182,12 +186,14 @@ def orders(outputs: Sequence[str] = ("theta12", "theta22")) -> Iterator[str]:
                     yield f"| {output} | {name} | {freed} | {used} | {told} | {order} |"
 
 
-#: Terms of the equations whose gauges are compared: the hubs' share, which the own gauge's gain multiplies, and what
-#: the other gauge read, which the ratio of both multiplies.
+#: Equations whose gauges are compared: what the hubs' motion drives, in which the own gauge's gain stands, and what
+#: the other gauge read, in which the ratio of both stands. Signals, whole orders, coefficients; -1 where there is none.
 GAUGES = {
-    "theta12": (("- D^2 theta11", "p D^2 theta21", "s theta21", "r theta11"), ("q theta22",)),
-    "theta22": (("- D^2 theta21", "p D^2 theta11"), ("q D^2 theta12",)),
-}
+    "theta12": (
+        [("theta11", 2, ""), ("theta21", 2, "p"), ("theta21", 0, "s"), ("theta11", 0, "r")], [("theta22", 0, "q")],
+    ),
+    "theta22": ([("theta21", 2, ""), ("theta11", 2, "p")], [("theta12", 2, "q")]),
+}  # fmt: skip
 
 
 def gains() -> Iterator[str]:
@@ -197,18 +203,30 @@ def gains() -> Iterator[str]:
     yield "| --- | --- | --- | --- | --- | --- | --- |"
     seen = ("theta12", "theta22")
     for output, (hubs, other) in GAUGES.items():
-        text = f"D^2 {output} = a {output} + d D {output} {hubs[0]} + {' + '.join((*hubs[1:], *other))}"
+        driving = " ".join(f"+ {c} D^{m} {n}" if c else f"- D^{m} {n}" for n, m, c in (*hubs, *other))
+        made = structure(f"D^2 {output} = a {output} + d D {output} {driving}".replace("D^0 ", ""), seen, offset=True)
         for used, judge in (("psf", "lqr"), ("lqr", "psf")):
-            found = fitted([runs[used]], structure(text, seen, offset=True))
-            known = found.coefficients
-            scaled = [f"{known['a']:+.9g} {output}", f"{known['d']:+.9g} D {output}", f"-1.0 k {hubs[0][2:]}"]
-            for gain, terms in (("k", hubs[1:]), ("m", other)):
-                scaled += [f"{known[t[0]]:+.9g} {gain} {t[2:]}" for t in terms]
-            told = " ".join(t[0] + " " + t[1:] for t in scaled).removeprefix("+ ")
-            again = fitted([runs[judge]], structure(f"D^2 {output} = {told}", seen, offset=True))
-            fits = [m.compare(runs[judge]).fit_percent[output] for m in (found.model, again.model)]
-            k, m = (f"{again.coefficients[n]:.3f} ± {again.standard_errors[n]:.2g}" for n in "km")
-            yield f"| {output} | {used} | {judge} | **{fits[0]:.1f}** | {fits[1]:.1f} | {k} | {m} |"
+            found = fitted([runs[used]], made)
+            known, run = found.coefficients, runs[judge]
+            # SciPy's responses of the fitted link: the two gains are linear in them.
+            table = lsim_link.columns(
+                {n: np.asarray(run[n]) for n in ANGLES}, run.step, known["a"], known["d"],
+                [(n, m) for n, m, _ in (*hubs, *other)], seen, offset=True,
+            )  # fmt: skip
+            parts = [known[c] if c else -1.0 for *_, c in (*hubs, *other)]
+            shares = table[:, : len(hubs)] @ parts[: len(hubs)], table[:, len(hubs) : len(parts)] @ parts[len(hubs) :]
+            columns = np.column_stack((*shares, table[:, len(parts) :]))
+            size = np.linalg.norm(columns, axis=0)
+            gain = np.linalg.lstsq(columns / size, run[output], rcond=1e-12)[0] / size
+            free = run[output] - np.column_stack(shares).sum(axis=1)
+            rest = columns[:, 2:]
+            left = free - rest @ np.linalg.lstsq(rest, free, rcond=1e-12)[0]
+            fits = [lsim_link.fit_percent(run[output], e) for e in (left, run[output] - columns @ gain)]
+            ours = found.model.compare(run).fit_percent[output]
+            yield (
+                f"| {output} | {used} | {judge} | **{ours:.1f}** (SciPy {fits[0]:.1f}) | {fits[1]:.1f} | "
+                f"{gain[0]:.3f} | {gain[1]:.3f} |"
+            )
 
 
 def rival() -> Iterator[str]:
