@@ -36,7 +36,8 @@ const ROUNDING: f64 = 1e-12;
 
 /// Mean sign and end velocity of a pulse that starts at v, would end at p without friction, which takes b at most and
 /// holds what exceeds it by rounding.
-fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
+#[must_use]
+pub fn pulse(v: f64, p: f64, b: f64, rounding: f64) -> (f64, f64, Phase) {
     if v == 0.0 {
         if p.abs() <= b + rounding {
             return (if b > 0.0 { p / b } else { 0.0 }, 0.0, Phase::Stick);

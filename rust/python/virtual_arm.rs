@@ -3,11 +3,11 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
-use super::arrays::{stacked, vector};
+use super::arrays::{equations, stacked, vector, EquationArg};
 use super::errors::{attached, detached};
 use crate::error::{check_length, Error};
 use crate::memory::integral_by_memory;
-use crate::rig::arm::{Arm, Form, Parameters, Stage};
+use crate::rig::arm::{Arm, Parameters, SIGNALS};
 use crate::rig::guard::{self, Fault};
 use crate::rig::virtual_arm::{Injection, Pace, Plant, Reading, Sensors};
 
@@ -118,34 +118,15 @@ impl Guard {
 
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
-struct StageArg {
-    hub_orders: [f64; 3],
-    hub: [f64; 4],
-    deflection_orders: [f64; 3],
-    deflection: [f64; 4],
-    coulomb: f64,
-}
-
-#[derive(FromPyObject)]
-#[pyo3(from_item_all)]
 struct ArmArg {
-    stages: [StageArg; 2],
-    coupling: f64,
-    inertia_ratio: f64,
-    published: bool,
+    equations: Vec<EquationArg>,
+    coulomb: [f64; 2],
 }
 
-impl From<ArmArg> for Parameters {
-    fn from(a: ArmArg) -> Self {
-        let stages = a.stages.map(|s| Stage {
-            hub_orders: s.hub_orders,
-            hub: s.hub,
-            deflection_orders: s.deflection_orders,
-            deflection: s.deflection,
-            coulomb: s.coulomb,
-        });
-        let form = if a.published { Form::Published } else { Form::Lagrange };
-        Self { stages, coupling: a.coupling, inertia_ratio: a.inertia_ratio, form }
+impl ArmArg {
+    fn parameters(self) -> PyResult<Parameters> {
+        let inputs = [false, false, false, false, true, true];
+        Ok(Parameters { equations: equations(self.equations, SIGNALS, &inputs)?, coulomb: self.coulomb })
     }
 }
 
@@ -162,6 +143,7 @@ struct SensorsArg {
     range: f64,
     bits: u32,
     current_limit: [f64; 2],
+    offset: [f64; 2],
     travel: [f64; 2],
 }
 
@@ -178,6 +160,7 @@ impl From<SensorsArg> for Sensors {
             range: s.range,
             bits: s.bits,
             current_limit: s.current_limit,
+            offset: s.offset,
             travel: s.travel,
         }
     }
@@ -203,7 +186,7 @@ impl VirtualArm {
         longest_substep: f64,
         horizon: f64,
     ) -> PyResult<Self> {
-        let (arm, sensors) = (arm.into(), sensors.into());
+        let (arm, sensors) = (arm.parameters()?, sensors.into());
         let plant = detached(py, || Plant::new(Arm::new(&arm, step, longest_substep, horizon)?, sensors))?;
         Ok(Self { plant, step, pace: None, rows: Vec::new() })
     }

@@ -1,66 +1,43 @@
-//! The physical two-link arm stepped sample by sample, with its converters, paced in real time or not.
+//! The two-link arm stepped in time: four linear equations of fractional order in its angles, and dry friction of its hubs.
 //!
-//! Each hub obeys (17) with Newton's order 2 on the left, each link (15): it hangs on its hub's motion, which enters by
-//! D^{2−μ+γ} of the hub angle, a change of momentum. Or both obey (22)–(23) as published, where that motion is eliminated
-//! and a derivative of the current dropped: such a link bends the wrong way. The hub's Coulomb friction is a set-valued
-//! torque, so it counts as a current that is subtracted from the motor's and may take any value up to its limit at
-//! standstill. Stage 2 rides on link 1: with φ = θ₁₁ + θ₁₂ its base accelerates by φ″, and its motor's torque pulls on
-//! link 1,
+//! Which equations is not said here: whoever makes the arm hands them over with orders and coefficients, the same that
+//! identification and free runs read. Each is integrated once. What is differentiated by more than 1, D^ν θ with ν > 1,
+//! then stands on the left as a momentum, D^{ν−1} θ, so that what hangs on the motion of something else hangs on its rate;
+//! everything else is a force. Fractional derivatives of the angles are integrals of their rates, D^ν θ = I^{1−ν} θ′ and
+//! D^ν θ = I^{2−ν} θ″, exact for rates that are linear over a substep; the past lives in a fixed number of exponentials
+//! ([`crate::memory`]). One substep is a trapezoidal step, implicit in all four rates at once.
 //!
-//!   J₁₁θ₁₁″ = τ₁ + …,   J₁₂φ″ = … − κτ₂,   J₂₁(κφ″ + θ₂₁″) = τ₂ + …,   κ = 0 (apart) … 1 (the real mounting),
-//!
-//! which follow from one Lagrangian for every κ; link 2 hangs on the motion of its hub against the ground, κφ + θ₂₁.
-//! Fractional derivatives of the angles are integrals of their rates,
-//! D^ν θ = I^{1−ν} θ′ and D^ν θ = I^{2−ν} θ″, exact for rates that are linear over a substep; the past lives in a fixed
-//! number of exponentials ([`crate::memory`]). One substep is a trapezoidal step, implicit in all four rates at once.
+//! A hub's Coulomb friction is a set-valued torque: it counts as a current that is subtracted from the motor's and may take
+//! any value up to its limit at standstill, by the law of a pulse of [`crate::friction::march`] for each of two hubs that
+//! feel each other.
 
-use crate::error::{check_step, Error, Result};
+use crate::equation::{tidy, Equation, ORDER_GRAIN};
+use crate::error::{check_length, check_step, Error, Result};
+use crate::friction::march::{pulse, Phase};
 use crate::memory::{decay, Rates};
+use crate::regularity::check_regular;
 use crate::small;
 
 /// Accuracy of the memory's kernels: far below what the trapezoidal steps leave.
 const MEMORY_TOLERANCE: f64 = 1e-10;
 /// Sweeps of the friction solve; two hubs need one where the stages are apart and a few where they are not.
 const FRICTION_SWEEPS: usize = 60;
+/// Share of the most that friction takes from a rate which may be rounding.
+const ROUNDING: f64 = 1e-12;
 
 /// Most substeps of a sample: more take seconds each, and a slip of the hand would never end.
 const MOST_SUBSTEPS: f64 = 1e6;
 
-/// Which equation of the deflection is integrated.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Form {
-    /// (15): the link hangs on its hub.
-    Lagrange,
-    /// (23) as published.
-    Published,
-}
+/// Signals of the arm's equations: θ₁₁, θ₁₂, θ₂₁, θ₂₂, I₁, I₂.
+pub const SIGNALS: usize = 6;
 
-/// Orders, coefficients and friction of one stage, by the paper's names.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Stage {
-    /// Orders in the hub's equation: β on the deflection, γ on the hub, μ on the deflection; in [0, 2).
-    pub hub_orders: [f64; 3],
-    /// a, b, d, g of the hub's equation.
-    pub hub: [f64; 4],
-    /// Orders in the deflection's equation: β, γ, μ; in [0, 2), but γ in [1, 3) of [`Form::Lagrange`].
-    pub deflection_orders: [f64; 3],
-    /// a, b, d, g of the deflection's equation; g is 0 of [`Form::Lagrange`].
-    pub deflection: [f64; 4],
-    /// Coulomb friction of the hub as a current \[A\].
-    pub coulomb: f64,
-}
-
-/// Both stages and how they are joined.
+/// What the arm obeys.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parameters {
-    /// Stage 1 and stage 2.
-    pub stages: [Stage; 2],
-    /// κ: 0 stages apart, 1 stage 2 on link 1.
-    pub coupling: f64,
-    /// J₂₁/J₁₂.
-    pub inertia_ratio: f64,
-    /// Which equation of the deflections.
-    pub form: Form,
+    /// D^α θ = Σ c D^ν s of the four angles in their order, over [`SIGNALS`]; currents as they are.
+    pub equations: Vec<Equation>,
+    /// Coulomb friction of each hub as a current \[A\].
+    pub coulomb: [f64; 2],
 }
 
 /// A derivative of one angle and what it contributes to the four equations.
@@ -69,7 +46,7 @@ struct Operator {
     signal: usize,
     order: f64,
     into: [f64; 4],
-    /// Momenta that it is part of, beside the rates: what stands on the left of the equations, integrated once.
+    /// Momenta that it is part of: what stands on the left of the equations, integrated once.
     momentum: [f64; 4],
     /// On the states of the past; empty for orders 0 and 1.
     weights: Vec<f64>,
@@ -106,9 +83,10 @@ impl Arm {
     /// An arm at rest, stepped `step` s at a time in substeps of at most `longest_substep`, for `horizon` s.
     ///
     /// # Errors
-    /// [`Error::OutOfRange`] for an order outside [0, 2), a negative friction or coupling, a step that is not positive, a
-    /// horizon that is no number, more than a million substeps;
-    /// [`Error::NotFinite`] for a coefficient.
+    /// [`Error::OutOfRange`] for an order outside [0, 3), a highest order outside (1, 2], a negative friction, a step that
+    /// is not positive, a horizon that is no number, more than a million substeps; [`Error::NotFinite`] for a
+    /// coefficient; [`Error::Structure`] for equations that do not tell the angles apart, a differentiated current, and
+    /// friction of a hub whose motor does not drive it.
     pub fn new(parameters: &Parameters, step: f64, longest_substep: f64, horizon: f64) -> Result<Self> {
         check_step(step)?;
         check_step(longest_substep)?;
@@ -135,7 +113,6 @@ impl Arm {
             operator.prepare(h, &rates);
         }
         let (mut implicit, mut momenta) = ([[0.0; 4]; 4], [[0.0; 4]; 4]);
-        (0..4).for_each(|i| momenta[i][i] = 1.0);
         for operator in &operators {
             for (row, c) in implicit.iter_mut().zip(operator.into) {
                 row[operator.signal] += c * operator.now;
@@ -145,30 +122,46 @@ impl Arm {
             }
         }
         let matrix: Vec<f64> = (0..16).map(|i| momenta[i / 4][i % 4] - h / 2.0 * implicit[i / 4][i % 4]).collect();
-        let inverse = small::inverse(&matrix, 4)?;
+        let inverse = small::inverse(&matrix, 4).map_err(|_| singular())?;
         let mut solve = [[0.0; 4]; 4];
         for (i, value) in inverse.iter().enumerate() {
             solve[i / 4][i % 4] = *value;
         }
         let steps: Vec<(f64, f64, f64)> = rates.rates().iter().map(|s| decay(s * h)).collect();
         let count = steps.len();
-        Ok(Self {
+        // What is differentiated by whole orders alone has no past.
+        let remembered: [bool; 4] =
+            std::array::from_fn(|s| operators.iter().any(|o| o.signal == s && !o.weights.is_empty()));
+        let arm = Self {
             substep: h,
             substeps,
             operators,
             input,
-            coulomb: [parameters.stages[0].coulomb, parameters.stages[1].coulomb],
+            coulomb: parameters.coulomb,
             solve,
             implicit,
             keep: steps.iter().map(|s| s.0).collect(),
             first: steps.iter().map(|s| h * s.1).collect(),
             last: steps.iter().map(|s| h * s.2).collect(),
-            past: std::array::from_fn(|_| vec![0.0; count]),
+            past: remembered.map(|any| vec![0.0; if any { count } else { 0 }]),
             rate: [0.0; 4],
             angle: [0.0; 4],
             linear: [0.0; 4],
             friction: [0.0; 2],
-        })
+        };
+        let columns = arm.columns();
+        for (k, column) in columns.iter().enumerate() {
+            if arm.coulomb[k] > 0.0 && !(column[2 * k] > 0.0 && column[2 * k].is_finite()) {
+                return Err(Error::Structure {
+                    what: format!(
+                        "motor {} does not turn its hub, so friction given as its current does not hold it",
+                        k + 1
+                    ),
+                    remedy: "give the hub a torque per ampere above 0, or no friction".into(),
+                });
+            }
+        }
+        Ok(arm)
     }
 
     /// θ₁₁, θ₁₂, θ₂₁, θ₂₂ \[rad\].
@@ -218,7 +211,7 @@ impl Arm {
         let mut right = [0.0; 4];
         for (i, value) in right.iter_mut().enumerate() {
             let driven: f64 = self.input[i].iter().zip(current).map(|(b, u)| b * u).sum();
-            *value = self.rate[i] + gained[i] + h / 2.0 * (self.linear[i] + history[i]) + h * driven;
+            *value = gained[i] + h / 2.0 * (self.linear[i] + history[i]) + h * driven;
         }
         let mut rate = times(&self.solve, &right);
         if self.coulomb != [0.0; 2] {
@@ -239,22 +232,29 @@ impl Arm {
         self.rate = rate;
     }
 
-    /// Coulomb friction: the currents within ±coulomb that stop the hubs, or as much of them as there is.
-    fn rub(&mut self, rate: &mut [f64; 4]) {
+    /// Rates at the end of a substep per ampere of each motor in it.
+    fn columns(&self) -> [[f64; 4]; 2] {
         let h = self.substep;
-        // Rates per ampere of friction; column k is the response to motor k.
-        let columns: [[f64; 4]; 2] =
-            std::array::from_fn(|k| times(&self.solve, &std::array::from_fn(|i| h * self.input[i][k])));
+        std::array::from_fn(|k| times(&self.solve, &std::array::from_fn(|i| h * self.input[i][k])))
+    }
+
+    /// Coulomb friction: what each hub's own law asks for beside the other's, until both agree.
+    fn rub(&mut self, rate: &mut [f64; 4]) {
+        let columns = self.columns();
         let free = *rate;
         let mut friction = self.friction;
+        let mut rests = [false; 2];
         for _ in 0..FRICTION_SWEEPS {
             let mut change = 0.0_f64;
-            for k in 0..2 {
-                let hub = 2 * k;
-                let speed = free[hub] - columns[0][hub] * friction[0] - columns[1][hub] * friction[1];
-                let next = (friction[k] + speed / columns[k][hub]).clamp(-self.coulomb[k], self.coulomb[k]);
+            for k in (0..2).filter(|&k| self.coulomb[k] > 0.0) {
+                let (hub, other) = (2 * k, 1 - k);
+                let without = free[hub] - columns[other][hub] * friction[other];
+                let most = columns[k][hub] * self.coulomb[k];
+                let (sign, _, phase) = pulse(self.rate[hub], without, most, ROUNDING * most);
+                let next = self.coulomb[k] * sign;
                 change = change.max((next - friction[k]).abs());
                 friction[k] = next;
+                rests[k] = phase == Phase::Stick;
             }
             if change < 1e-15 {
                 break;
@@ -266,7 +266,7 @@ impl Arm {
         }
         for k in 0..2 {
             // A hub held by friction stands still exactly, and its encoder with it.
-            if friction[k].abs() < self.coulomb[k] {
+            if rests[k] {
                 rate[2 * k] = 0.0;
             }
         }
@@ -306,71 +306,76 @@ fn decayed(rates: &Rates, q: f64, h: f64) -> Vec<f64> {
     rates.weights(q).iter().zip(rates.rates()).map(|(w, s)| w * libm::exp(-s * h)).collect()
 }
 
+fn singular() -> Error {
+    Error::Structure {
+        what: "the arm's equations do not tell its angles apart: their leading matrix is singular".into(),
+        remedy: "change an order, or an inertia that the stages share".into(),
+    }
+}
+
 /// The forces and momenta of the four equations as derivatives of the angles, and their motor currents.
 fn accelerations(parameters: &Parameters) -> Result<(Vec<Operator>, [[f64; 2]; 4])> {
-    let (k, ratio) = (parameters.coupling, parameters.inertia_ratio);
+    check_length("equations of the arm", 4, parameters.equations.len())?;
     let outside = |name: &str, value: f64, range: &str| Error::OutOfRange {
         name: name.into(),
         value,
         range: range.into(),
         remedy: "correct the arm's parameters".into(),
     };
-    if !(0.0..=1.0).contains(&k) {
-        return Err(outside("coupling", k, "[0, 1]"));
+    if let Some(&value) = parameters.coulomb.iter().find(|c| !(**c >= 0.0 && c.is_finite())) {
+        return Err(outside("Coulomb friction", value, "[0, ∞) A"));
     }
-    if !(ratio >= 0.0 && ratio.is_finite()) {
-        return Err(outside("inertia ratio", ratio, "[0, ∞)"));
-    }
-    let mut terms: Vec<(usize, f64, usize, f64)> = Vec::new();
-    let mut momenta: Vec<(usize, f64, usize, f64)> = Vec::new();
-    let mut input = [[0.0; 2]; 4];
-    for (j, stage) in parameters.stages.iter().enumerate() {
-        if !(stage.coulomb >= 0.0 && stage.coulomb.is_finite()) {
-            return Err(outside("Coulomb friction", stage.coulomb, "[0, ∞) A"));
-        }
-        let (hub, link) = (2 * j, 2 * j + 1);
-        for (row, orders, c) in [(hub, stage.hub_orders, stage.hub), (link, stage.deflection_orders, stage.deflection)]
-        {
-            crate::error::check_finite("coefficients of the arm", &c)?;
-            for (t, signal) in [link, hub, link].into_iter().enumerate() {
-                // Integrated once with its equation, the hub's motion is a momentum.
-                let moved = row == link && t == 1 && parameters.form == Form::Lagrange;
-                let order = if moved { orders[t] - 1.0 } else { orders[t] };
-                if !(0.0..2.0).contains(&order) {
-                    return Err(outside("order of the arm", orders[t], if moved { "[1, 3)" } else { "[0, 2)" }));
-                }
-                if moved {
-                    momenta.push((signal, order, row, -c[t]));
-                    if j == 1 {
-                        // Hub 2 turns with the tip of link 1.
-                        momenta.extend([(0, order, row, -k * c[t]), (1, order, row, -k * c[t])]);
-                    }
-                } else {
-                    terms.push((signal, orders[t], row, c[t]));
-                }
-            }
-            input[row][j] += c[3];
-        }
-    }
-    // What accelerates φ accelerates the base of hub 2 the other way.
-    momenta.extend([(0, 1.0, 2, k), (1, 1.0, 2, k)]);
-    // Motor 2 and its friction pull on link 1.
-    let second = &parameters.stages[1];
-    terms.push((2, second.hub_orders[1], 1, -k * ratio * second.hub[1]));
-    input[1][1] -= k * ratio * second.hub[3];
-
     let mut operators: Vec<Operator> = Vec::new();
-    for (list, momentum) in [(terms, false), (momenta, true)] {
-        for (signal, order, row, c) in list.into_iter().filter(|term| term.3 != 0.0) {
+    let mut input = [[0.0; 2]; 4];
+    for (row, equation) in parameters.equations.iter().enumerate() {
+        let structure = &equation.structure;
+        crate::error::check_finite("coefficients of the arm", &equation.coefficients)?;
+        check_length("coefficients", structure.terms.len(), equation.coefficients.len())?;
+        if structure.output != row {
+            let what = format!("equation {row} of the arm is not that of its angle {row}");
+            return Err(Error::Structure { what, remedy: "give θ11, θ12, θ21, θ22 in this order".into() });
+        }
+        let alpha = structure.order;
+        if !(alpha > 1.0 && alpha <= 2.0) {
+            return Err(outside("highest order of the arm", alpha, "(1, 2]"));
+        }
+        // What is on the left counts as taken from the right.
+        let terms = structure.terms.iter().zip(&equation.coefficients).map(|(t, &c)| (t.signal, t.order, c));
+        for (signal, order, c) in std::iter::once((row, alpha, -1.0)).chain(terms) {
+            if signal >= SIGNALS {
+                let what = format!("an equation of the arm names signal {signal}, but it has {SIGNALS}");
+                return Err(Error::Structure { what, remedy: "number four angles and two currents from 0".into() });
+            }
+            if signal >= 4 {
+                if order.abs() > ORDER_GRAIN {
+                    let what = format!("an equation of the arm has its current differentiated by {order}");
+                    return Err(Error::Structure { what, remedy: "currents are held: take them as they are".into() });
+                }
+                input[row][signal - 4] += c;
+                continue;
+            }
+            // Beyond 3 even the momentum would be differentiated more often than trapezoids follow.
+            if !(0.0..3.0).contains(&order) {
+                return Err(outside("order of the arm", order, "[0, 3)"));
+            }
+            if c == 0.0 {
+                continue;
+            }
+            let momentum = order > 1.0;
+            let order = tidy(if momentum { order - 1.0 } else { order });
             #[allow(clippy::float_cmp)]
             let known = operators.iter().position(|o| o.signal == signal && o.order == order);
             let at = known.unwrap_or_else(|| {
                 operators.push(Operator { signal, order, ..Operator::default() });
                 operators.len() - 1
             });
-            let into = if momentum { &mut operators[at].momentum } else { &mut operators[at].into };
-            into[row] += c;
+            if momentum {
+                operators[at].momentum[row] -= c;
+            } else {
+                operators[at].into[row] += c;
+            }
         }
     }
+    check_regular(&parameters.equations).map_err(|_| singular())?;
     Ok((operators, input))
 }

@@ -28,6 +28,8 @@ pub struct Sensors {
     pub bits: u32,
     /// Largest current of the amplifiers \[A\].
     pub current_limit: [f64; 2],
+    /// What drives each motor besides its command while its amplifier is enabled \[A\].
+    pub offset: [f64; 2],
     /// Hub angle at which a limit switch opens \[rad\].
     pub travel: [f64; 2],
 }
@@ -207,7 +209,8 @@ impl Plant {
             let asked = -s.convert(volts) * s.command_scale;
             *current = if enabled { asked.clamp(-limit, limit) } else { 0.0 };
         }
-        self.arm.advance(self.current);
+        let offset = if enabled { s.offset } else { [0.0; 2] };
+        self.arm.advance(std::array::from_fn(|j| self.current[j] + offset[j]));
         self.sample += 1;
     }
 }
@@ -249,6 +252,7 @@ impl Sensors {
         }
         check_finite("strain_bias", &self.strain_bias)?;
         check_finite("sense_bias", &self.sense_bias)?;
+        check_finite("current offset", &self.offset)?;
         if self.bits > MOST_BITS {
             return Err(outside("bits", f64::from(self.bits), &format!("[0, {MOST_BITS}]")));
         }

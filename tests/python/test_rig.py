@@ -264,7 +264,7 @@ def test_parameters_come_from_a_toml_file(tmp_path):
         ('base = "other"', "base = 'other' is not known"),
         ('form = "newton"', "form = 'newton' is not known; use 'lagrange' or 'published'"),
         ("coupling = 7.0", "outside [0, 1]"),
-        ("[stage1]\ngamma = 1.9", "outside [0, 2)"),
+        ("[stage1]\ngamma = 1.9", "order 3.05 of theta11 is 1.05 above alpha = 2"),
     ],
 )
 def test_parameters_that_cannot_be_used_are_refused(tmp_path, text, words):

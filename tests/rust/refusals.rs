@@ -1,6 +1,6 @@
 //! What would panic, hang or exhaust memory later is refused at the door, in words.
 
-use ftlm::equation::{Equation, Filter, Initial};
+use ftlm::equation::{Equation, Filter, Initial, Structure, Term};
 use ftlm::error::{check_dense, check_points, Error, MOST_POINTS};
 use ftlm::estimate::iv;
 use ftlm::estimate::least_squares::{self, Regression};
@@ -9,7 +9,7 @@ use ftlm::estimate::streaming::Streaming;
 use ftlm::kernels::digamma;
 use ftlm::means::{delayed, pulse_means, Intersample};
 use ftlm::memory::{integral_by_memory, Rates};
-use ftlm::rig::arm::{Arm, Form, Parameters, Stage};
+use ftlm::rig::arm::{Arm, Parameters};
 use ftlm::rig::virtual_arm::{Injection, Pace, Plant, Sensors};
 use ftlm::simulate::{self, OutputFilter};
 use ftlm::small::{self, Recursion};
@@ -143,17 +143,52 @@ fn numbers_that_are_none() {
     assert!([f64::NAN, -1e300, 0.0].iter().all(|&x| digamma(x).is_nan()));
 }
 
-fn arm(step: f64, substep: f64, horizon: f64) -> Result<Arm, Error> {
-    let stage = Stage {
-        hub_orders: [0.1, 0.95, 0.75],
-        hub: [60.0, -6.0, 1.5, 14.0],
-        deflection_orders: [0.1, 1.05, 0.85],
-        deflection: [-84.0, 6.0, -2.1, -14.0],
-        coulomb: 0.05,
+/// One equation of the arm: its angle, then (signal, order, coefficient).
+fn of_arm(output: usize, terms: &[(usize, f64, f64)]) -> Equation {
+    let all = terms.iter().map(|&(signal, order, _)| Term { signal, order }).collect();
+    let structure = Structure { output, order: 2.0, terms: all };
+    Equation::new(structure, terms.iter().map(|t| t.2).collect()).unwrap()
+}
+
+fn arm_equations() -> Vec<Equation> {
+    let stage = |hub: usize, current: usize| {
+        let link = hub + 1;
+        let first = of_arm(hub, &[(link, 0.1, 60.0), (hub, 0.95, -6.0), (link, 0.75, 1.5), (current, 0.0, 14.0)]);
+        [first, of_arm(link, &[(link, 0.1, -84.0), (hub, 2.1, -1.0), (link, 0.85, -2.1)])]
     };
-    let form = Form::Published;
-    let parameters = Parameters { stages: [stage.clone(), stage], coupling: 1.0, inertia_ratio: 0.02, form };
-    Arm::new(&parameters, step, substep, horizon)
+    stage(0, 4).into_iter().chain(stage(2, 5)).collect()
+}
+
+fn arm(step: f64, substep: f64, horizon: f64) -> Result<Arm, Error> {
+    Arm::new(&Parameters { equations: arm_equations(), coulomb: [0.05; 2] }, step, substep, horizon)
+}
+
+#[test]
+fn an_arm_that_cannot_be_stepped_is_refused() {
+    let made =
+        |equations: Vec<Equation>, coulomb: [f64; 2]| Arm::new(&Parameters { equations, coulomb }, 0.002, 1e-4, 10.0);
+    assert!(made(arm_equations(), [0.0; 2]).is_ok());
+    for friction in [-0.1, f64::NAN, f64::INFINITY] {
+        refused(made(arm_equations(), [0.0, friction]));
+    }
+    refused(made(arm_equations()[..3].to_vec(), [0.0; 2]));
+    let changed = |row: usize, terms: &[(usize, f64, f64)]| {
+        let mut equations = arm_equations();
+        equations[row] = of_arm(equations[row].structure.output, terms);
+        equations
+    };
+    // A hub that its link moves as much as it moves its link.
+    refused(made(changed(0, &[(1, 1.9, -1.0), (4, 0.0, 14.0)]), [0.0; 2]));
+    refused(made(changed(0, &[(4, 0.1, 14.0)]), [0.0; 2]));
+    refused(made(changed(0, &[(1, 3.0, 1.0), (4, 0.0, 14.0)]), [0.0; 2]));
+    refused(made(changed(0, &[(6, 0.0, 1.0)]), [0.0; 2]));
+    refused(made(changed(0, &[(1, 0.1, 60.0)]), [0.1, 0.0]));
+    let mut swapped = arm_equations();
+    swapped.swap(0, 1);
+    refused(made(swapped, [0.0; 2]));
+    let mut slow = arm_equations();
+    slow[0].structure.order = 0.9;
+    refused(made(slow, [0.0; 2]));
 }
 
 fn sensors() -> Sensors {
@@ -168,6 +203,7 @@ fn sensors() -> Sensors {
         range: 10.0,
         bits: 16,
         current_limit: [0.94, 1.2],
+        offset: [0.0; 2],
         travel: [1.57, 1.57],
     }
 }

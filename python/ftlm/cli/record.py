@@ -84,8 +84,11 @@ def record(
     rate: Annotated[float, Option(help="Samples per second.")] = 500.0,
     seed: Annotated[int, Option(min=0, help="Of noise and random inputs.")] = 0,
     parameters: Annotated[
-        str, Option(metavar="NAME or TOML", help="Virtual arm: effective, linear or a file.")
+        str, Option(metavar="NAME or TOML", help="Virtual arm: effective, measured, linear or a file.")
     ] = "effective",
+    offset: Annotated[
+        Text, Option(metavar="A1:A2", help="Virtual arm: current that drives each motor besides its command.")
+    ] = None,
     paced: Annotated[bool, Option("--real-time", help="Pace the virtual rig.")] = False,
     stock_filter: Annotated[bool, Option("--stock-filter", help="Record behind the stock 2 Hz low-pass.")] = False,
     watchdog: Annotated[float, Option(help="Time after which the motors are stopped [s].")] = 0.1,
@@ -96,12 +99,14 @@ def record(
     """Drive a rig, simulated by default, and record a run that every other command reads."""
     currents = several("--amplitude", amplitude, 1, 2)
     low, high = several("--band", band, 2)
+    shift = None if offset is None else several("--offset", offset, 2)
     stream = live.stream(rig, parameters, rate, limit)
     try:
         with Progress("recording", quiet=as_json) as progress:
             run = experiment.record(
                 rig, input=shape, amplitude=(currents[0], currents[-1]), period=period, band=(low, high), ramp=ramp,
-                file=file, duration=duration, limit=limit, rate=rate, seed=seed, parameters=parameters, paced=paced,
+                file=file, duration=duration, limit=limit, rate=rate, seed=seed, parameters=parameters,
+                offset=None if shift is None else (shift[0], shift[1]), paced=paced,
                 sensor_filter="stock" if stock_filter else None, watchdog=watchdog, arm=arm, card=card, out=out,
                 force=force, live=stream, progress=each_second(stream, rate, progress),
             )  # fmt: skip

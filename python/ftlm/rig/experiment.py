@@ -7,6 +7,7 @@ import math
 import os
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -36,7 +37,8 @@ def record(
     rig: str | Board = "virtual", *, input: str = "square", amplitude: float | tuple[float, float] = 0.3,
     period: float | None = None, band: tuple[float, float] = (0.1, 20.0), ramp: float = 0.0,
     file: str | os.PathLike[str] | None = None, duration: float = 10.0, limit: float = 30.0, rate: float = 500.0,
-    seed: int = 0, parameters: str | os.PathLike[str] | ArmParameters = "effective", paced: bool = False,
+    seed: int = 0, parameters: str | os.PathLike[str] | ArmParameters = "effective",
+    offset: tuple[float, float] | None = None, paced: bool = False,
     sensor_filter: Literal["stock"] | None = None, watchdog: float = 0.1, arm: bool = False, card: str = "0",
     name: str | None = None, out: str | os.PathLike[str] | None = None, force: bool = False,
     live: Streaming | None = None, progress: Callable[[int, int], None] | None = None,
@@ -72,7 +74,10 @@ def record(
     seed : int
         Of the virtual rig's noise and of random inputs. Equal seeds give equal runs.
     parameters : str, path or ArmParameters
-        Of the virtual arm: ``"effective"``, ``"linear"`` (no friction, coupling or noise) or a TOML file.
+        Of the virtual arm: ``"effective"``, ``"measured"``, ``"linear"`` (no friction, coupling or noise), a TOML file.
+    offset : pair of float, optional
+        What drives each motor of the virtual arm besides its command while the amplifiers are enabled [A]; default that
+        of its parameters, 0. It belongs to a run: real ones have another each.
     paced : bool
         Whether the virtual rig runs in real time.
     sensor_filter : {"stock"}, optional
@@ -114,7 +119,7 @@ def record(
     commands = excitation.commands(rate, duration)
     if sensor_filter not in (None, "stock"):
         raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or None")
-    board, told = _board(rig, parameters, seed, paced=paced, horizon=limit, card=card)
+    board, told = _board(rig, parameters, seed, offset, paced=paced, horizon=limit, card=card)
     paced = paced or board.hardware or bool(getattr(board, "paced", False))
     if board.hardware and not arm:
         raise ModelError(
@@ -224,12 +229,18 @@ class _Recorder:
 
 
 def _board(
-    rig: str | Board, parameters: str | os.PathLike[str] | ArmParameters, seed: int, *, paced: bool, horizon: float,
-    card: str,
+    rig: str | Board, parameters: str | os.PathLike[str] | ArmParameters, seed: int,
+    offset: tuple[float, float] | None, *, paced: bool, horizon: float, card: str,
 ) -> tuple[Board, dict[str, Any]]:  # fmt: skip
     """The board that is asked for, and what a run tells of it."""
+    if offset is not None and rig != "virtual":
+        raise ModelError("offset is of the virtual arm; a board has its own, leave it out")
     if rig == "virtual":
         arm = ArmParameters.of(parameters)
+        if offset is not None:
+            if len(offset) != 2 or not all(math.isfinite(v) for v in offset):
+                raise ModelError(f"offset = {offset!r} is not a pair of currents [A], of motor 1 and motor 2")
+            arm = replace(arm, current_offset=(float(offset[0]), float(offset[1])))
         return VirtualBoard(arm, seed=seed, paced=paced, horizon=horizon), {"parameters": arm.to_dict()}
     if rig == "q8":
         return QuanserBoard(card=card), {"card": card}

@@ -11,11 +11,21 @@ from pathlib import Path
 from typing import Any
 
 from ftlm import _core
-from ftlm.arm.link import Form, order_law
+from ftlm.arm.link import Form, flexible_link
 from ftlm.base.checks import listed, nearest
 from ftlm.base.errors import DataError, ModelError
+from ftlm.model.model import Model
 from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
+from ftlm.solve.records import equation_tuple
 
+#: Of the arm, in the order that the core numbers them.
+SIGNALS = ("theta11", "theta12", "theta21", "theta22", "I1", "I2")
+#: The maker's file: link 1 is 0.202 m long and turns 0.170434 kg m^2 with all that it carries; on link 2, which turns
+#: 0.0064387 kg m^2, 0.157 kg sit 0.20185 m out; of hub 2's 0.00301955 kg m^2 a rotor of 1.03e-6 behind a gear of
+#: 50 is 0.002575 and leans on link 1 with a fiftieth of that alone.
+INERTIA_RATIO = 0.00301955 / 0.170434
+REACH = 0.157 * 0.202 * 0.20185 / 0.0064387
+TURNED = (0.00301955 - 0.002575 + 0.002575 / 50.0) / 0.00301955
 #: Longest step of the simulation inside a sample [s]: deflections are then within 2e-4 of their deviation, of stage 1
 #: within 1e-5.
 SUBSTEP = 1e-4
@@ -28,11 +38,11 @@ class StageParameters:
     Parameters
     ----------
     a, b, d, g, r
-        Coefficients of the hub's equation and the inertia ratio, which give the deflection's.
+        Coefficients of the hub's equation and the inertia ratio r = (J_1 + J_2)/J_2, which give the deflection's.
     gamma, beta, mu
-        Free orders, in [0, 1.2], such that every order of the law lies in [0, 2); both highest orders are 2.
+        Free orders, such that every order of the law lies in [0, 3); both highest orders are 2.
     coulomb
-        Friction as a motor current [A].
+        Friction as a motor current [A], 0 for none.
     """
 
     a: float
@@ -50,22 +60,14 @@ class StageParameters:
         h, k = 2 * stage - 1, 2 * stage
         return {f"alpha{h}": 2.0, f"alpha{k}": 2.0, f"gamma{h}": self.gamma, f"beta{k}": self.beta, f"mu{k}": self.mu}
 
-    def equations(self, stage: int, form: Form = "lagrange") -> dict[str, Any]:
-        """Orders and coefficients of both equations, as the core takes them."""
+    def coefficients(self, stage: int, form: Form = "lagrange") -> dict[str, float]:
+        """The coefficients of both equations, by the law's names."""
         h, k = 2 * stage - 1, 2 * stage
-        free = self.orders(stage)
-        law = {name: order.at(free) for name, order in order_law(stage, form=form).items()}
-        deflection = [-self.a * self.r, -self.b, -self.d * self.r, -self.g]
+        hub = {f"a{h}": self.a, f"b{h}": self.b, f"d{h}": self.d, f"g{h}": self.g}
         if form == "lagrange":
             # J_1/J_2 is r - 1.
-            deflection = [-self.a * (self.r - 1.0), -1.0, -self.d * (self.r - 1.0), 0.0]
-        return {
-            "hub_orders": [law[f"{n}{h}"] for n in ("beta", "gamma", "mu")],
-            "hub": [self.a, self.b, self.d, self.g],
-            "deflection_orders": [law[f"{n}{k}"] for n in ("beta", "gamma", "mu")],
-            "deflection": deflection,
-            "coulomb": self.coulomb,
-        }
+            return hub | {f"a{k}": -self.a * (self.r - 1.0), f"d{k}": -self.d * (self.r - 1.0)}
+        return hub | {f"a{k}": -self.a * self.r, f"b{k}": -self.b, f"d{k}": -self.d * self.r, f"g{k}": -self.g}
 
 
 @dataclass(frozen=True)
@@ -77,9 +79,18 @@ class ArmParameters:
     stage1, stage2
         The stages.
     coupling
-        0: stages apart; 1: stage 2 rides on link 1.
+        0: stages apart; 1: stage 2 rides on link 1, as :func:`ftlm.flexible_link` has it under
+        ``cross_stage="inertial"``. In between the rates that link 1 hands on to stage 2 are so much smaller, in one and
+        the same kinetic energy.
     inertia_ratio
-        J_21/J_12.
+        J_21/J_12, J_12 with all that link 1 carries.
+    reach
+        H/J_22, H the length of link 1 times the moment of mass of link 2: 1 where both links are equally long and the
+        mass is at the tip.
+    turned
+        Share of J_21 that turns with link 1. A rotor behind a gear does not, but for one part in its ratio.
+    current_offset
+        What drives each motor besides its command while the amplifiers are enabled [A]: of a run, not of the arm.
     strain_noise, current_noise
         Standard deviation of the noise on the gauges and on the current sense [V].
     strain_bias, current_bias
@@ -91,8 +102,9 @@ class ArmParameters:
     travel
         Hub angle at which a limit switch opens [rad].
     form
-        ``"lagrange"``: links hang on their hubs, the Euler-Lagrange equations (15); ``"published"``: (23) and (25) as
-        printed, whose links bend the wrong way, for what is set beside the paper's own numbers.
+        ``"lagrange"``: links hang on their hubs, the Euler-Lagrange equations (14)-(15); ``"published"``: (22)-(25) as
+        printed, whose links bend the wrong way, for what is set beside the paper's own numbers. These know the stages
+        apart alone.
     name
         What files call them.
     """
@@ -100,7 +112,10 @@ class ArmParameters:
     stage1: StageParameters
     stage2: StageParameters
     coupling: float = 1.0
-    inertia_ratio: float = 0.00301955 / 0.170434
+    inertia_ratio: float = INERTIA_RATIO
+    reach: float = REACH
+    turned: float = TURNED
+    current_offset: tuple[float, float] = (0.0, 0.0)
     strain_noise: tuple[float, float] = (0.015, 0.0134)
     current_noise: tuple[float, float] = (0.0012, 0.0012)
     strain_bias: tuple[float, float] = (0.12, -0.2)
@@ -156,17 +171,69 @@ class ArmParameters:
         """For JSON."""
         return {k: list(v) if isinstance(v, tuple) else v for k, v in asdict(self).items()}
 
+    def pushes(self) -> dict[str, float]:
+        """What the stages do to each other: coefficients of D^2 of the other stage's angles by the law's names.
+
+        Raises
+        ------
+        ModelError
+            Numbers out of range, or inertias with which the arm's kinetic energy is not positive.
+        """
+        for name, highest in (("coupling", 1.0), ("turned", 1.0), ("inertia_ratio", math.inf), ("reach", math.inf)):
+            value = getattr(self, name)
+            if not (0.0 <= value <= highest and math.isfinite(value)):
+                raise ModelError(f"{name} = {value!r} is outside [0, {highest:g}]; correct the arm's parameters")
+        if not self.stage2.r > 1.0:
+            raise ModelError(f"r = {self.stage2.r!r} of stage 2 is not above 1, as (J_1 + J_2)/J_2 is")
+        hub = self.coupling * self.turned * self.inertia_ratio
+        arm = self.coupling * self.inertia_ratio / (self.stage2.r - 1.0) * (1.0 + self.reach)
+        base, carried = -self.coupling * self.turned, -self.coupling * (1.0 + self.reach)
+        # The determinant of the inertias over that of the stages apart.
+        if not 1.0 + hub * base + arm * carried > 0.0:
+            raise ModelError(
+                f"inertia_ratio = {self.inertia_ratio:g} and reach = {self.reach:g} give stage 2 more inertia than "
+                "link 1 carries, and the arm a kinetic energy that is not positive: its leading matrix is singular or "
+                "worse; make them smaller"
+            )
+        return {"p2": -hub - arm, "q2": -arm, "p3": base, "q3": base, "p4": carried, "q4": carried}
+
+    def model(self) -> Model:
+        """The arm's linear part, both stages from their currents: what :meth:`arm` integrates, friction aside.
+
+        Raises
+        ------
+        ModelError
+            Orders or coefficients that make no model, the published form with a coupling.
+        """
+        if self.form == "published" and self.coupling != 0.0:
+            raise ModelError(
+                "form = 'published' knows the stages apart alone: set coupling = 0, or use form = 'lagrange'"
+            )
+        coupled = self.coupling != 0.0
+        structure = flexible_link(
+            stage="both", form=self.form, coupling="simulated", cross_stage="inertial" if coupled else False
+        )
+        orders: dict[str, float] = {}
+        coefficients: dict[str, float] = self.pushes() if coupled else {}
+        for j, stage in ((1, self.stage1), (2, self.stage2)):
+            orders |= stage.orders(j)
+            coefficients |= stage.coefficients(j, self.form)
+        known = {n: v for n, v in orders.items() if n in structure.order_names}
+        return Model(structure.with_orders(known).with_coefficients(coefficients), orders=known)
+
     def arm(self, step: float, horizon: float) -> _core.VirtualArm:
         """The simulated arm at rest, for runs of at most `horizon` s in samples of `step` s."""
+        model = self.model()
         links = {
-            "stages": [self.stage1.equations(1, self.form), self.stage2.equations(2, self.form)],
-            "coupling": self.coupling, "inertia_ratio": self.inertia_ratio, "published": self.form == "published",
-        }  # fmt: skip
+            "equations": [equation_tuple(item, SIGNALS) for item in model.equations],
+            "coulomb": [self.stage1.coulomb, self.stage2.coulomb],
+        }
         sensors = {
             "strain_scale": STRAIN_SCALE, "strain_bias": self.strain_bias,
             "noise": [*self.strain_noise, *self.current_noise], "sense_bias": self.current_bias,
             "sense_scale": SENSE_SCALE, "command_scale": COMMAND_SCALE, "encoder_scale": self.encoder_scale,
-            "range": 10.0, "bits": self.bits, "current_limit": CURRENT_LIMIT, "travel": self.travel,
+            "range": 10.0, "bits": self.bits, "current_limit": CURRENT_LIMIT, "offset": self.current_offset,
+            "travel": self.travel,
         }  # fmt: skip
         return _core.VirtualArm(links, sensors, step, SUBSTEP, horizon)
 
