@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 
 import ftlm
+import lagrange
 from ftlm import rig
+from ftlm.rig.experiment import STOCK_FILTER
 from planar_arm import Planar
+from real_arm import correlations, filtered
 
 STEP = 0.002
 ANGLES = ("theta11", "theta12", "theta21", "theta22")
@@ -112,6 +115,33 @@ def test_a_hub_by_itself_is_the_body_with_friction_of_the_free_run():
     truth = ftlm.Model(body).simulate(blank)["theta11"]
     found = states_of(parameters, driven)[:, 0]
     assert np.abs(found - truth).max() < 1e-4 * truth.std()
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# As the real arm
+
+
+def run_of(parameters, driven):
+    """A run without noise, deflections behind the stock filter."""
+    angles, (w, damping) = states_of(parameters, driven), STOCK_FILTER
+    seen = [filtered(angles[:, k], [w * w], [1.0, 2.0 * damping * w, w * w], STEP) for k in (1, 3)]
+    outputs = {"theta11": angles[:, 0], "theta12": seen[0], "theta21": angles[:, 2], "theta22": seen[1]}
+    return ftlm.Run.from_arrays(step=STEP, inputs={"I1": driven[:, 0], "I2": driven[:, 1]}, outputs=outputs)
+
+
+@pytest.mark.parametrize("shape", ["square", "multisine"])
+def test_deflections_go_against_their_currents_and_with_their_hubs(shape):
+    # The real arm, under currents of its own (tests/python/test_rig_measured.py): -0.34 and 0.69, -0.32 and 0.92.
+    driven = np.column_stack([2.0 * lagrange.current(shape, 5000)] * 2)
+    for name in ("linear", "effective", "measured", "measured-lqr"):
+        current, hub, second, _ = correlations(run_of(exact(name), driven))
+        assert current < -0.15, name
+        assert hub > 0.4, name
+        assert second < -0.15, name
+    # The published form bends the other way, and follows no hub.
+    current, hub, second, other = correlations(run_of(exact("linear", form="published"), driven))
+    assert min(current, second) > 0.1
+    assert max(hub, other) < 0.2
 
 
 # ----------------------------------------------------------------------------------------------------------------------
