@@ -144,6 +144,33 @@ def test_deflections_go_against_their_currents_and_with_their_hubs(shape):
     assert max(hub, other) < 0.2
 
 
+@pytest.mark.slow
+def test_the_links_of_a_noisy_run_with_friction_and_offset_are_recovered_with_intervals():
+    # Friction, torque and offset are those of hubs: driven by these the links know nothing of them.
+    arm = rig.ArmParameters.of("effective")
+    run = rig.record(
+        input="multisine", amplitude=(0.6, 0.8), period=8.0, band=(0.125, 8.0), duration=8.0, seed=1, parameters=arm,
+        offset=(0.01, -0.02),
+    )  # fmt: skip
+    hubs, deflections = ("theta11", "theta21"), ("theta12", "theta22")
+    driven = ftlm.Run.from_arrays(
+        step=2 * run.step, inputs={n: run[n][::2] for n in hubs}, outputs={n: run[n][::2] for n in deflections},
+        intersample=dict.fromkeys(hubs, "foh"),
+    )  # fmt: skip
+    truth = {**arm.model().orders, **arm.model().coefficients}
+    structure = ftlm.flexible_link(stage="both", hub=False, cross_stage="inertial")
+    structure = replace(structure, coupling="simulated", initial="rest")
+    known = {n: truth[n] for n in ("gamma1", "gamma3")}
+    found = ftlm.identify(driven, structure.with_orders(known), threads=1, intervals="quadratic")
+    names = ("beta2", "mu2", "beta4", "mu4", "a2", "d2", "p2", "q2", "a4", "d4", "p4", "q4")
+    values = {**found.orders, **found.coefficients}
+    away = {n: (values[n] - truth[n]) / found.standard_errors[n] for n in names}
+    # 12 numbers at once: 99.9 % each.
+    assert max(map(abs, away.values())) < 3.3, away
+    assert max(found.standard_errors[n] for n in ("beta2", "mu2", "beta4", "mu4")) < 0.002
+    assert found.standard_errors["p4"] < 0.01
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # A run
 
