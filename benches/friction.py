@@ -112,9 +112,7 @@ def measured() -> None:
         structure = ftlm.equation(HUB.format(current="I1", rubs=words), initial="caputo")
         for run in runs.values():
             told(structure, [run], runs)
-    steps = {
-        n: run_of(DATA / "two_link_steps" / f"lqr_{n}.csv", "Im1_cmd_A", name=n) for n in (*FITTED, *JUDGED)
-    }
+    steps = {n: run_of(DATA / "two_link_steps" / f"lqr_{n}.csv", "Im1_cmd_A", name=n) for n in (*FITTED, *JUDGED)}
     # In the first four the command stays below what the amplifier gives; the limit is seen in the step of -30 degrees.
     for fitted, current in ((FITTED, "I1"), (SEEN, "I1"), (SEEN, SATURATES)):
         for words in ("", RUBS):
