@@ -351,9 +351,14 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
         return replace(valley, best=off)
 
     monkeypatch.setattr(profiling.Valley, "at", classmethod(beside))
-    again = ftlm.identify(
-        run, ftlm.equation("D^2 y = c D y + a y + b u", initial="rest"), threads=1, intervals="profile"
-    )
+    structure = ftlm.equation("D^2 y = c D y + a y + b u", initial="rest")
+    same = ftlm.identify(run, structure, threads=1, intervals="profile")
+    # The fit was right all the while: its residuals do not fall, and its starts stay told.
+    assert not [w for w in same.warnings if "the search for intervals did" in w]
+    assert same.joint.starts == right.joint.starts
+    calls.clear()
+    monkeypatch.setattr("ftlm.identification.intervals.TOLD", -1.0)
+    again = ftlm.identify(run, structure, threads=1, intervals="profile")
     assert [w for w in again.warnings if "led to this optimum, but the search for intervals did" in w]
     assert "from a lower optimum" in str(again)
     for name, value in right.coefficients.items():

@@ -19,6 +19,8 @@ from ftlm.identification.judged import Judged
 
 #: Level of the intervals that are printed.
 PRINTED = 0.95
+#: A lower optimum is spoken of where the residuals of an output fall by this share.
+TOLD = 1e-3
 #: How often a fit goes on from a lower optimum that its intervals came upon.
 REFITS = 2
 #: Pulses that may be spent on profiles nobody asked for, all numbers together, free runs that an end is worth beginning
@@ -64,7 +66,10 @@ def with_intervals(
             again = fit_output_error(runs, problem.structure, threads=threads, start=start, loss=loss)
         except FtlmError:
             break
-        joint = replace(again, origin="a lower optimum that the search for its intervals came upon")
+        joint = replace(again, starts=joint.starts, origin=joint.origin)
+        if all(v > (1.0 - TOLD) * level[o] for o, v in joint.noise.items()):
+            continue
+        joint = replace(joint, origin="a lower optimum that the search for its intervals came upon")
         before, after = (", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise))
         warnings = [
             f"none of {tried} starts led to this optimum, but the search for intervals did (residuals {before} before, "
