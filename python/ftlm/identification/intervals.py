@@ -66,10 +66,10 @@ def with_intervals(
             again = fit_output_error(runs, problem.structure, threads=threads, start=start, loss=loss)
         except FtlmError:
             break
-        joint = replace(again, starts=joint.starts, origin=joint.origin)
-        if all(v > (1.0 - TOLD) * level[o] for o, v in joint.noise.items()):
+        if all(v > (1.0 - TOLD) * level[o] for o, v in again.noise.items()):
+            joint = replace(again, starts=joint.starts, origin=joint.origin)
             continue
-        joint = replace(joint, origin="a lower optimum that the search for its intervals came upon")
+        joint = replace(again, origin="a lower optimum that the search for its intervals came upon")
         before, after = (", ".join(f"{o} {v:.4g}" for o, v in noise.items()) for noise in (level, joint.noise))
         warnings = [
             f"none of {tried} starts led to this optimum, but the search for intervals did (residuals {before} before, "
