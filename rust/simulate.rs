@@ -119,6 +119,40 @@ impl<'a> System<'a> {
         Ok(out)
     }
 
+    /// What a unit of each initial term, an equation and an exponent, does to every output while nothing else drives.
+    pub(crate) fn units(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
+        let (m, n) = (self.record.m(), self.matrix.len());
+        if units.is_empty() {
+            return Ok(Vec::new());
+        }
+        let inverse = self.inverse()?;
+        if inverse.iter().flatten().any(|series| grows(series)) {
+            return units
+                .iter()
+                .map(|&(i, exponent)| {
+                    let mut rhs = vec![vec![0.0; m]; n];
+                    rhs[i] = self.record.initial_term(exponent);
+                    self.solve(&rhs)
+                })
+                .collect();
+        }
+        let kernels: Vec<Vec<Kernel>> =
+            inverse.iter().map(|row| row.iter().map(|s| Kernel::new(s)).collect()).collect();
+        let mut buffers = Buffers::default();
+        let mut through = |kernel: &Kernel, term: &[f64]| {
+            let mut out = vec![0.0; m];
+            kernel.apply(term, &mut out, &mut buffers);
+            out
+        };
+        Ok(units
+            .iter()
+            .map(|&(i, exponent)| {
+                let term = self.record.initial_term(exponent);
+                kernels.iter().map(|row| through(&row[i], &term)).collect()
+            })
+            .collect())
+    }
+
     fn solve(&self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
         series::solve(&self.matrix, &borrowed)
@@ -227,35 +261,7 @@ pub fn unit_responses(equations: &[Equation], record: &Record, units: &[(usize, 
             })?
             .push((exponent, 1.0));
     }
-    let system = checked(equations, record, &initial)?;
-    let inverse = system.inverse()?;
-    let term = |exponent: f64| record.initial_term(exponent);
-    if inverse.iter().flatten().any(|series| grows(series)) {
-        return units
-            .iter()
-            .map(|&(i, exponent)| {
-                let mut rhs = vec![vec![0.0; record.m()]; n];
-                rhs[i] = term(exponent);
-                system.solve(&rhs)
-            })
-            .collect();
-    }
-    let kernels: Vec<Vec<Kernel>> = inverse.iter().map(|row| row.iter().map(|s| Kernel::new(s)).collect()).collect();
-    let mut buffers = Buffers::default();
-    Ok(units
-        .iter()
-        .map(|&(i, exponent)| {
-            let term = term(exponent);
-            kernels
-                .iter()
-                .map(|row| {
-                    let mut out = vec![0.0; record.m()];
-                    row[i].apply(&term, &mut out, &mut buffers);
-                    out
-                })
-                .collect()
-        })
-        .collect())
+    checked(equations, record, &initial)?.units(units)
 }
 
 /// Whether the second half of a series exceeds its first by so much that a transform would swamp the latter.
@@ -288,7 +294,6 @@ pub fn respond_with_initial(
         check_length("filter", record.m(), filter.series.len())?;
         check_length("filtered outputs", equations.len(), filter.applies.len())?;
     }
-    let n = equations.len();
     let exponents: Vec<Vec<f64>> = equations.iter().map(|e| e.structure.initial_exponents(initial)).collect();
     let through = |mut outputs: Vec<Vec<f64>>| {
         if let Some(filter) = filter {
@@ -308,17 +313,14 @@ pub fn respond_with_initial(
     let stack = |outputs: &[Vec<f64>]| -> Vec<f64> {
         outputs.iter().zip(&weights).flat_map(|(o, w)| o.iter().map(move |v| v * w)).collect()
     };
-    let mut responses = Vec::new();
-    for (i, list) in exponents.iter().enumerate() {
-        for (e, &exponent) in list.iter().enumerate() {
-            let mut rhs = vec![vec![0.0; record.m()]; n];
-            rhs[i] = record.initial_term(exponent);
-            let response = through(system.solve(&rhs)?);
-            if finite(&response) {
-                responses.push((i, e, response));
-            }
-        }
-    }
+    let units: Vec<(usize, usize, f64)> = (exponents.iter().enumerate())
+        .flat_map(|(i, list)| list.iter().enumerate().map(move |(e, &exponent)| (i, e, exponent)))
+        .collect();
+    let asked: Vec<(usize, f64)> = units.iter().map(|&(i, _, exponent)| (i, exponent)).collect();
+    let responses: Vec<(usize, usize, Vec<Vec<f64>>)> = (units.iter().zip(system.units(&asked)?))
+        .map(|(&(i, e, _), outputs)| (i, e, through(outputs)))
+        .filter(|(_, _, response)| finite(response))
+        .collect();
     let columns: Vec<Vec<f64>> = responses.iter().map(|(_, _, r)| stack(r)).collect();
     let misses: Vec<Vec<f64>> = equations
         .iter()

@@ -159,3 +159,29 @@ def _reaches(u: np.ndarray, step: float, omega: float) -> bool:
     power = np.abs(np.fft.rfft(u)) ** 2
     w = 2 * np.pi * np.fft.rfftfreq(u.size, step)
     return bool(np.sum(power[(w > omega / 2) & (w < 2 * omega)]) > 0.02 * np.sum(power[1:]))
+
+
+def resonant_plant(seed: int, *, wrong: bool = False) -> ftlm.Run:
+    """A random plant of the chain of orders at 40 dB, or one that no single equation is."""
+    rng = np.random.default_rng([seed, int(wrong)])
+    rows, step = 801, 0.02
+    command = np.repeat(rng.choice([-1.0, 1.0], rows // 20 + 1), 20)[:rows]
+    stiff, loss = 10 ** rng.uniform(0.3, 1.8), rng.uniform(0.05, 0.5)
+    alpha, mu = rng.uniform(1.3, 2.1), rng.uniform(0.2, 1.1)
+    damping = loss * stiff ** (1 - mu / alpha) * 2
+    words = f"D^{alpha:.6f} y = -{damping:.6g} D^{mu:.6f} y - {stiff:.6g} y + {stiff:.6g} u"
+    if wrong:
+        # Another mode stands beside it, and the input comes late.
+        second = f"D^2 z = -{rng.uniform(0.5, 2):.6g} D z - {6 * stiff:.6g} z + {3 * stiff:.6g} u"
+        models = [ftlm.equation(words, delay={"u": 0.05}), ftlm.equation(second)]
+    else:
+        models = [ftlm.equation(words)]
+    total = np.zeros(rows)
+    for made in models:
+        name = made.outputs[0]
+        blank = ftlm.Run.from_arrays(step=step, inputs={"u": command}, outputs={name: np.zeros(rows)})
+        total = total + ftlm.Model(made).simulate(blank)[name]
+    noisy = total + 0.01 * np.std(total) * rng.standard_normal(rows)
+    return ftlm.Run.from_arrays(
+        step=step, inputs={"u": command}, outputs={"y": noisy}, name=f"{'wrong' if wrong else 'plant'} {seed}"
+    )

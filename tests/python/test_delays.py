@@ -80,7 +80,7 @@ def test_its_score_is_that_of_a_standard_normal_number():
         found = fit_output_error(
             [late_run(DELAY, 40, seed)], structure(), start=dict(zip(problem.names, truth, strict=True))
         )
-        scores.append((found.delays["u"] - DELAY) / found.standard_errors["delay_u"])
+        scores.append((found.inputs["delay_u"] - DELAY) / found.standard_errors["delay_u"])
     # Thirty standard normal numbers: the mean scatters by 0.18, the deviation by 0.13.
     assert abs(np.mean(scores)) < 0.65
     assert 0.55 < np.std(scores) < 1.45
@@ -131,7 +131,7 @@ def test_two_runs_share_one_delay():
 def test_no_delay_is_found_where_there_is_none():
     found = fit_output_error([plants.noisy_run("3T", 40, 5)], structure())
     # At 0 the estimate is on its natural edge, which is no reason to widen anything.
-    assert found.delays["u"] < 3 * found.standard_errors["delay_u"]
+    assert found.inputs["delay_u"] < 3 * found.standard_errors["delay_u"]
     result = ftlm.identify(plants.noisy_run("3T", 40, 5), structure(), threads=1)
     assert not [w for w in result.warnings if "on its bound" in w]
 

@@ -17,16 +17,12 @@ from ftlm.data.run import Run
 from ftlm.errors import DataError
 from ftlm.files import apart
 from ftlm.files.load import load
-from measured import DATA
+from measured import DATA, needs_data
 
 PSF = DATA / "two_link_psf"
 SIGNALS = {"inputs": {"u": "c2"}, "outputs": {"y": "c3"}}
 HEADED = {"inputs": ["u"], "outputs": ["y"]}
 ANGLES = ("theta11", "theta12", "theta21", "theta22")
-
-measured = pytest.mark.skipif(
-    not (PSF / "psf.csv").is_file(), reason=f"measured data are not in {DATA} (set FTLM_DATA to their folder)"
-)
 
 
 def rows(n=12, separator=",", step=0.01):
@@ -597,7 +593,7 @@ def test_numbers_are_read_to_the_bit(values, separator, header, tmp_path_factory
 # --- measured data ----------------------------------------------------------------------------------------------------
 
 
-@measured
+@needs_data
 def test_measured_csv_and_mat_agree():
     from_csv = load(
         PSF / "psf.csv",
@@ -622,7 +618,7 @@ def test_measured_csv_and_mat_agree():
         from_csv.slice(0, 1.0).require_outputs(["theta12"])
 
 
-@measured
+@needs_data
 def test_measured_record_whose_time_starts_late():
     run = load(
         DATA / "two_link_lqr" / "lqr.csv",
@@ -634,7 +630,7 @@ def test_measured_record_whose_time_starts_late():
     assert (run.step, run.start, run.length) == (0.002, 83.274, 9450)
 
 
-@measured
+@needs_data
 def test_measured_records_without_header():
     arm = load(DATA / "robot_arm" / "robot_arm.dat", inputs={"torque": "c1"}, outputs={"acceleration": "c2"}, step=1.0)
     assert (arm.length, arm.step) == (1024, 1.0)

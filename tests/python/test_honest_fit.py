@@ -8,7 +8,8 @@ from scipy import signal
 
 import ftlm
 from ftlm.judge.comparison import compare_means
-from measured import DATA
+from measured import DATA, needs_data
+from plants import resonant_plant
 
 
 def commands(rows, seed, hold=4):
@@ -195,11 +196,9 @@ def test_a_model_that_runs_away_is_said_to():
     assert not found.output_error["y"].fit >= 0
 
 
+@needs_data
 def test_a_real_arm_with_feed_through_prints_what_it_simulates():
-    file = DATA / "robot_arm" / "robot_arm.dat"
-    if not file.exists():
-        pytest.skip(f"measured data are not at {DATA}")
-    torque, acceleration = np.loadtxt(file).T
+    torque, acceleration = np.loadtxt(DATA / "robot_arm" / "robot_arm.dat").T
     run = run_of(torque, acceleration, 0.01)
     structure = ftlm.equation("D^2 y = a1 D y + a0 y + b2 D^2 u + b1 D u + b0 u", initial="rest")
     result = ftlm.identify(run, structure)
@@ -208,3 +207,14 @@ def test_a_real_arm_with_feed_through_prints_what_it_simulates():
     theirs = exact([c["b2"], c["b1"], c["b0"]], [1, -c["a1"], -c["a0"]], torque, 0.01, "zoh")
     assert result.fit_percent["y"] == pytest.approx(own, abs=1e-3)
     assert result.fit_percent["y"] == pytest.approx(nrmse_fit(acceleration, theirs), abs=1e-3)
+
+
+@pytest.mark.parametrize(("seed", "rows"), [(0, 401), (1, 201), (3, 201)])
+def test_the_printed_fit_is_that_of_the_residuals_where_numbers_cannot_be_told_apart(seed, rows):
+    """Three own terms whose orders end beside each other: a flat, bent valley, out of which a straight line leads."""
+    whole = resonant_plant(seed, wrong=True)
+    run = whole.slice(0.0, (rows - 1) * whole.step)
+    structure = ftlm.equation("D^alpha y = d D^mu y + e D^nu y + a y + b u", initial="rest")
+    found = ftlm.identify(run, structure, threads=1, intervals="quadratic")
+    assert found.joint.standard_errors["mu"] > 0.2
+    assert found.output_error["y"].rmse == pytest.approx(found.joint.noise["y"], rel=0.1)

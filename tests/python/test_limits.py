@@ -107,6 +107,28 @@ def test_rows_at_times_of_their_own_are_limited_too():
     np.testing.assert_allclose(found, other, atol=1e-9)
 
 
+def test_an_input_that_is_linear_in_between_is_limited_at_its_samples():
+    # The corners of what acts lie between samples: the error falls with the step's square, by lsim on a fine grid.
+    errors = []
+    for every in (64, 32, 16):
+        t = np.arange(20 * 640 + 1) * STEP / 64
+        u = 1.5 * np.sin(1.3 * t) + 0.4 * np.sin(4.1 * t)
+        y = signal.lsim(signal.StateSpace(*MATRICES), np.clip(u, -0.8, 0.8), t)[1][::every]
+        run = ftlm.Run.from_arrays(
+            step=STEP * every / 64, inputs={"u": u[::every]}, outputs={"y": 0 * y}, intersample={"u": "foh"}
+        )
+        model = ftlm.Model(ftlm.equation(PLANT.format("sat(u, 0.8)"), initial="rest"))
+        errors.append(float(np.max(np.abs(model.simulate(run)["y"] - y)) / np.max(np.abs(y))))
+    assert errors[0] < 5e-3
+    assert errors[2] < errors[0] / 8
+    # Left free, it is found all the same.
+    noisy = y + 0.01 * np.std(y) * np.random.default_rng(14).standard_normal(y.size)
+    given = ftlm.Run.from_arrays(step=run.step, inputs={"u": run["u"]}, outputs={"y": noisy}, intersample={"u": "foh"})
+    found = ftlm.identify(given, ftlm.equation(FREE.format("sat(u, 0.1:3)"), initial="rest"), threads=1)
+    assert found.limits["sat_u"] == pytest.approx(0.8, abs=4 * found.standard_errors["sat_u"])
+    assert found.standard_errors["sat_u"] < 0.01
+
+
 # ------------------------------------------------------------------------------------------------ limits that are found
 
 
@@ -145,6 +167,19 @@ def test_without_its_limit_the_plant_is_another():
     u = levels(600, 8)
     other = run_of(u, response(bent(u, sat=0.6)))
     assert found.model.compare(other).fit_percent["y"] > 99 > plain.model.compare(other).fit_percent["y"]
+
+
+def test_a_limit_is_found_where_rows_have_times_of_their_own():
+    rng = np.random.default_rng(15)
+    times = STEP * (np.arange(600) + np.append(0.0, rng.uniform(-0.05, 0.05, 599)))
+    u = levels(600, 15)
+    fine = np.repeat(bent(u, sat=0.6), 20)
+    y = np.interp(times, np.arange(fine.size) * STEP / 20, signal.lsim(signal.StateSpace(*MATRICES), fine,
+                  np.arange(fine.size) * STEP / 20, interp=False)[1])  # fmt: skip
+    noisy = y + 0.02 * np.std(y) * rng.standard_normal(y.size)
+    run = ftlm.Run.from_arrays(time=times, inputs={"u": u}, outputs={"y": noisy}, resample=STEP)
+    found = ftlm.identify(run, ftlm.equation(FREE.format("sat(u, 0.1:3)"), initial="rest"), threads=1)
+    assert found.limits["sat_u"] == pytest.approx(0.6, abs=0.03)
 
 
 def test_a_limit_beside_friction_is_found():

@@ -84,7 +84,7 @@ def record(
     rate: Annotated[float, Option(help="Samples per second.")] = 500.0,
     seed: Annotated[int, Option(min=0, help="Of noise and random inputs.")] = 0,
     parameters: Annotated[
-        str, Option(metavar="NAME or TOML", help="Virtual arm: effective, measured, linear or a file.")
+        str, Option(metavar="NAME or TOML", help="Virtual arm: effective, measured, measured-lqr, linear or a file.")
     ] = "effective",
     offset: Annotated[
         Text, Option(metavar="A1:A2", help="Virtual arm: current that drives each motor besides its command.")

@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal
 
 from msgspec import UNSET
 
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Friction, Term
-from ftlm.data.limits import SHORT, Limit, Value, in_order
+from ftlm.data.limits import SHORT, Limit, LimitLaw, Value, in_order
 from ftlm.data.orders import Order, Values
 from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial, check_offset
 
 NAME = r"[^\W\d]\w*"
 #: What words may say of an input.
-LIMITS: tuple[Literal["saturation", "dead_zone"], ...] = ("saturation", "dead_zone")
+LIMITS: tuple[LimitLaw, ...] = ("saturation", "dead_zone")
 #: A term that is such a name alone is an offset.
 _OFFSET = re.compile(r"c\d*")
 

@@ -15,12 +15,19 @@ from ftlm.base.errors import ModelError
 
 #: How an input acts: later, no further than a limit, by what exceeds a threshold.
 InputLaw = Literal["delay", "saturation", "dead_zone"]
+#: Those of them that know no time.
+LimitLaw = Literal["saturation", "dead_zone"]
 #: A number that is known, or (least, largest) of one that is estimated.
 Value = float | tuple[float, float]
 #: The laws in words.
 WORDS: dict[InputLaw, str] = {"delay": "delay", "saturation": "saturation", "dead_zone": "dead zone"}
 #: What equations in words and names of parameters call them.
 SHORT: dict[InputLaw, str] = {"delay": "delay", "saturation": "sat", "dead_zone": "dead"}
+
+
+def input_name(law: InputLaw, signal: str) -> str:
+    """Name under which a number of an input stands among the parameters, such as ``delay_u`` and ``sat_u``."""
+    return f"{SHORT[law]}_{signal}"
 
 
 @dataclass(frozen=True)
@@ -43,8 +50,8 @@ class FreeInput:
 
     @property
     def name(self) -> str:
-        """Name under which the estimate stands among the parameters, such as ``delay_u`` and ``sat_u``."""
-        return f"{SHORT[self.law]}_{self.signal}"
+        """Name of the estimate; see :func:`input_name`."""
+        return input_name(self.law, self.signal)
 
     @property
     def words(self) -> str:
@@ -76,7 +83,7 @@ class Limit:
     """
 
     signal: str
-    law: Literal["saturation", "dead_zone"]
+    law: LimitLaw
     value: Value
 
     def __post_init__(self) -> None:
@@ -99,13 +106,20 @@ class Limit:
 
     @property
     def name(self) -> str:
-        """Name of its value, such as ``sat_u``."""
-        return f"{SHORT[self.law]}_{self.signal}"
+        """Name of its value; see :func:`input_name`."""
+        return input_name(self.law, self.signal)
 
     def of(self, values: Floats) -> Floats:
-        """What acts of an input's values; its value must be known."""
-        limit = float(self.value) if not isinstance(self.value, tuple) else math.inf
-        clipped = np.clip(values, -limit, limit)
+        """What acts of an input's values.
+
+        Raises
+        ------
+        ModelError
+            A value that is still to be estimated.
+        """
+        if isinstance(self.value, tuple):
+            raise ModelError(f"the {WORDS[self.law]} of {self.signal} is still free; give its value")
+        clipped = np.clip(values, -self.value, self.value)
         return np.asarray(clipped if self.law == "saturation" else values - clipped)
 
     def written(self, inner: str, digits: str = "r") -> str:
@@ -120,9 +134,7 @@ def in_order(limits: Sequence[Limit]) -> list[Limit]:
     return sorted(limits, key=lambda limit: limit.law == "saturation")
 
 
-def with_values(
-    limits: Sequence[Limit], law: Literal["saturation", "dead_zone"], values: Mapping[str, Value]
-) -> tuple[Limit, ...]:
+def with_values(limits: Sequence[Limit], law: LimitLaw, values: Mapping[str, Value]) -> tuple[Limit, ...]:
     """Limits with those of one law set anew by input."""
     kept = [limit for limit in limits if limit.law != law or limit.signal not in values]
     new = [Limit(s, law, (v[0], v[1]) if isinstance(v, list) and len(v) == 2 else v) for s, v in values.items()]

@@ -14,7 +14,7 @@ from msgspec import UNSET, UnsetType
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Term, numeric
-from ftlm.data.limits import FreeInput, Limit, Value, check_limits, with_values
+from ftlm.data.limits import FreeInput, Limit, Value, check_limits, input_name, with_values
 from ftlm.data.orders import MAX_ORDER, Order, Values, parse_values
 
 
@@ -502,7 +502,8 @@ class Structure:
 
     def with_inputs(self, values: Mapping[str, float]) -> Structure:
         """Set free delays and limits by the names of their estimates, such as ``delay_u`` and ``sat_u``."""
-        delays = {n: values[delay_name(n)] for n in self.free_delays if delay_name(n) in values}
+        names = {n: input_name("delay", n) for n in self.free_delays}
+        delays = {n: values[name] for n, name in names.items() if name in values}
         limits = tuple(
             replace(limit, value=float(values[limit.name])) if limit.free and limit.name in values else limit
             for limit in self.limits
@@ -544,11 +545,6 @@ class Structure:
 def _or_unset(limits: Sequence[Limit]) -> tuple[Limit, ...] | UnsetType:
     """Limits as a structure holds them."""
     return tuple(limits) or UNSET
-
-
-def delay_name(signal: str) -> str:
-    """Name under which the estimated delay of an input stands among the parameters."""
-    return f"delay_{signal}"
 
 
 def offset_exponents(alpha: float, offset: Offset) -> dict[str, float]:

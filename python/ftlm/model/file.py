@@ -14,7 +14,7 @@ from msgspec import UNSET, UnsetType
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import write_atomically
 from ftlm.data.equations import Equation, Friction, Term
-from ftlm.data.limits import Limit
+from ftlm.data.limits import Limit, LimitLaw
 from ftlm.data.orders import Order
 from ftlm.data.solved import Estimate, Solved
 from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
@@ -49,7 +49,7 @@ class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
     """A saturation or a dead zone of an input, in its unit."""
 
     signal: str
-    law: Literal["saturation", "dead_zone"]
+    law: LimitLaw
     value: float
 
 

@@ -10,10 +10,9 @@ from msgspec import UNSET
 
 from ftlm.base.statistics import NORMAL_95
 from ftlm.data.equations import Equation
-from ftlm.data.limits import SHORT, WORDS, Limit
+from ftlm.data.limits import SHORT, WORDS, Limit, input_name
 from ftlm.data.orders import Order
 from ftlm.data.solved import Solved
-from ftlm.data.structures import delay_name
 from ftlm.fit.joint import JointFit
 from ftlm.paint.table import Table
 from ftlm.paint.text import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_html, unbounded
@@ -158,7 +157,7 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
             shown.add(name)
             place = Markup("Coulomb friction in the equation of {}").format(symbol_html(item.output))
             rows.append(row(name, float(item.friction.coefficient), reference.get(name), place))
-    inputs = {delay_name(n): (f"delay of {symbol(n)} in s", v) for n, v in model.structure.delay.items()}
+    inputs = {input_name("delay", n): (f"delay of {symbol(n)} in s", v) for n, v in model.structure.delay.items()}
     for limit in model.structure.limits:
         if not isinstance(limit.value, tuple):
             inputs[limit.name] = (f"{WORDS[limit.law]} of {symbol(limit.signal)}", limit.value)

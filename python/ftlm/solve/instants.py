@@ -16,8 +16,11 @@ from ftlm.solve.records import Record, acting
 
 
 def has_own_times(run: Run, structure: Structure) -> bool:
-    """Whether a run's outputs are compared when they were read: not under a free delay, nor behind a filter of all."""
-    return run.readings is not None and not structure.free_delays and not structure.behind_filter
+    """Whether a run's outputs are compared when they were read.
+
+    Not where a number of an input is free, nor behind a filter of all.
+    """
+    return run.readings is not None and not structure.free_inputs and not structure.behind_filter
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,6 +1,6 @@
 //! What an actuator does to an input before it drives an equation: a delay, a saturation, a dead zone, its number free.
 
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::means::delayed;
 
 /// How an input acts.
@@ -33,7 +33,7 @@ impl InputLaw {
     /// exact for what holds in between.
     ///
     /// # Errors
-    /// A delay that is negative or no number.
+    /// [`Error::OutOfRange`] for a number that is negative or none.
     ///
     /// ```
     /// use ftlm::estimate::output_error::InputLaw;
@@ -46,6 +46,14 @@ impl InputLaw {
     /// # }
     /// ```
     pub fn acted(self, means: &[f64], value: f64, step: f64, before: f64) -> Result<(Vec<f64>, Vec<f64>)> {
+        if !(value >= 0.0 && value.is_finite()) {
+            return Err(Error::OutOfRange {
+                name: "number of an input".into(),
+                value,
+                range: "[0, ∞)".into(),
+                remedy: "an input acts after it is given, and alike on both sides of 0".into(),
+            });
+        }
         let beyond = |v: f64| if v.abs() > value { v.signum() } else { 0.0 };
         Ok(match self {
             Self::Delay => {
@@ -55,7 +63,7 @@ impl InputLaw {
                 let slope = near.iter().zip(&far).map(|(near, far)| (far - near) / step).collect();
                 (delayed(means, steps, before)?, slope)
             }
-            Self::Saturation => means.iter().map(|&v| (v.clamp(-value.abs(), value.abs()), beyond(v))).unzip(),
+            Self::Saturation => means.iter().map(|&v| (v.clamp(-value, value), beyond(v))).unzip(),
             Self::DeadZone => means
                 .iter()
                 .map(|&v| {
