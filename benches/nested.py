@@ -1,4 +1,4 @@
-"""Nested structures: does one that contains another ever end with a larger cost?
+"""Nested structures: how often one that contains another ends with a larger cost.
 
 ``python benches/nested.py [--records psf,lqr,steps,heating,robot_arm,plants,wrong] [--seeds 40] [--first 0]`` fits
 chains of four structures, each of which contains the one before it, by the default call, and compares the mean squares

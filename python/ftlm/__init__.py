@@ -1,7 +1,8 @@
 """Fractional-order models of flexible machines from measured data.
 
 Names are imported when they are first asked for: all of them together take longer than numpy does. Where each lives is
-the way of a measurement: data, files, solve, judge, fit, model, search, identification, and beside it arm, rig, paper.
+the way of a measurement: data, files, solve, judge, fit, model, search, identification, selection, and beside it arm,
+rig, paper.
 """
 
 import importlib as _importlib
@@ -37,6 +38,9 @@ if _typing.TYPE_CHECKING:
     from ftlm.paper.reproduction import Reproduction, reproduce
     from ftlm.search.orders import resume_search, search_orders, search_status
     from ftlm.search.result import SearchResult, SearchRow, StoreStatus
+    from ftlm.selection.result import Selection
+    from ftlm.selection.select import select
+    from ftlm.selection.trial import Trial
     from ftlm.solve.free_run import explicit_euler, simulate
     from ftlm.solve.operators import (
         block_pulse_matrix,
@@ -52,12 +56,13 @@ __all__ = [
     "PARAMETERS", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation", "Estimate",
     "FeedbackTest", "Friction", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria",
     "InternalError", "Lattice", "LinkParameters", "Metrics", "Model", "ModelError", "Order", "OutputResiduals",
-    "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow",
-    "SensorFilter", "StoreStatus", "Structure", "Term", "Trace", "__version__", "block_pulse_matrix", "compare",
-    "equation", "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse",
-    "haar_matrix", "haar_transform", "identify", "identify_many", "information_criteria", "lattice", "link_model",
-    "load", "load_model", "metrics", "multi_innovation_trace", "operational_matrix", "order_law", "physical_parameters",
-    "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status", "simulate",
+    "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run", "SearchResult",
+    "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Structure", "Term", "Trace", "Trial", "__version__",
+    "block_pulse_matrix", "compare", "equation", "explicit_euler", "flexible_link", "fractional_derivative",
+    "fractional_integral", "haar_inverse", "haar_matrix", "haar_transform", "identify", "identify_many",
+    "information_criteria", "lattice", "link_model", "load", "load_model", "metrics", "multi_innovation_trace",
+    "operational_matrix", "order_law", "physical_parameters", "reproduce", "resid", "resume_search", "rig",
+    "search_orders", "search_status", "select", "simulate",
 ]  # fmt: skip
 
 #: Where each name lives.
@@ -92,6 +97,9 @@ _HOMES = {
         "paper.reproduction": "Reproduction reproduce",
         "search.orders": "resume_search search_orders search_status",
         "search.result": "SearchResult SearchRow StoreStatus",
+        "selection.result": "Selection",
+        "selection.select": "select",
+        "selection.trial": "Trial",
         "solve.free_run": "explicit_euler simulate",
         "solve.operators": "block_pulse_matrix fractional_derivative fractional_integral haar_inverse haar_matrix "
         "haar_transform operational_matrix",

@@ -12,6 +12,7 @@ from ftlm.cli.inspect import doctor, inspect
 from ftlm.cli.judge import compare, export, plot, report, resid, simulate
 from ftlm.cli.paper import demo, reproduce
 from ftlm.cli.record import record
+from ftlm.cli.select import select
 
 app = typer.Typer(
     name="ftlm",
@@ -36,8 +37,8 @@ def version(
 
 
 for _command in (
-    demo, record, inspect, identify, search, resume, status, compare, resid, simulate, report, reproduce, plot, export,
-    doctor,
+    demo, record, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce, plot,
+    export, doctor,
 ):  # fmt: skip
     app.command()(_command)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
@@ -33,6 +33,13 @@ StructureText = Annotated[
     Option(
         "--structure",
         help="flexible-link:1, :2 or :both; arm:1, :2 or :both (deflections of a real arm); or an equation in words.",
+    ),
+]
+CandidateTexts = Annotated[
+    list[str],
+    Option(
+        "--structure",
+        help="One, whose inside is searched, or several to compare: as of identify; or auto, one output, any inputs.",
     ),
 ]
 LatticeStep = Annotated[float, Option("--step", help="Step of the order lattice.")]
@@ -182,6 +189,13 @@ class StructureOptions:
             saturation=ranges("--saturation", self.saturation), dead_zone=ranges("--dead-zone", self.dead_zone)
         )
         return built.with_orders(numbers("--order", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
+
+    def given(self) -> list[str]:
+        """Options that say something."""
+        names = {"orders": "--order", "fixed": "--fixed"}
+        usual = StructureOptions()
+        said = [f.name for f in fields(self) if getattr(self, f.name) != getattr(usual, f.name)]
+        return [names.get(n, "--" + n.replace("_", "-")) for n in said]
 
     def _check_equation(self, count: int) -> None:
         """Refuse what only the flexible link has, for that many equations in words."""

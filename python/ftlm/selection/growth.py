@@ -1,0 +1,229 @@
+"""From the simplest structure to one that predicts: one thing more at a time, then one thing less."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from ftlm.base.errors import FtlmError
+from ftlm.data.structures import Structure
+from ftlm.fit.joint import JointFit
+from ftlm.fit.problem import FreeProblem
+from ftlm.selection.candidates import Change, Inside, signature, worded
+from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, numbers_of, spread
+
+Item = TypeVar("Item")
+Made = TypeVar("Made")
+#: Where an order that becomes free starts besides its whole value.
+SHIFTS = (0.0, -0.4, 0.4)
+#: Where a free number of an input starts, as shares of its interval.
+SHARES = (0.1, 0.3, 0.6, 0.9)
+#: Steps in a row that predict no better, after which growth ends.
+PATIENCE = 2
+#: Prediction is better where what is left over falls by more than this share.
+BETTER = 0.005
+#: Two predictions are alike where what they leave over differs by no more than this share.
+SAME = 0.01
+#: Changes of a step that are judged on unseen runs: the best by criterion.
+JUDGED = 2
+
+
+@dataclass
+class Work:
+    """How candidates are tried, and who is told.
+
+    Parameters
+    ----------
+    folds
+        What they are fitted on and judged on.
+    threads
+        Candidates at a time; what comes out does not depend on it.
+    progress
+        Called with (candidates fitted, candidates known of so far).
+    """
+
+    folds: Folds
+    threads: int
+    progress: Callable[[int, int], None] | None = None
+    done: int = 0
+    known: int = 0
+    trials: list[Trial] = field(default_factory=list)
+
+    def each(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+        """Work done for each item, in their order."""
+        self.known += len(items)
+        out = []
+        with ThreadPoolExecutor(self.threads) as pool:
+            try:
+                for made in pool.map(work, items):
+                    out.append(made)
+                    self.done += 1
+                    if self.progress is not None:
+                        self.progress(self.done, self.known)
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        return out
+
+    def judge(self, name: str, structure: Structure, joint: JointFit | FtlmError) -> Trial:
+        """A fitted candidate on what it never saw."""
+        if isinstance(joint, FtlmError):
+            return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
+        try:
+            return judged(name, structure, self.folds, joint)
+        except FtlmError as error:
+            return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
+
+    def fitted(
+        self, structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
+    ) -> JointFit | FtlmError:
+        """A fit on all runs, or why there is none."""
+        try:
+            return fit(self.folds.runs, structure, starts, refine=refine)
+        except FtlmError as error:
+            return error
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A variant with its fit."""
+
+    change: Change
+    joint: JointFit
+    bic: float
+
+
+def starts_from(
+    structure: Structure, values: Mapping[str, float], whole: Mapping[str, float]
+) -> list[dict[str, float]]:
+    """Where a structure starts that has what `values` knows, orders that were `whole`, and coefficients that were 0."""
+    problem = FreeProblem.of(structure)
+    usual: dict[str, list[float]] = {}
+    for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
+        at = whole.get(name, 0.5 * (low + high))
+        usual[name] = [min(max(at + shift, low), high) for shift in SHIFTS]
+    usual |= {n: [0.0] for n in problem.coefficients}
+    usual |= {i.name: [i.bounds[0] + s * (i.bounds[1] - i.bounds[0]) for s in SHARES] for i in problem.inputs}
+    places = {n: [values[n]] if n in values else places for n, places in usual.items()}
+    return [dict(zip(places, point, strict=True)) for point in itertools.product(*places.values())]
+
+
+def grown(inside: Inside, work: Work) -> list[Trial]:
+    """Candidates on the way from the simplest structures up, and down again, each judged; in the order tried.
+
+    Each whole value of the highest orders is a root of its own: what is best among the simplest need not be what the
+    best grows from.
+    """
+    changes = _new(inside, inside.skeletons(), set())
+    joints = work.each(lambda c: work.fitted(inside.build(c.variant), []), changes)
+    roots: dict[tuple[float | None, ...], list[tuple[Change, JointFit | FtlmError]]] = {}
+    for change, joint in zip(changes, joints, strict=True):
+        roots.setdefault(inside.top(change.variant), []).append((change, joint))
+    if all(isinstance(j, FtlmError) for j in joints):
+        work.trials += [work.judge(c.words, inside.build(c.variant), j) for c, j in zip(changes, joints, strict=True)]
+    ends: list[tuple[Trial, Fitted]] = []
+    tried: set[str] = set()
+    for pairs in roots.values():
+        ahead = _by_criterion(inside, work, pairs)[:1]
+        ends += [_upwards(inside, work, one, tried) for one in ahead]
+    least = min((trial.score for trial, _ in ends), default=0.0)
+    for trial, at in ends:
+        if trial.score <= least + SAME:
+            _pruned(inside, work, trial, at, tried)
+    return work.trials
+
+
+def _upwards(inside: Inside, work: Work, chosen: Fitted, tried: set[str]) -> tuple[Trial, Fitted]:
+    """One thing more after another, as long as prediction gets better; the best of the way."""
+    best = work.judge(_name(inside, chosen), inside.build(chosen.change.variant), chosen.joint)
+    best_at, idle = chosen, 0
+    work.trials.append(best)
+    tried.add(_key(inside, chosen.change))
+    while idle < PATIENCE:
+        larger = _new(inside, inside.larger(chosen.change.variant), tried)
+        ahead = _tried(inside, work, chosen, larger)[:JUDGED]
+        if not ahead:
+            break
+        found = _judged(inside, work, ahead)
+        tried |= {_key(inside, s.change) for s in ahead}
+        place = min(range(len(found)), key=lambda k: (found[k].score, k))
+        chosen = ahead[place]
+        if found[place].score < best.score - BETTER:
+            best, best_at, idle = found[place], chosen, 0
+        else:
+            idle += 1
+    return best, best_at
+
+
+def _judged(inside: Inside, work: Work, ahead: Sequence[Fitted]) -> list[Trial]:
+    """Fitted variants on what they never saw."""
+
+    def one(fitted: Fitted) -> Trial:
+        return work.judge(_name(inside, fitted), inside.build(fitted.change.variant), fitted.joint)
+
+    found = work.each(one, ahead)
+    work.trials += found
+    return found
+
+
+def _tried(inside: Inside, work: Work, at: Fitted, changes: Sequence[Change]) -> list[Fitted]:
+    """Changes fitted from where one is, best first."""
+    values = dict(zip(at.joint.names, at.joint.values.tolist(), strict=True))
+
+    def one(change: Change) -> JointFit | FtlmError:
+        structure = inside.build(change.variant)
+        whole = {**at.change.variant.held(), **change.variant.held()}
+        return work.fitted(structure, starts_from(structure, values, whole))
+
+    return _by_criterion(inside, work, list(zip(changes, work.each(one, changes), strict=True)))
+
+
+def _by_criterion(inside: Inside, work: Work, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[Fitted]:
+    """Those that were fitted, by Schwarz's criterion, all with the colour of the best residuals among them."""
+    there = [(c, j) for c, j in pairs if not isinstance(j, FtlmError)]
+    if not there:
+        return []
+    scatter = min(spread(j) for _, j in there)
+    count = [numbers_of(inside.build(c.variant), j, work.folds) for c, j in there]
+    every = [Fitted(c, j, criterion(j, n, scatter)) for (c, j), n in zip(there, count, strict=True)]
+    return sorted(every, key=lambda f: f.bic)
+
+
+def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]) -> None:
+    """One thing less after another, as long as prediction is no worse."""
+    while True:
+        changes = _new(inside, inside.smaller(at.change.variant), tried)
+        steps = _tried(inside, work, at, changes)
+        tried |= {_key(inside, c) for c in changes}
+        found = _judged(inside, work, steps[:JUDGED])
+        better = [(t, s) for t, s in zip(found, steps, strict=False) if t.score <= best.score + BETTER]
+        if not better:
+            return
+        best, at = min(better, key=lambda pair: pair[0].score)
+
+
+def _key(inside: Inside, change: Change) -> str:
+    return signature(inside.build(change.variant))
+
+
+def _new(inside: Inside, changes: Iterable[Change], tried: set[str]) -> list[Change]:
+    """Changes to what was not tried, each once."""
+    return list({key: c for c in changes if (key := _key(inside, c)) not in tried}.values())
+
+
+def _name(inside: Inside, fitted: Fitted) -> str:
+    return worded(inside.build(fitted.change.variant))
+
+
+def listed(candidates: Mapping[str, Structure], work: Work) -> list[Trial]:
+    """Candidates of a list, each from automatic starts."""
+
+    def one(item: tuple[str, Structure]) -> Trial:
+        name, structure = item
+        return work.judge(name, structure, work.fitted(structure, []))
+
+    work.trials += work.each(one, list(candidates.items()))
+    return work.trials

@@ -1,0 +1,192 @@
+"""Terms and orders that earn their place: structures inside one, or a list of them, judged by what they predict."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ftlm.base.errors import ConvergenceError, ModelError
+from ftlm.data.run import Run
+from ftlm.data.settings import Settings
+from ftlm.data.structures import Structure
+from ftlm.identification.identify import identify
+from ftlm.selection.automatic import automatic
+from ftlm.selection.candidates import Inside, named, signature
+from ftlm.selection.growth import SAME, Work, grown, listed
+from ftlm.selection.result import Selection
+from ftlm.selection.trial import Folds, Trial, criterion, spread
+from ftlm.solve.records import prepare
+
+#: Schwarz criteria closer than this tell nothing; doi:10.1080/01621459.1995.10476572.
+ALIKE = 2.0
+#: Folds from which on the scatter over them says something.
+FOLDS = 3
+#: Candidates of a list beyond which somebody has made a mistake.
+MOST = 10_000
+
+
+def select(
+    runs: Run | Sequence[Run],
+    candidates: str | Structure | Sequence[Structure] | Mapping[str, Structure],
+    *,
+    validation: str | Run | Sequence[Run] | None = None,
+    threads: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Selection:
+    """Choose the terms and orders that earn their place on runs that they were not fitted to.
+
+    A structure is grown: from the simplest one inside it (whole orders, the output's own terms, one thing that drives),
+    a term, a free order or an offset more at a time, each fitted by output error from the last optimum, the two most
+    promising by Schwarz's criterion judged by free runs on what they were not fitted to; where two steps in a row
+    predict no better, it is pruned, one thing less at a time. A list of candidates is judged whole, each from automatic
+    starts. Chosen is, among those that predict as well as the best (what is left over is within 1 %, or within the
+    standard error of the difference over three or more folds), the one with the least Schwarz criterion, samples
+    counted as the colour of the residuals lets them; of those alike in that the one with the fewest and best determined
+    numbers.
+
+    Parameters
+    ----------
+    runs
+        One run or several with the same names and units.
+    candidates
+        A structure, whose inside is searched; several structures, by name or by their equations; or ``"auto"``: one
+        output, every input, whole orders 1 to 4 and the fractional ones that earn their place.
+    validation
+        ``"runs"``: each run is judged by a fit on the others, the default where there are several; ``"blocks"``: each
+        quarter of every run by a fit on the rest, the default for one run; or runs that are fitted to by nobody.
+    threads
+        Candidates at a time, by default all cores; the result does not depend on it.
+    progress
+        Called with (candidates fitted, candidates known of so far).
+
+    Returns
+    -------
+    Selection
+        Prints well; ``.best`` is the chosen structure identified on all runs, ``.report`` writes a page.
+
+    Raises
+    ------
+    DataError
+        Runs that do not fit together or the structure, or that are too short to be cut.
+    ModelError
+        No candidates, two that are the same, more than 10 000, words that are not known, one run where several are
+        needed.
+    ConvergenceError
+        No candidate that can be fitted.
+
+    Notes
+    -----
+    Initial terms are those of whole orders (none from rest, else level and velocity, Caputo's) unless the structure
+    says otherwise: with a history, which has more terms the more orders are free, candidates could not be compared.
+    Growth costs one fit for each thing that may be added, at each step.
+    """
+    # Checked here as identify checks it: threads is a whole number, at least 1.
+    workers = Settings.check(coefficients="least-squares", threads=threads).threads
+    several = [runs] if isinstance(runs, Run) else list(runs)
+    folds = Folds.of(runs, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
+    work = Work(folds, workers, progress)
+    every = named(candidates) if not isinstance(candidates, (str, Structure)) else {}
+    if len(every) > MOST:
+        raise ModelError(
+            f"{len(every)} candidates are more than {MOST}; give one structure instead, whose inside is grown step by "
+            "step"
+        )
+    for structure in [candidates] if isinstance(candidates, Structure) else every.values():
+        # Refused here, once, and not as a failure of every candidate.
+        prepare(folds.runs, replace(structure.as_given(), offset="none"), None, power_of_two=False, gaps=True)
+    if isinstance(candidates, str):
+        if candidates != "auto":
+            raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
+        for structure in automatic(folds.runs):
+            grown(Inside(structure), work)
+    elif isinstance(candidates, Structure):
+        grown(Inside(candidates), work)
+    else:
+        listed(every, work)
+    return _chosen(work, folds)
+
+
+def _chosen(work: Work, folds: Folds) -> Selection:
+    """Rank what was judged, choose, and identify the choice."""
+    there = [t for t in work.trials if t.joint is not None]
+    if not there:
+        why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
+        raise ConvergenceError(f"no candidate can be fitted to {folds.words}{why}")
+    scatter = min(spread(t.joint) for t in there if t.joint is not None)
+    scored = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in work.trials]
+    kept: dict[str, Trial] = {}
+    for trial in scored:
+        key = signature(trial.structure)
+        if key not in kept or trial.score < kept[key].score:
+            kept[key] = trial
+    ranked = sorted(kept.values(), key=lambda t: (t.failed is not None, t.score, t.numbers, t.name))
+    best = ranked[0]
+    winner = _winner([t for t in ranked if t.failed is None and _as_good(t, best)])
+    found = identify(list(folds.runs), _as_judged(winner, folds), threads=work.threads)
+    warnings = []
+    if winner.joint is not None and found.joint is not None and found.joint.noise:
+        lower = [o for o, v in found.joint.noise.items() if v < 0.99 * winner.joint.noise.get(o, v)]
+        if lower:
+            warnings.append(
+                f"from automatic starts the chosen structure fits {', '.join(lower)} better than where it was judged: "
+                "another optimum; .best is that one"
+            )
+    if winner.unseen < 50.0:
+        warnings.append(
+            f"the best candidate predicts unseen runs with {winner.unseen:.3g} %: none of them is the machine"
+        )
+    return Selection(
+        tuple(ranked), ranked.index(winner), found, folds.words, _reason(winner, best, ranked), work.done,
+        tuple(warnings),
+    )  # fmt: skip
+
+
+def _as_good(trial: Trial, best: Trial) -> bool:
+    """Whether a candidate predicts like the best: within 1 %, or within what the difference scatters over folds."""
+    apart = np.array(trial.scores) - np.array(best.scores)
+    scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size) if apart.size >= FOLDS else 0.0
+    return trial.score - best.score <= max(SAME, scatter)
+
+
+def _winner(near: Sequence[Trial]) -> Trial:
+    """Of those that predict alike, the one with the least criterion; of those alike in that, the best determined."""
+    least = min(_bic(t) for t in near)
+    alike = [t for t in near if _bic(t) <= least + ALIKE]
+    return min(alike, key=lambda t: (t.numbers, t.looseness, t.score))
+
+
+def _bic(trial: Trial) -> float:
+    return math.inf if trial.bic is None else trial.bic
+
+
+def _as_judged(trial: Trial, folds: Folds) -> Structure:
+    """The structure with the initial terms that it was judged with."""
+    return trial.structure if trial.joint is None else replace(trial.structure, initial=trial.joint.initial)
+
+
+def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
+    """Why the winner is the winner."""
+    lead = f"Chosen: {winner.name} ({winner.numbers} numbers, {winner.unseen:.4g} % where unseen)"
+    if winner is best:
+        lead += ", which predicts best"
+    else:
+        more = best.numbers - winner.numbers
+        lead += (
+            f", which leaves {100 * (math.exp(winner.score - best.score) - 1):.2g} % more than the best prediction"
+            + (f" with {more} numbers fewer" if more > 0 else "")
+            + " and has the least Schwarz criterion of those that predict alike"
+        )
+    for word, others in (
+        ("fewer", [t for t in ranked if t.failed is None and t.numbers < winner.numbers]),
+        ("more", [t for t in ranked if t.failed is None and t.numbers > winner.numbers]),
+    ):
+        if others:
+            near = min(others, key=lambda t: t.score)
+            share = 100 * (math.exp(near.score - winner.score) - 1)
+            lead += (
+                f"; the best with {word} ({near.numbers}) leaves {abs(share):.3g} % {'more' if share >= 0 else 'less'}"
+            )
+    return lead + "."

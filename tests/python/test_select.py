@@ -1,0 +1,216 @@
+"""Structures chosen by what they predict: the true one among those inside a richer one, and words where none can be."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy import signal
+from typer.testing import CliRunner
+
+import ftlm
+from ftlm.cli.app import app
+from ftlm.selection.automatic import automatic
+from ftlm.selection.candidates import Inside, Variant, named
+from ftlm.selection.trial import Folds, masked
+
+RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
+
+
+def motor(seed, rows=400, late=0, snr=40.0, name="motor"):
+    """A second-order motor by SciPy, its command late by some samples, in white noise."""
+    rng = np.random.default_rng([7, seed])
+    step = 0.02
+    u = np.repeat(rng.choice([-1.0, 1.0], rows // 15 + 1), 15)[:rows]
+    acts = np.concatenate([np.zeros(late), u[: rows - late]])
+    system = signal.cont2discrete(signal.tf2ss([40.0], [1.0, 5.0, 40.0]), step, "zoh")
+    y = signal.dlsim(system, acts)[1][:, 0]
+    y = y + 10 ** (-snr / 20) * np.std(y) * rng.standard_normal(rows)
+    return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y}, name=f"{name} {seed}")
+
+
+def rich(**more):
+    return ftlm.equation(RICH, orders={"mu": (0.1, 1.9, 0.1), "gamma": (0.5, 1.5, 0.1)}, **more)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return [motor(0), motor(1)]
+
+
+@pytest.fixture(scope="module")
+def chosen(runs):
+    return ftlm.select(runs, rich(offset="auto"), threads=2)
+
+
+def test_the_true_structure_is_chosen_from_a_richer_one(chosen):
+    assert chosen.winner.name == "D^2 y = d D^1 y + a y + b0 u"
+    assert chosen.winner.numbers == 3
+    truth = {"d": -5.0, "a": -40.0, "b0": 40.0}
+    for name, value in truth.items():
+        low, high = chosen.best.intervals[name]
+        assert low <= value <= high
+    assert "each of 2 runs by the others" in str(chosen)
+    assert chosen.reason.startswith("Chosen: D^2 y = d D^1 y + a y + b0 u (3 numbers, ")
+
+
+def test_what_is_judged_was_not_fitted(runs, chosen):
+    """The figure of the left-out run is that of an identification of the other run alone."""
+    for left, seen in ((runs[0], runs[1]), (runs[1], runs[0])):
+        alone = ftlm.identify(seen, chosen.winner.structure, threads=1, intervals="quadratic")
+        own = chosen.winner.validation[left.name]["y"]
+        assert own == pytest.approx(alone.model.compare(left).fit_percent["y"], abs=2e-3)
+
+
+def test_any_number_of_threads_gives_the_same_bits(runs, chosen):
+    again = ftlm.select(runs, rich(offset="auto"), threads=1)
+    assert [(t.name, t.scores, t.values) for t in again.trials] == [(t.name, t.scores, t.values) for t in chosen.trials]
+    assert again.chosen == chosen.chosen
+    assert again.fitted == chosen.fitted
+
+
+def test_a_dead_time_is_found_where_there_is_one(runs):
+    late = [motor(0, late=4), motor(1, late=4)]
+    structure = ftlm.equation("D^2 y = d D y + a y + b u", delay={"u": (0.0, 0.3)})
+    with_delay = ftlm.select(late, structure, threads=2)
+    assert with_delay.winner.structure.free_delays == {"u": (0.0, 0.3)}
+    assert with_delay.best.delays["u"] == pytest.approx(0.08, abs=2e-3)
+    assert "delay of u free" in with_delay.winner.name
+    without = ftlm.select(runs, structure, threads=2)
+    assert without.winner.structure.free_delays == {}
+
+
+def test_a_list_is_ranked_by_prediction_and_failures_have_a_reason(runs):
+    found = ftlm.select(
+        runs,
+        {
+            "first order": ftlm.equation("D y = a y + b u"),
+            "second order": ftlm.equation("D^2 y = d D y + a y + b u"),
+            "without a spring": ftlm.equation("D^2 y = d D y + b u"),
+        },
+        threads=2,
+    )
+    assert found.trials[0].name == found.winner.name == "second order"
+    assert found.fitted == 3
+    assert [t.score for t in found.trials] == sorted(t.score for t in found.trials)
+    assert found.trials[0].unseen > 98.5
+    assert found.trials[1].unseen < 90
+
+
+def test_blocks_of_one_run_are_judged_by_a_fit_that_has_not_read_them():
+    run = motor(2)
+    folds = Folds.of(run, "blocks")
+    assert [f.rows for f in folds.parts] == [(0, 100), (100, 200), (200, 300), (300, 400)]
+    unread = folds.parts[1].seen(["y"])[0]
+    assert np.isnan(unread["y"][100:200]).all()
+    assert not np.isnan(np.delete(unread["y"], slice(100, 200))).any()
+    assert not np.isnan(run["y"]).any()
+    found = ftlm.select(run, [ftlm.equation("D^2 y = d D y + a y + b u"), ftlm.equation("D y = a y + b u")], threads=2)
+    assert len(found.winner.validation) == 4
+    # 40 dB of noise leave 1 % over, of whatever block.
+    assert all(97.5 < part["y"] < 99.5 for part in found.winner.validation.values())
+
+
+def test_a_run_of_its_own_judges(runs):
+    found = ftlm.select(runs[0], [ftlm.equation("D^2 y = d D y + a y + b u")], validation=runs[1], threads=1)
+    assert list(found.winner.validation) == [runs[1].name]
+    assert found.validation == f"{runs[1].name}, not fitted to"
+
+
+def test_auto_has_an_equation_of_each_order(runs):
+    made = automatic(runs)
+    assert [len(s.equations[0].terms) for s in made] == [2, 3, 4, 5]
+    first = [str(Inside(s).build(next(iter(Inside(s).skeletons())).variant)) for s in made]
+    assert first[0] == "D^1 y = a0 y + b1 u"
+    assert first[3] == "D^4 y = a3 D^3 y + a2 D^2 y + a1 D^1 y + a0 y + b1 u"
+    with pytest.raises(ftlm.ModelError, match="the outputs y, z; structure='auto' is of one"):
+        automatic([ftlm.Run.from_arrays(step=1, inputs={"u": [0, 1, 2]}, outputs={"y": [0, 1, 2], "z": [0, 1, 2]})])
+    with pytest.raises(ftlm.ModelError, match="the runs have no input"):
+        automatic([ftlm.Run.from_arrays(step=1, inputs={}, outputs={"y": [0, 1, 2]})])
+
+
+@pytest.mark.slow
+def test_auto_finds_order_and_terms(runs):
+    found = ftlm.select(runs, "auto", threads=2)
+    assert found.winner.numbers == 3
+    item = found.winner.structure.equations[0]
+    assert item.order.constant == 2.0
+    assert sorted((t.signal, t.order.constant) for t in item.terms) == [("u", 0.0), ("y", 0.0), ("y", 1.0)]
+
+
+def test_everything_inside_a_structure_is_one():
+    inside = Inside(rich(offset="auto"))
+    first = next(iter(inside.skeletons())).variant
+    assert str(inside.build(first)) == "D^2 y = d D^1 y + a y + b0 u"
+    grown = {c.words for c in inside.larger(first)}
+    assert grown == {"+ b1 D^1 u", "mu free", "an offset of each run"}
+    for change in inside.larger(first):
+        back = {str(inside.build(c.variant)) for c in inside.smaller(change.variant)}
+        assert str(inside.build(first)) in back
+    # A second own term at order 0 would be the same as the first.
+    assert not inside.possible(Variant(frozenset({"d", "a", "b0"}), (("mu", 2.0),), offset=False))
+
+
+def test_masked_runs_keep_what_was_read(runs):
+    unread = masked(runs[0], ["y"], (10, 20))
+    assert unread.step == runs[0].step
+    assert unread.name == runs[0].name
+    np.testing.assert_array_equal(unread["u"], runs[0]["u"])
+    np.testing.assert_array_equal(unread["y"][:10], runs[0]["y"][:10])
+
+
+def test_words_where_nothing_can_be_chosen(runs):
+    second = ftlm.equation("D^2 y = d D y + a y + b u")
+    with pytest.raises(ftlm.ModelError, match="there is one; give two or more"):
+        ftlm.select(runs[0], second, validation="runs")
+    with pytest.raises(ftlm.ModelError, match="'halves' is not known; use 'runs', 'blocks', or a run"):
+        ftlm.select(runs, second, validation="halves")
+    with pytest.raises(ftlm.ModelError, match="there are no candidates"):
+        ftlm.select(runs, [])
+    with pytest.raises(ftlm.ModelError, match="candidate 1 of 2 is str"):
+        ftlm.select(runs, [second, "D y = u"])
+    with pytest.raises(ftlm.ModelError, match="are the same structure; leave one out"):
+        named({"one": second, "two": ftlm.equation("D^2 y = d D y + a y + b u")})
+    with pytest.raises(ftlm.ModelError, match="candidates = 'D y = u'; use 'auto'"):
+        ftlm.select(runs, "D y = u")
+    with pytest.raises(ftlm.ModelError, match="10001 candidates are more than 10000"):
+        ftlm.select(runs, {str(k): ftlm.equation(f"D^{1 + k * 1e-5:.6f} y = a y + b u") for k in range(10_001)})
+    with pytest.raises(ftlm.DataError, match="has 40 rows, too few to be cut into 4 blocks"):
+        ftlm.select(runs[0].slice(0, 0.8), second)
+    with pytest.raises(ftlm.DataError, match="signal"):
+        ftlm.select(runs, ftlm.equation("D^2 z = a z + b u"))
+
+
+def test_the_page_and_the_figures(chosen, tmp_path):
+    page = chosen.report(tmp_path / "choice.html").read_text("utf-8")
+    assert "What each number is worth" in page
+    assert "not told from 0" in page
+    with pytest.raises(ftlm.DataError, match="exists"):
+        chosen.report(tmp_path / "choice.html")
+    data = json.loads(json.dumps(chosen.to_dict()))
+    assert data["chosen"] == chosen.winner.name
+    assert len(data["candidates"]) == len(chosen.trials)
+    frame = chosen.to_frame()
+    assert list(frame["chosen"]).count(True) == 1
+
+
+def test_the_command(tmp_path):
+    for seed in (0, 1):
+        run = motor(seed)
+        table = np.column_stack([np.arange(run.length) * run.step, run["u"], run["y"]])
+        np.savetxt(tmp_path / f"{seed}.csv", table, delimiter=",", header="t,u,y", comments="")
+    files = [str(tmp_path / "0.csv"), str(tmp_path / "1.csv")]
+    columns = ["--time", "t", "-u", "u=u", "-y", "y=y"]
+    model = tmp_path / "best.json"
+    done = CliRunner().invoke(
+        app, ["select", *files, *columns, "--structure", "D^2 y = d D y + a y + b u", "-o", str(model), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["chosen"] == "D^2 y = d D^1 y + a y + b u"
+    assert ftlm.load_model(model).coefficients["a"] == pytest.approx(-40, rel=0.02)
+    both = ["--by", "runs", "--validation", files[0]]
+    asked = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "D y = a y + b u", *both])
+    assert asked.exit_code == 2
+    assert "both say what judges" in asked.output
+    wrong = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "auto", "--order", "alpha=1"])
+    assert wrong.exit_code == 2
+    assert "--order: of a structure that is given, not used with --structure auto" in wrong.output
