@@ -107,9 +107,10 @@ class Inside:
         except ModelError:
             return False
         for item in made.equations:
-            own = [t.order.constant for t in item.terms if t.signal == item.output and not t.order.names]
-            if len(set(own)) < len(own):
+            places = [(t.signal, t.order.constant) for t in item.terms if not t.order.names]
+            if len(set(places)) < len(places):
                 return False
+            own = [order for signal, order in places if signal == item.output]
             if not item.order.names and any(o >= item.order.constant for o in own):
                 return False
         return True
@@ -219,6 +220,16 @@ class Inside:
         made = self.build(variant)
         found = next(t for e in made.equations for t in e.terms if t.coefficient == term.coefficient)
         return str(found)
+
+    def richest(self, variant: Variant) -> Variant:
+        """The variant with every term that it has room for, each at a whole order that no other term of it has."""
+        for item in self.structure.equations:
+            for term in item.terms:
+                if term.coefficient in self.droppable and term.coefficient not in variant.kept:
+                    grown = [c.variant for c in self._adding(variant, term)]
+                    free = set(self.build(variant).order_names)
+                    variant = next((v for v in grown if set(self.build(v).order_names) <= free), variant)
+        return variant
 
     def larger(self, variant: Variant) -> Iterator[Change]:
         """Every variant with one thing more: a term, a free order, an offset."""

@@ -115,7 +115,8 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
     """Candidates on the way from the simplest structures up, and down again, each judged; in the order tried.
 
     Each whole value of the highest orders is a root of its own: what is best among the simplest need not be what the
-    best grows from.
+    best grows from. Where several signals drive, one may stand for all the others: the best is also come to from above,
+    from everything at whole orders, one thing less at a time.
     """
     changes = _new(inside, inside.skeletons(), set())
     joints = work.each(lambda c: work.fitted(inside.build(c.variant), []), changes)
@@ -129,11 +130,27 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
     for pairs in roots.values():
         ahead = _by_criterion(inside, work, pairs)[:1]
         ends += [_upwards(inside, work, one, tried) for one in ahead]
-    least = min((trial.score for trial, _ in ends), default=0.0)
+    if not ends:
+        return work.trials
+    first = min(ends, key=lambda end: _rank(end[0]))
+    joined = [values_of(j) for c, j in zip(changes, joints, strict=True) if not isinstance(j, FtlmError)]
+    from_above = _downwards(inside, work, first[1], joined, tried)
+    ends += [] if from_above is None else [from_above]
+    least = min(_rank(trial) for trial, _ in ends)
     for trial, at in ends:
-        if trial.score <= least + SAME:
+        if (trial.grows, trial.score) <= (least[0], least[1] + SAME):
             _pruned(inside, work, trial, at, tried)
     return work.trials
+
+
+def _rank(trial: Trial) -> tuple[bool, float]:
+    """What a candidate is compared by: whether its free run grows without bound, then what it leaves over."""
+    return trial.grows, trial.score
+
+
+def values_of(joint: JointFit) -> dict[str, float]:
+    """Everything free by name."""
+    return dict(zip(joint.names, joint.values.tolist(), strict=True))
 
 
 def _upwards(inside: Inside, work: Work, chosen: Fitted, tried: set[str]) -> tuple[Trial, Fitted]:
@@ -149,13 +166,47 @@ def _upwards(inside: Inside, work: Work, chosen: Fitted, tried: set[str]) -> tup
             break
         found = _judged(inside, work, ahead)
         tried |= {_key(inside, s.change) for s in ahead}
-        place = min(range(len(found)), key=lambda k: (found[k].score, k))
+        place = min(range(len(found)), key=lambda k: (_rank(found[k]), k))
         chosen = ahead[place]
-        if found[place].score < best.score - BETTER:
+        if _is_better(found[place], best):
             best, best_at, idle = found[place], chosen, 0
         else:
             idle += 1
     return best, best_at
+
+
+def _is_better(trial: Trial, than: Trial) -> bool:
+    """Whether a candidate predicts better than another by more than nothing."""
+    return _rank(trial) < (than.grows, than.score - BETTER)
+
+
+def _downwards(
+    inside: Inside, work: Work, low: Fitted, others: Sequence[Mapping[str, float]], tried: set[str]
+) -> tuple[Trial, Fitted] | None:
+    """One thing less after another from everything at whole orders, all the way; the best of the way."""
+    full = inside.richest(low.change.variant)
+    if len(full.kept) - len(low.change.variant.kept) < 2:
+        return None
+    structure = inside.build(full)
+    starts = [starts_from(structure, known, full.held())[0] for known in (values_of(low.joint), *others)]
+    (joint,) = work.each(lambda item: work.fitted(item, starts, refine=False), [structure])
+    if isinstance(joint, FtlmError):
+        return None
+    at = Fitted(Change(worded(structure), full), joint, 0.0)
+    found = _judged(inside, work, [at])
+    best, best_at = found[0], at
+    while True:
+        changes = [c for c in inside.smaller(at.change.variant) if len(c.variant.kept) < len(at.change.variant.kept)]
+        ahead = _tried(inside, work, at, changes)
+        if not ahead:
+            return best, best_at
+        at = ahead[0]
+        if _key(inside, at.change) in tried:
+            continue
+        tried.add(_key(inside, at.change))
+        (trial,) = _judged(inside, work, [at])
+        if _rank(trial) <= (best.grows, best.score + BETTER):
+            best, best_at = trial, at
 
 
 def _judged(inside: Inside, work: Work, ahead: Sequence[Fitted]) -> list[Trial]:
@@ -171,12 +222,12 @@ def _judged(inside: Inside, work: Work, ahead: Sequence[Fitted]) -> list[Trial]:
 
 def _tried(inside: Inside, work: Work, at: Fitted, changes: Sequence[Change]) -> list[Fitted]:
     """Changes fitted from where one is, best first."""
-    values = dict(zip(at.joint.names, at.joint.values.tolist(), strict=True))
+    values = values_of(at.joint)
 
     def one(change: Change) -> JointFit | FtlmError:
         structure = inside.build(change.variant)
         whole = {**at.change.variant.held(), **change.variant.held()}
-        return work.fitted(structure, starts_from(structure, values, whole))
+        return work.fitted(structure, starts_from(structure, values, whole), refine=False)
 
     return _by_criterion(inside, work, list(zip(changes, work.each(one, changes), strict=True)))
 
@@ -199,10 +250,10 @@ def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]
         steps = _tried(inside, work, at, changes)
         tried |= {_key(inside, c) for c in changes}
         found = _judged(inside, work, steps[:JUDGED])
-        better = [(t, s) for t, s in zip(found, steps, strict=False) if t.score <= best.score + BETTER]
+        better = [(t, s) for t, s in zip(found, steps, strict=False) if _rank(t) <= (best.grows, best.score + BETTER)]
         if not better:
             return
-        best, at = min(better, key=lambda pair: pair[0].score)
+        best, at = min(better, key=lambda pair: _rank(pair[0]))
 
 
 def _key(inside: Inside, change: Change) -> str:

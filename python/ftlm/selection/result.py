@@ -20,6 +20,8 @@ from ftlm.selection.trial import LOST, Trial
 
 #: Rows that are printed.
 SHOWN = 12
+#: Said of a candidate whose free run grows.
+GROWS = " (grows without bound)"
 
 
 @dataclass(frozen=True)
@@ -64,9 +66,8 @@ class Selection:
             if trial.failed is not None:
                 out.append([f"{trial.name}: {trial.failed}", trial.numbers, None, None, None, ""])
                 continue
-            out.append([
-                mark + trial.name, trial.numbers, trial.seen, trial.unseen, trial.bic, ", ".join(trial.idle),
-            ])  # fmt: skip
+            name = mark + trial.name + (GROWS if trial.grows else "")
+            out.append([name, trial.numbers, trial.seen, trial.unseen, trial.bic, ", ".join(trial.idle)])
         return out
 
     def table(self) -> Table:
@@ -149,6 +150,7 @@ class Selection:
                     "validation": {n: dict(v) for n, v in t.validation.items()}, "score": finite(t.score),
                     "bic": None if t.bic is None else finite(t.bic), "values": dict(t.values),
                     "standard_errors": {n: finite(e) for n, e in t.errors.items()}, "idle": list(t.idle),
+                    "grows": t.grows,
                     "failed": t.failed,
                 }
                 for t in self.trials
@@ -165,7 +167,8 @@ class Selection:
             if trial.failed is not None:
                 lines.append(f"{mark}{'-':>9}{'-':>10}{trial.numbers:>9}  {trial.name}: {trial.failed}")
             else:
-                lines.append(f"{mark}{trial.unseen:>9.2f}{trial.seen:>10.2f}{trial.numbers:>9}  {trial.name}")
+                told = trial.name + (GROWS if trial.grows else "")
+                lines.append(f"{mark}{trial.unseen:>9.2f}{trial.seen:>10.2f}{trial.numbers:>9}  {told}")
         if self.chosen >= SHOWN:
             trial = self.winner
             lines.append(f"> {trial.unseen:>9.2f}{trial.seen:>10.2f}{trial.numbers:>9}  {trial.name}")

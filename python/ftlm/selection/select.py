@@ -122,9 +122,9 @@ def _chosen(work: Work, folds: Folds) -> Selection:
         key = signature(trial.structure)
         if key not in kept or trial.score < kept[key].score:
             kept[key] = trial
-    ranked = sorted(kept.values(), key=lambda t: (t.failed is not None, t.score, t.numbers, t.name))
+    ranked = sorted(kept.values(), key=lambda t: (t.failed is not None, t.grows, t.score, t.numbers, t.name))
     best = ranked[0]
-    winner = _winner([t for t in ranked if t.failed is None and _as_good(t, best)])
+    winner = _winner([t for t in ranked if t.failed is None and t.grows == best.grows and _as_good(t, best)])
     found = identify(list(folds.runs), _as_judged(winner, folds), threads=work.threads)
     warnings = []
     if winner.joint is not None and found.joint is not None and found.joint.noise:
@@ -180,8 +180,8 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
             + " and has the least Schwarz criterion of those that predict alike"
         )
     for word, others in (
-        ("fewer", [t for t in ranked if t.failed is None and t.numbers < winner.numbers]),
-        ("more", [t for t in ranked if t.failed is None and t.numbers > winner.numbers]),
+        ("fewer", [t for t in ranked if t.failed is None and t.grows == winner.grows and t.numbers < winner.numbers]),
+        ("more", [t for t in ranked if t.failed is None and t.grows == winner.grows and t.numbers > winner.numbers]),
     ):
         if others:
             near = min(others, key=lambda t: t.score)

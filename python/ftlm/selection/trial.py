@@ -164,6 +164,8 @@ class Trial:
         Estimates and standard errors on all runs, by name.
     idle
         Numbers whose 95 % interval holds the value at which they do nothing: 0 for a coefficient.
+    grows
+        Whether it has a pole with a positive real part: within a run the inputs may hide what it does, later nothing.
     failed
         Why there are no figures; None where there are.
     """
@@ -178,6 +180,7 @@ class Trial:
     values: Mapping[str, float] = field(default_factory=dict)
     errors: Mapping[str, float] = field(default_factory=dict)
     idle: tuple[str, ...] = ()
+    grows: bool = False
     failed: str | None = None
     joint: JointFit | None = field(default=None, repr=False)
 
@@ -250,7 +253,9 @@ def model_of(structure: Structure, joint: JointFit, runs: Sequence[Run]) -> Mode
 
 def judged(name: str, structure: Structure, folds: Folds, joint: JointFit) -> Trial:
     """A candidate fitted on all runs, fitted anew for each fold from there, and judged on what was left out."""
-    estimation = compare(model_of(structure, joint, folds.runs), list(folds.runs)).fit_percent
+    model = model_of(structure, joint, folds.runs)
+    estimation = compare(model, list(folds.runs)).fit_percent
+    grows = not structure.has_friction and model.stability(coupling=structure.coupling).unstable_poles > 0
     start = dict(zip(joint.names, joint.values.tolist(), strict=True))
     validation: dict[str, dict[str, float]] = {}
     for fold in folds.parts:
@@ -263,7 +268,8 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit) -> Tr
     idle = tuple(n for n in joint.coefficients if intervals[n][0] <= 0.0 <= intervals[n][1])
     return Trial(
         name, structure, numbers_of(structure, joint, folds), dict(estimation), validation, scores,
-        values=start, errors=joint.standard_errors, idle=idle, joint=joint,
+        values=start, errors=joint.standard_errors, idle=idle, grows=grows,
+        joint=joint,
     )  # fmt: skip
 
 
