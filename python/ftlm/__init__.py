@@ -14,7 +14,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.arm.link import flexible_link, link_model, order_law
     from ftlm.arm.parameters import PARAMETERS, LinkParameters
     from ftlm.base.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
-    from ftlm.data.equations import Equation, Friction, Term
+    from ftlm.data.equations import Equation, Friction, Stribeck, Term
     from ftlm.data.language import equation
     from ftlm.data.lattice import Lattice, lattice
     from ftlm.data.orders import Order
@@ -56,8 +56,8 @@ __all__ = [
     "PARAMETERS", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation", "Estimate",
     "FeedbackTest", "Friction", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria",
     "InternalError", "Lattice", "LinkParameters", "Metrics", "Model", "ModelError", "Order", "OutputResiduals",
-    "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run", "SearchResult",
-    "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Structure", "Term", "Trace", "Trial", "__version__",
+    "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow",
+    "Selection", "SensorFilter", "StoreStatus", "Stribeck", "Structure", "Term", "Trace", "Trial", "__version__",
     "block_pulse_matrix", "compare", "equation", "explicit_euler", "flexible_link", "fractional_derivative",
     "fractional_integral", "haar_inverse", "haar_matrix", "haar_transform", "identify", "identify_many",
     "information_criteria", "lattice", "link_model", "load", "load_model", "metrics", "multi_innovation_trace",
@@ -73,7 +73,7 @@ _HOMES = {
         "arm.link": "flexible_link link_model order_law",
         "arm.parameters": "LinkParameters PARAMETERS",
         "base.errors": "ConvergenceError DataError FtlmError InternalError ModelError RigFault",
-        "data.equations": "Equation Friction Term",
+        "data.equations": "Equation Friction Stribeck Term",
         "data.language": "equation",
         "data.lattice": "Lattice lattice",
         "data.orders": "Order",

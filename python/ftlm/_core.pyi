@@ -224,20 +224,20 @@ def output_error(
 class _Motion(TypedDict):
     output: _Vector
     velocity: _Vector
-    sign: _Vector
+    force: _Vector
     stuck: Any
 
 def friction_respond(
     run: _Record,
     equation: _Structure,
     coefficients: Sequence[float],
-    strength: float,
+    strength: tuple[float, float, float],
     terms: Sequence[tuple[float, float]],
 ) -> _Motion: ...
 def friction_error(
     runs: Sequence[_Experiment],
     law: _FreeEquation,
-    strength: _Monomial,
+    strength: Sequence[_Monomial],
     order_bounds: Sequence[tuple[float, float]],
     names: Sequence[str],
     terms: _Initial,

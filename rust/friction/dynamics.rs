@@ -1,10 +1,10 @@
 //! The body between its inputs and its friction: operators on pulse means, velocities at the edges of pulses, free runs.
 //!
-//! The output follows from the equation as every linear free run does, friction being one more input once its signs are
-//! known. The velocity obeys the same equation, all that drives it differentiated once. At an edge it is what the pulses
+//! The output follows from the equation as every linear free run does, friction being one more input once it is known. The velocity obeys the same equation, all that drives it differentiated once. At an edge it is what the pulses
 //! before it add up to there, exactly for what is constant within each.
 
-use super::march::{March, Phase};
+use super::law::{Law, Phase};
+use super::march::March;
 use super::online::Heads;
 use super::states::Forcing;
 use crate::equation::{Structure, ORDER_GRAIN};
@@ -14,15 +14,15 @@ use crate::kernels::digamma;
 use crate::regressors::Record;
 use crate::series::{divide, reciprocal, Buffers, Kernel};
 
-/// An equation with Coulomb friction of its own output's velocity.
+/// An equation with friction of its own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Body {
     /// D^α y = Σ c D^ν s, 1 < α ≤ 2; orders of every signal below α.
     pub structure: Structure,
     /// One coefficient a term.
     pub coefficients: Vec<f64>,
-    /// f of − f sgn(Dy), not negative, in the unit of D^α y.
-    pub friction: f64,
+    /// F of − F(Dy) sgn(Dy).
+    pub friction: Law,
 }
 
 /// A free run.
@@ -32,8 +32,8 @@ pub struct Motion {
     pub output: Vec<f64>,
     /// Velocity at the edges of the pulses, one more than there are pulses; exactly 0 at rest.
     pub velocity: Vec<f64>,
-    /// Mean of the friction's sign over each pulse.
-    pub sign: Vec<f64>,
+    /// Mean of the friction over each pulse, in the unit of D^α y.
+    pub force: Vec<f64>,
     /// What the body did in each pulse.
     pub phases: Vec<Phase>,
 }
@@ -47,7 +47,8 @@ impl Body {
         self.structure.check(signals, |_| true)?;
         check_length("coefficients", self.structure.terms.len(), self.coefficients.len())?;
         check_finite("coefficients", &self.coefficients)?;
-        check_finite("friction", &[self.friction])?;
+        let Law { coulomb, stribeck, speed } = self.friction;
+        check_finite("friction", &[coulomb, stribeck, speed])?;
         let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
             Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
         };
@@ -55,8 +56,11 @@ impl Body {
         if !(alpha > 1.0 && alpha <= 2.0) {
             return refuse("order of a body with friction", alpha, "(1, 2]", "a velocity needs inertia");
         }
-        if self.friction < 0.0 {
-            return refuse("friction", self.friction, "[0, ∞)", "friction takes energy, it does not give any");
+        if let Some(force) = [coulomb, stribeck].into_iter().find(|f| *f < 0.0) {
+            return refuse("friction", force, "[0, ∞)", "friction takes energy, it does not give any");
+        }
+        if speed <= 0.0 {
+            return refuse("speed of Stribeck friction", speed, "(0, ∞)", "it is the speed at which friction falls");
         }
         match self.structure.terms.iter().find(|t| t.order >= alpha - ORDER_GRAIN) {
             Some(term) => refuse("order beside friction", term.order, "below that of the body", "lower it"),
@@ -71,12 +75,12 @@ impl Body {
     ///
     /// ```
     /// use ftlm::equation::{Structure, Term};
-    /// use ftlm::friction::Body;
+    /// use ftlm::friction::{Body, Law};
     /// use ftlm::regressors::Record;
     /// # fn main() -> ftlm::error::Result<()> {
     /// // A block slides at 1 m/s on friction of 2 m/s²: it stops after half a second, 0.25 m on, and stays.
     /// let structure = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
-    /// let block = Body { structure, coefficients: vec![1.0], friction: 2.0 };
+    /// let block = Body { structure, coefficients: vec![1.0], friction: Law::coulomb(2.0) };
     /// let run = Record::new(0.01, vec![vec![0.0; 100], vec![0.0; 100]], None)?;
     /// let motion = block.run(&run, &[(1.0, 1.0)])?;
     /// assert!((motion.velocity[25] - 0.5).abs() < 1e-12 && motion.velocity[50..].iter().all(|v| v.abs() < 1e-12));
@@ -91,7 +95,7 @@ impl Body {
         crate::equation::Initial::Powers(exponents).check()?;
         let forcing = Forcing::of(initial, &self.own(), record.m(), record.step());
         let run = Run::new(self, &Operators::new(self, record), &forcing)?;
-        Ok(Motion { output: run.output, velocity: run.march.edges, sign: run.march.sign, phases: run.march.phases })
+        Ok(Motion { output: run.output, velocity: run.march.edges, force: run.march.force, phases: run.march.phases })
     }
 
     /// Integration and coefficient of each own term.
@@ -261,10 +265,8 @@ pub(super) struct Run {
     /// Pulse means of the velocity.
     pub(super) velocity: Vec<f64>,
     pub(super) march: March,
-    /// The friction's sign, integrated.
-    pub(super) signed: Integrated,
-    /// Its spectrum.
-    pub(super) sign: Kernel,
+    /// Spectrum of the friction.
+    pub(super) force: Kernel,
 }
 
 impl Run {
@@ -292,14 +294,13 @@ impl Run {
         }
         // What friction holds back though nothing else would is a difference of two large numbers.
         let largest = |values: &[f64]| values.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-        if largest(&linear) > LOST * (largest(&march.edges) + body.friction * operators.first) {
+        if largest(&linear) > LOST * (largest(&march.edges) + body.friction.breakaway() * operators.first) {
             return Err(Error::Diverged { what: "free run without its friction".into(), index: linear.len() });
         }
-        let sign = Kernel::new(&march.sign);
-        let signed = operators.friction.of(&sign, 0);
-        let f = body.friction;
-        total.output.iter_mut().zip(&signed.output).for_each(|(b, v)| *b -= f * v);
-        total.velocity.iter_mut().zip(&signed.velocity).for_each(|(b, v)| *b -= f * v);
+        let force = Kernel::new(&march.force);
+        let held = operators.friction.of(&force, 0);
+        total.output.iter_mut().zip(&held.output).for_each(|(b, v)| *b -= v);
+        total.velocity.iter_mut().zip(&held.velocity).for_each(|(b, v)| *b -= v);
         let output = if march.edges.iter().all(|v| *v == 0.0) {
             // What never leaves its rest is where it was, not where rounding puts it.
             vec![total.level; linear.len()]
@@ -310,7 +311,7 @@ impl Run {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
         let velocity = product(&operators.inverse, &total.velocity);
-        Ok(Self { output, velocity, march, signed, sign })
+        Ok(Self { output, velocity, march, force })
     }
 }
 

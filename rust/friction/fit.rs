@@ -80,7 +80,7 @@ impl Problem for OutputError<'_> {
         for (j, (value, step)) in next.coefficients.iter_mut().zip(coefficients).enumerate() {
             let before = *value;
             *value = self.model.coordinates[j].shifted(before, *step);
-            if self.model.rubs() == Some(j) {
+            if self.model.friction.rubs(j) {
                 *value = value.max(0.0);
             }
             moved = moved.max(share(before, *value));
@@ -120,10 +120,10 @@ impl Problem for OutputError<'_> {
             return (value - free.bounds.0, free.bounds.1 - value);
         }
         let plain = self.model.coordinates.get(j).is_some_and(|c| c.stretch(2.0) == 1.0);
-        match self.model.rubs() {
-            Some(rubs) if rubs == j && plain => (point.coefficients[j], f64::INFINITY),
-            _ => (f64::INFINITY, f64::INFINITY),
+        if plain && self.model.friction.rubs(j) {
+            return (point.coefficients[j], f64::INFINITY);
         }
+        (f64::INFINITY, f64::INFINITY)
     }
 
     /// Instants at which the body stops or turns pass from pulse to pulse, whatever moves them.
@@ -204,7 +204,7 @@ fn begun(
     let plain = model.first_states(orders, experiment, 0.0);
     let mut best = (f64::INFINITY, plain.clone());
     for share in BEGUN {
-        let start = model.first_states(orders, experiment, share * model.friction.at(coefficients));
+        let start = model.first_states(orders, experiment, share * model.friction.at(coefficients).breakaway());
         if share != 0.0 && start == plain {
             continue;
         }
@@ -234,8 +234,8 @@ pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, set
     let orders: Vec<f64> =
         start.orders.iter().zip(&model.order_bounds).map(|(o, &(low, high))| o.clamp(low, high)).collect();
     let mut coefficients = start.coefficients.clone();
-    if let Some(j) = model.rubs() {
-        coefficients[j] = coefficients[j].max(0.0);
+    for (_, value) in coefficients.iter_mut().enumerate().filter(|(j, _)| model.friction.rubs(*j)) {
+        *value = value.max(0.0);
     }
     let inputs: Vec<f64> =
         start.inputs.iter().zip(&model.inputs).map(|(v, i)| v.clamp(i.bounds.0, i.bounds.1)).collect();

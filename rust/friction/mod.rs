@@ -1,15 +1,17 @@
 //! Free runs of a body with dry friction, and their output error.
 //!
-//! D^α y = Σ c D^ν s − f sgn(Dy) + … with 1 < α ≤ 2, sgn set-valued at rest. Everything but sgn is linear, so superposition
-//! leaves one scalar problem: the velocity at the edges of the pulses is V = L − f g ∗ s with s ∈ sgn(V), L the velocity
-//! without friction and g what a pulse of force does to it ([`dynamics`]). It is marched pulse by pulse ([`march`]), the
-//! sum over the past by blocked transforms ([`online`]). A body at rest stays exactly at rest while friction can hold it.
+//! D^α y = Σ c D^ν s − F(Dy) sgn(Dy) + … with 1 < α ≤ 2, sgn set-valued at rest and F(v) = fc + fs exp(−(v/vs)²)
+//! ([`law`]). Everything but friction is linear, so superposition leaves one scalar problem: the velocity at the edges of
+//! the pulses is V = L − g ∗ φ with φ ∈ F(V) sgn(V), L the velocity without friction and g what a pulse of force does to
+//! it ([`dynamics`]). It is marched pulse by pulse ([`march`]), the sum over the past by blocked transforms ([`online`]).
+//! A body at rest stays exactly at rest while friction can hold it.
 //!
-//! Derivatives follow the march: s stands still while the body slides, and is what holds it while it sticks. Offsets and
-//! the state in which a run starts enter through the velocity, so they are no projection here but numbers of each run.
+//! Derivatives follow the march: φ is F while the body slides, and what holds it while it sticks. Offsets and the state in
+//! which a run starts enter through the velocity, so they are no projection here but numbers of each run.
 
 pub mod dynamics;
 pub mod fit;
+pub mod law;
 pub mod march;
 mod model;
 pub mod online;
@@ -17,4 +19,5 @@ mod states;
 
 pub use dynamics::{Body, Motion};
 pub use fit::{fit, Fit, Start};
-pub use model::FrictionModel;
+pub use law::Law;
+pub use model::{FreeLaw, FrictionModel};

@@ -1,6 +1,7 @@
 //! A body with friction whose orders and coefficients are free: its residuals on every experiment, and their derivatives.
 
 use super::dynamics::{product, Body, Integrated, Operators, Run};
+use super::law::Law;
 use super::states::{together, Forcing, State};
 use crate::equation::{Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
@@ -8,13 +9,48 @@ use crate::estimate::output_error::{Coordinate, Experiment, FreeEquation, FreeIn
 use crate::regressors::Record;
 use crate::series::Kernel;
 
-/// What is estimated: one equation, its output alone unknown, with Coulomb friction of that output's velocity.
+/// Friction each of whose numbers may be free: a multiple of one coefficient.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FreeLaw {
+    /// fc.
+    pub coulomb: Monomial,
+    /// fs.
+    pub stribeck: Monomial,
+    /// vs.
+    pub speed: Monomial,
+}
+
+impl FreeLaw {
+    /// Friction that is the same at every speed.
+    #[must_use]
+    pub fn coulomb(coulomb: Monomial) -> Self {
+        let known = |factor: f64| Monomial { factor, powers: Vec::new() };
+        Self { coulomb, stribeck: known(0.0), speed: known(1.0) }
+    }
+
+    fn numbers(&self) -> [&Monomial; 3] {
+        [&self.coulomb, &self.stribeck, &self.speed]
+    }
+
+    /// At coefficients.
+    pub(super) fn at(&self, coefficients: &[f64]) -> Law {
+        let [coulomb, stribeck, speed] = self.numbers().map(|number| number.at(coefficients));
+        Law { coulomb, stribeck, speed }
+    }
+
+    /// Whether a coefficient is one of its forces, which are not negative.
+    pub(super) fn rubs(&self, coefficient: usize) -> bool {
+        [&self.coulomb, &self.stribeck].iter().any(|number| number.powers.iter().any(|&(i, _)| i == coefficient))
+    }
+}
+
+/// What is estimated: one equation, its output alone unknown, with friction of that output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionModel {
     /// The linear terms.
     pub equation: FreeEquation,
-    /// f of − f sgn(Dy).
-    pub friction: Monomial,
+    /// F of − F(Dy) sgn(Dy).
+    pub friction: FreeLaw,
     /// What is free of inputs, one number of an input at most.
     pub inputs: Vec<FreeInput>,
     /// Bounds of each free order.
@@ -81,7 +117,8 @@ impl FrictionModel {
         if self.equation.output >= signals || terms.iter().any(|t| t.0 >= signals || !known(&t.2)) {
             return refuse("an equation names a signal or a coefficient that is not there", "number them from 0");
         }
-        if !known(&self.friction) || self.friction.powers.len() > 1 || self.friction.factor < 0.0 {
+        let numbers = self.friction.numbers();
+        if numbers.iter().any(|n| !known(n) || n.powers.len() > 1 || n.factor < 0.0) {
             return refuse("friction is no multiple of one free coefficient", "give it one that is not negative");
         }
         for (k, &FreeInput { signal, law, bounds: (low, high) }) in self.inputs.iter().enumerate() {
@@ -163,11 +200,6 @@ impl FrictionModel {
             _ => 0.0,
         };
         self.states(orders).iter().map(value).collect()
-    }
-
-    /// The coefficient that friction is a multiple of, if it is free.
-    pub(super) fn rubs(&self) -> Option<usize> {
-        self.friction.powers.first().map(|&(i, _)| i)
     }
 
     /// Powers of t of a run's states: (exponent, coefficient).
@@ -304,36 +336,35 @@ impl FrictionModel {
                 }
             }
         }
-        add(-friction_moves, &motion.signed);
         if alpha_moves != 0.0 {
-            add(-body.friction * alpha_moves, &operators.friction.of(&motion.sign, 1));
+            add(-alpha_moves, &operators.friction.of(&motion.force, 1));
         }
         let through = product(&operators.own_edges, &product(&operators.inverse, &total.velocity));
         let at_ends: Vec<f64> = through.iter().zip(&total.edges).map(|(a, b)| a + b).collect();
-        let brake = friction_moves * operators.first + body.friction * operators.first_slope(body, alpha_moves, &moves);
-        let signs = motion.march.slope(&at_ends, &operators.response, body.friction, brake, total.start);
-        if let Some(signs) = signs {
-            let held = operators.friction.of(&Kernel::new(&signs), 0);
-            total.output.iter_mut().zip(&held.output).for_each(|(s, v)| *s -= body.friction * v);
+        let first = operators.first_slope(body, alpha_moves, &moves);
+        let forces = motion.march.slope(&at_ends, &operators.response, first, friction_moves, total.start);
+        if let Some(forces) = forces {
+            let held = operators.friction.of(&Kernel::new(&forces), 0);
+            total.output.iter_mut().zip(&held.output).for_each(|(s, v)| *s -= v);
         }
         product(&operators.inverse, &total.output)
     }
 
-    /// Derivatives of α, of (coefficient, integration) of each term, and of friction.
-    fn moves(&self, point: &Point, moved: &Moved) -> (f64, Vec<(f64, f64)>, f64) {
+    /// Derivatives of α, of (coefficient, integration) of each term, and of fc, fs and vs.
+    fn moves(&self, point: &Point, moved: &Moved) -> (f64, Vec<(f64, f64)>, [f64; 3]) {
         let terms = &self.equation.terms;
         match *moved {
             Moved::Order(j) => {
                 let of = |weights: &[f64]| weights.get(j).copied().unwrap_or(0.0);
                 let alpha = of(&self.equation.order.weights);
-                (alpha, terms.iter().map(|t| (0.0, alpha - of(&t.1.weights))).collect(), 0.0)
+                (alpha, terms.iter().map(|t| (0.0, alpha - of(&t.1.weights))).collect(), [0.0; 3])
             }
             Moved::Coefficient(j) => (
                 0.0,
                 terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect(),
-                self.friction.slope(&point.coefficients, j),
+                self.friction.numbers().map(|number| number.slope(&point.coefficients, j)),
             ),
-            Moved::State(..) | Moved::Input(_) => (0.0, vec![(0.0, 0.0); terms.len()], 0.0),
+            Moved::State(..) | Moved::Input(_) => (0.0, vec![(0.0, 0.0); terms.len()], [0.0; 3]),
         }
     }
 

@@ -11,8 +11,8 @@ use super::estimate::{
     MonomialArg,
 };
 use crate::estimate::output_error as joint;
-use crate::friction::march::Phase;
-use crate::friction::{self, Body, FrictionModel, Start};
+use crate::friction::law::Phase;
+use crate::friction::{self, Body, FreeLaw, FrictionModel, Law, Start};
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
@@ -21,17 +21,19 @@ pub fn friction_respond<'py>(
     run: RecordArg<'py>,
     equation: StructureArg,
     coefficients: Vec<f64>,
-    strength: f64,
+    strength: (f64, f64, f64),
     terms: Vec<(f64, f64)>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let record = record(&run)?;
     let inputs = vec![true; record.len()];
-    let body = Body { structure: structure(equation, record.len(), &inputs)?, coefficients, friction: strength };
+    let (coulomb, stribeck, speed) = strength;
+    let friction = Law { coulomb, stribeck, speed };
+    let body = Body { structure: structure(equation, record.len(), &inputs)?, coefficients, friction };
     let motion = detached(py, || body.run(&record, &terms))?;
     let dict = PyDict::new(py);
     dict.set_item("output", PyArray1::from_vec(py, motion.output))?;
     dict.set_item("velocity", PyArray1::from_vec(py, motion.velocity))?;
-    dict.set_item("sign", PyArray1::from_vec(py, motion.sign))?;
+    dict.set_item("force", PyArray1::from_vec(py, motion.force))?;
     let stuck = motion.phases.iter().map(|phase| *phase == Phase::Stick).collect();
     dict.set_item("stuck", PyArray1::from_vec(py, stuck))?;
     Ok(dict)
@@ -43,7 +45,7 @@ pub fn friction_error<'py>(
     py: Python<'py>,
     runs: Vec<ExperimentArg<'py>>,
     law: FreeEquationArg,
-    strength: MonomialArg,
+    strength: [MonomialArg; 3],
     order_bounds: Vec<(f64, f64)>,
     names: Vec<String>,
     terms: InitialArg,
@@ -55,9 +57,10 @@ pub fn friction_error<'py>(
     tolerance: f64,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
+    let [coulomb, stribeck, speed] = strength.map(|(factor, powers)| joint::Monomial { factor, powers });
     let model = FrictionModel {
         equation: free_equation(law),
-        friction: joint::Monomial { factor: strength.0, powers: strength.1 },
+        friction: FreeLaw { coulomb, stribeck, speed },
         inputs: free_inputs(&inputs)?,
         order_bounds,
         coordinates: coordinates(&names)?,

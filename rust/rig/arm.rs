@@ -8,12 +8,12 @@
 //! ([`crate::memory`]). One substep is a trapezoidal step, implicit in all four rates at once.
 //!
 //! A hub's Coulomb friction is a set-valued torque: it counts as a current that is subtracted from the motor's and may take
-//! any value up to its limit at standstill, by the law of a pulse of [`crate::friction::march`] for each of two hubs that
+//! any value up to its limit at standstill, by the law of a pulse of [`crate::friction::law`] for each of two hubs that
 //! feel each other.
 
 use crate::equation::{tidy, Equation, ORDER_GRAIN};
 use crate::error::{check_length, check_step, Error, Result};
-use crate::friction::march::{pulse, Phase};
+use crate::friction::law::{pulse, Phase};
 use crate::memory::{decay, Rates};
 use crate::regularity::check_regular;
 use crate::small;

@@ -1,8 +1,9 @@
 """A body on dry friction, computed slowly: sums over the whole past written out, one implicit step an instant.
 
-Nothing here imports the package. D^alpha y = sum of c D^nu y + F(t) - f sgn(Dy), 1 < alpha <= 2, Caputo's derivatives,
-sgn set-valued at rest. In the velocity v = Dy the derivatives are those of Grünwald and Letnikov, of first order in the
-step, and every step solves its own scalar inclusion: what is left of all other forces beyond f moves the body.
+Nothing here imports the package. D^alpha y = sum of c D^nu y + F(t) - (f + fs exp(-(Dy/vs)^2)) sgn(Dy), 1 < alpha <= 2,
+Caputo's derivatives, sgn set-valued at rest. In the velocity v = Dy the derivatives are those of Grünwald and Letnikov,
+of first order in the step, and every step solves its own scalar inclusion: what is left of all other forces beyond f
+moves the body.
 """
 
 from __future__ import annotations
@@ -23,9 +24,12 @@ def weights(order: float, count: int) -> np.ndarray:
 
 def naive_run(
     force: np.ndarray, step: float, alpha: float, own: Sequence[tuple[float, float]], friction: float,
-    level: float = 0.0, rate: float = 0.0,
+    level: float = 0.0, rate: float = 0.0, more: float = 0.0, speed: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Position and velocity at the instants of `force`; `own` are (coefficient, order) with orders in [0, alpha)."""
+    """Position and velocity at the instants of `force`; `own` are (coefficient, order) with orders in [0, alpha).
+
+    What friction has `more` near rest is that of the velocity an instant ago.
+    """
     count = force.size
     v, y = np.zeros(count), np.full(count, level)
     v[0] = rate
@@ -46,15 +50,21 @@ def naive_run(
                 shift = rate if nu > 1 else 0.0
                 known += c * (w[1 : k + 1] @ (v[k - 1 :: -1][:k] - shift) - w[0] * shift)
                 gain -= c * w[0]
-        v[k] = np.sign(known) * max(abs(known) - friction, 0.0) / gain
+        holds = friction + more * np.exp(-((v[k - 1] / speed) ** 2))
+        v[k] = np.sign(known) * max(abs(known) - holds, 0.0) / gain
         y[k] = y[k - 1] + step * v[k]
     return y, v
 
 
 def between_events(
-    force: Callable[[float], float], times: np.ndarray, viscous: float, friction: float, rate: float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:
-    """Mass of 1 with viscous and Coulomb friction, integrated between its events: stops, turns, breaks away."""
+    force: Callable[[float], float], times: np.ndarray, viscous: float, friction: float, rate: float = 0.0,
+    more: float = 0.0, speed: float = 1.0, spring: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Mass of 1 with viscous, Coulomb and Stribeck friction, integrated between its events: stops, turns, breaks away.
+
+    A spring of this stiffness holds it at 0.
+    """
+    most = friction + more
     state, now, end = np.array([0.0, rate]), 0.0, float(times[-1])
     y, v = np.zeros(times.size), np.zeros(times.size)
     v[0] = rate
@@ -62,23 +72,26 @@ def between_events(
     while now < end:
         if side == 0:
             fine = np.linspace(now, end, 20001)
-            away = np.flatnonzero(np.abs([force(t) for t in fine]) > friction)
+            away = np.flatnonzero(np.abs([force(t) - spring * state[0] for t in fine]) > most)
             until = end if away.size == 0 else float(fine[away[0]])
             if away.size and away[0] > 0:
                 low, high = float(fine[away[0] - 1]), until
                 for _ in range(60):
                     middle = 0.5 * (low + high)
-                    low, high = (low, middle) if abs(force(middle)) > friction else (middle, high)
+                    low, high = (low, middle) if abs(force(middle) - spring * state[0]) > most else (middle, high)
                 until = high
             held = (times >= now) & (times <= until)
             y[held], v[held] = state[0], 0.0
-            now, side = until, np.sign(force(until)) if until < end else 0.0
+            now, side = until, np.sign(force(until) - spring * state[0]) if until < end else 0.0
             if until >= end:
                 break
         s = side
 
         def motion(t: float, x: np.ndarray, s: float = s) -> list[float]:
-            return [x[1], force(t) - viscous * x[1] - s * friction]
+            return [
+                x[1],
+                force(t) - spring * x[0] - viscous * x[1] - s * (friction + more * np.exp(-((x[1] / speed) ** 2))),
+            ]
 
         def rest(t: float, x: np.ndarray, s: float = s, begun: float = now) -> float:
             return x[1] if t > begun + 1e-9 else s
@@ -94,8 +107,8 @@ def between_events(
         now, state = float(found.t[-1]), found.y[:, -1].copy()
         if found.status == 1:
             state[1] = 0.0
-            pull = force(now)
-            side = 0.0 if abs(pull) <= friction else float(np.sign(pull))
+            pull = force(now) - spring * state[0]
+            side = 0.0 if abs(pull) <= most else float(np.sign(pull))
     return y, v
 
 

@@ -32,11 +32,12 @@ def model_of(words: str, **values: float) -> ftlm.Model:
     return ftlm.Model(structure)
 
 
-def motion(means: np.ndarray, step: float, alpha: float, own, strength: float, powers=()):
-    """The core's march: own are (coefficient, order)."""
+def motion(means: np.ndarray, step: float, alpha: float, own, strength, powers=()):
+    """The core's march: own are (coefficient, order), the strength fc or (fc, fs, vs)."""
+    law = strength if isinstance(strength, tuple) else (strength, 0.0, 1.0)
     terms = [(0, order) for _, order in own] + [(1, 0.0)]
     record = (step, np.stack([np.zeros_like(means), means]), None)
-    return _core.friction_respond(record, (0, alpha, terms), [*(c for c, _ in own), 1.0], strength, list(powers))
+    return _core.friction_respond(record, (0, alpha, terms), [*(c for c, _ in own), 1.0], law, list(powers))
 
 
 def level_and_rate(alpha: float, own, level: float, rate: float) -> list[tuple[float, float]]:
@@ -74,7 +75,7 @@ def test_a_body_at_rest_moves_only_where_the_force_exceeds_its_friction() -> Non
     freed = motion(force[:-1], 0.005, 2.0, [(-1.0, 1.0)], 0.6)
     first = int(np.flatnonzero(freed["velocity"])[0])
     assert times[first] == pytest.approx(np.arcsin(0.6), abs=0.011)
-    assert np.all(np.abs(freed["sign"]) <= 1.0 + 1e-9)
+    assert np.all(np.abs(freed["force"]) <= 0.6 * (1.0 + 1e-9))
 
 
 @pytest.mark.parametrize("fc", [0.8, 1.5])
@@ -209,7 +210,7 @@ def test_derivatives_are_those_of_finite_differences(orders) -> None:
 
     def at(point):
         return _core.friction_error(
-            runs, law, (1.0, [(2, 1)]), [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 3, (True, [], 1), list(point[:2]),
+            runs, law, [(1.0, [(2, 1)]), (0.0, []), (1.0, [])], [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 3, (True, [], 1), list(point[:2]),
             list(point[2:5]), [], [list(point[5:8]), list(point[8:])], 1, 1e-9,
         )  # fmt: skip
 

@@ -3,14 +3,19 @@
 use ftlm::equation::{AffineOrder, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimate::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
-use ftlm::friction::march::{March, Phase};
+use ftlm::friction::law::Phase;
+use ftlm::friction::march::March;
 use ftlm::friction::online::{Heads, Online};
-use ftlm::friction::{fit, Body, FrictionModel, Start};
+use ftlm::friction::{fit, Body, FreeLaw, FrictionModel, Law, Start};
 use ftlm::regressors::Record;
 
 fn body(order: f64, friction: f64) -> Body {
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
-    Body { structure: Structure { output: 0, order, terms }, coefficients: vec![-1.0, 1.0], friction }
+    Body {
+        structure: Structure { output: 0, order, terms },
+        coefficients: vec![-1.0, 1.0],
+        friction: Law::coulomb(friction),
+    }
 }
 
 fn force(m: usize) -> Vec<f64> {
@@ -36,15 +41,15 @@ fn a_march_obeys_its_law() {
     let response: Vec<f64> = (0..m).map(|n| 0.01 * (-0.002 * n as f64).exp()).collect();
     let linear: Vec<f64> = force(m);
     let strength = 3.0;
-    let march = March::new(&linear, &Heads::new(&response), response[0], strength, 0.0);
+    let march = March::new(&linear, &Heads::new(&response), response[0], Law::coulomb(strength), 0.0);
     assert!(march.phases.contains(&Phase::Stick) && march.phases.contains(&Phase::Slip));
     for k in 0..m {
-        let past: f64 = (0..=k).map(|j| response[k - j] * march.sign[j]).sum();
-        assert!((march.edges[k + 1] - (linear[k] - strength * past)).abs() < 1e-9, "{k}");
-        assert!(march.sign[k].abs() <= 1.0 + 1e-9);
+        let past: f64 = (0..=k).map(|j| response[k - j] * march.force[j]).sum();
+        assert!((march.edges[k + 1] - (linear[k] - past)).abs() < 1e-9, "{k}");
+        assert!(march.force[k].abs() <= strength * (1.0 + 1e-9));
         match march.phases[k] {
             Phase::Stick => assert_eq!(march.edges[k + 1], 0.0),
-            Phase::Slip => assert!(march.sign[k] * march.edges[k + 1] >= 0.0 && march.sign[k].abs() == 1.0),
+            Phase::Slip => assert!(march.force[k] * march.edges[k + 1] >= 0.0 && march.force[k].abs() == strength),
             Phase::Turn => assert!(march.edges[k] * march.edges[k + 1] < 0.0),
         }
     }
@@ -74,7 +79,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
             order: order(0.0, 1.0),
             terms: vec![(0, order(1.0, 0.0), free(0, -1.0)), (1, order(0.0, 0.0), free(1, 1.0))],
         },
-        friction: free(2, 1.0),
+        friction: FreeLaw::coulomb(free(2, 1.0)),
         inputs: vec![],
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
@@ -87,7 +92,8 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
     for (value, truth) in found.coefficients.iter().zip([1.0, 1.0, 0.8]) {
         assert!((value - truth).abs() < 1e-4, "{:?}", found.coefficients);
     }
-    let strange = FrictionModel { friction: Monomial { factor: -1.0, powers: vec![] }, ..model.clone() };
+    let strange =
+        FrictionModel { friction: FreeLaw::coulomb(Monomial { factor: -1.0, powers: vec![] }), ..model.clone() };
     assert!(matches!(strange.check(&[experiment]), Err(Error::Structure { .. })));
     assert!(matches!(model.check(&[]), Err(Error::Length { .. })));
     Ok(())

@@ -5,7 +5,7 @@ use ftlm::error::Error;
 use ftlm::estimate::output_error::{
     self, Coordinate, Experiment, FreeEquation, FreeInput, FreeModel, InputLaw, Instant, Monomial, Point, Settings,
 };
-use ftlm::friction::{self, FrictionModel, Start};
+use ftlm::friction::{self, FreeLaw, FrictionModel, Law, Start};
 use ftlm::means::point_samples;
 use ftlm::regressors::Record;
 
@@ -69,7 +69,7 @@ fn linear(law: InputLaw) -> FreeModel {
 fn rubbing(law: InputLaw) -> FrictionModel {
     FrictionModel {
         equation: equation(),
-        friction: free(2, 1.0),
+        friction: FreeLaw::coulomb(free(2, 1.0)),
         inputs: limited(law),
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
@@ -85,7 +85,7 @@ fn run(law: InputLaw, limit: f64, f: f64, seed: u64) -> Result<Experiment, Error
     let body = friction::Body {
         structure: Structure { output: 0, order: 1.8, terms },
         coefficients: vec![-1.0, 1.5],
-        friction: f,
+        friction: Law::coulomb(f),
     };
     let output = body.run(&Record::new(STEP, vec![vec![0.0; M], acting(&u, law, limit)], None)?, &[])?.output;
     let record = Record::new(STEP, vec![output.clone(), u], None)?;

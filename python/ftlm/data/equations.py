@@ -66,6 +66,39 @@ def derivative(order: Order, signal: str) -> str:
 
 
 @dataclass(frozen=True)
+class Stribeck:
+    """What friction has more near rest: ``factor * coefficient * exp(-(D output / speed)^2) * sign(D output)``.
+
+    Parameters
+    ----------
+    coefficient
+        Name of the free coefficient fs, or its value [unit of D^alpha y]; not negative times a factor that is negative.
+    speed
+        Name of the free speed vs at which the term has fallen to 1/e, or its value [unit of y per s], positive.
+    factor
+        Known factor of the coefficient, negative: friction takes energy.
+    name, speed_name
+        Names that coefficient and speed had before they got their values.
+    """
+
+    coefficient: str | float
+    speed: str | float
+    factor: float = -1.0
+    name: str | None = None
+    speed_name: str | None = None
+
+    @property
+    def strength(self) -> float | None:
+        """What friction holds at rest beyond what it takes at speed, [unit of D^alpha y], if it is known."""
+        return None if isinstance(self.coefficient, str) else -self.factor * self.coefficient
+
+    def written(self, output: str) -> str:
+        """Write the term in words."""
+        speed = self.speed if isinstance(self.speed, str) else f"{self.speed!r}"
+        return f"- {_sized(self.coefficient, self.factor)} exp(-(D {output}/{speed})^2) sign(D {output})"
+
+
+@dataclass(frozen=True)
 class Friction:
     """Coulomb friction ``factor * coefficient * sign(D output)`` of an equation's own output, set-valued at rest.
 
@@ -80,23 +113,78 @@ class Friction:
         Known factor, negative: friction takes energy.
     name
         Name that the coefficient had before it got its value.
+    more
+        What it has more near rest, if there is such a term: a body then breaks away where the force exceeds both.
     """
 
     coefficient: str | float
     factor: float = -1.0
     name: str | None = None
+    # Absent where there is none, so that what is written of an equation without it is as it was.
+    more: Stribeck | UnsetType = UNSET
+
+    @property
+    def stribeck(self) -> Stribeck | None:
+        """What it has more near rest; None without."""
+        return self.more if isinstance(self.more, Stribeck) else None
 
     @property
     def strength(self) -> float | None:
-        """What friction holds at most, [unit of D^alpha y], if it is known."""
+        """What friction takes at speed, and at rest holds at most by itself, [unit of D^alpha y], if it is known."""
         return None if isinstance(self.coefficient, str) else -self.factor * self.coefficient
 
+    @property
+    def law(self) -> tuple[float, float, float]:
+        """Numbers fc, fs and vs of friction whose coefficients are known; without a Stribeck term fs is 0, vs 1."""
+        more = self.stribeck
+        near = (0.0, 1.0) if more is None else (more.strength or 0.0, float(more.speed))
+        return (self.strength or 0.0, *near)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Free coefficients."""
+        numbers = [self.coefficient] + (
+            [] if self.stribeck is None else [self.stribeck.coefficient, self.stribeck.speed]
+        )
+        return tuple(n for n in numbers if isinstance(n, str))
+
+    @property
+    def found(self) -> dict[str, float]:
+        """Coefficients that have their values, by the names that they had."""
+        more = self.stribeck
+        pairs = [(self.name, self.coefficient)]
+        if more is not None:
+            pairs += [(more.name, more.coefficient), (more.speed_name, more.speed)]
+        return {name: float(value) for name, value in pairs if name is not None}
+
+    def with_coefficients(self, values: Mapping[str, float]) -> Friction:
+        """Return it with these free coefficients replaced by values; others stay free."""
+        out, more = self, self.stribeck
+        if isinstance(self.coefficient, str) and self.coefficient in values:
+            out = replace(
+                out, coefficient=real_number(self.coefficient, values[self.coefficient]), name=self.coefficient
+            )
+        if more is None:
+            return out
+        if isinstance(more.coefficient, str) and more.coefficient in values:
+            name = more.coefficient
+            more = replace(more, coefficient=real_number(name, values[name]), name=name)
+        if isinstance(more.speed, str) and more.speed in values:
+            name = more.speed
+            more = replace(more, speed=real_number(name, values[name]), speed_name=name)
+        return replace(out, more=more)
+
     def written(self, output: str) -> str:
-        """Write the term in words."""
-        if isinstance(self.coefficient, str):
-            factor = "" if self.factor == -1 else f"{-self.factor!r} "
-            return f"- {factor}{self.coefficient} sign(D {output})"
-        return f"- {-self.factor * self.coefficient!r} sign(D {output})"
+        """Write the terms in words."""
+        near = "" if self.stribeck is None else f" {self.stribeck.written(output)}"
+        return f"- {_sized(self.coefficient, self.factor)} sign(D {output}){near}"
+
+
+def _sized(coefficient: str | float, factor: float) -> str:
+    """A coefficient of friction with its factor, the sign left out."""
+    if isinstance(coefficient, str):
+        return coefficient if factor == -1 else f"{-factor!r} {coefficient}"
+    return f"{-factor * coefficient!r}"
 
 
 @dataclass(frozen=True)
@@ -114,8 +202,8 @@ class Equation:
         link of an arm hangs on a hub that is differentiated more often than its own deflection. A command that holds
         between samples stays at alpha or below, its jumps have no derivative.
     coulomb
-        Coulomb friction of the output's own velocity, if there is some; alpha then lies in (1, 2], and every order
-        below alpha.
+        Friction of the output's own velocity, of Coulomb and near rest of Stribeck, if there is some; alpha then lies
+        in (1, 2], and every order below alpha.
     """
 
     output: str
@@ -170,15 +258,24 @@ class Equation:
     def _check_friction(self, friction: Friction) -> None:
         """Refuse friction that drives, and orders beside which a velocity has no meaning."""
         words = f"friction in the equation of {self.output}"
-        if not (math.isfinite(friction.factor) and friction.factor < 0):
-            raise ModelError(
-                f"{words} has the factor {friction.factor:g}, but friction takes energy: write "
-                f"'- fc*sign(D {self.output})'"
-            )
-        if friction.strength is not None and not 0 <= friction.strength < math.inf:
-            raise ModelError(
-                f"{words} has the coefficient {friction.coefficient!r}; it is not negative: the sign is in the term"
-            )
+        terms: list[Friction | Stribeck] = [friction] if friction.stribeck is None else [friction, friction.stribeck]
+        for term in terms:
+            if not (math.isfinite(term.factor) and term.factor < 0):
+                raise ModelError(
+                    f"{words} has the factor {term.factor:g}, but friction takes energy: write "
+                    f"'- fc*sign(D {self.output})'"
+                )
+            if term.strength is not None and not 0 <= term.strength < math.inf:
+                raise ModelError(
+                    f"{words} has the coefficient {term.coefficient!r}; it is not negative: the sign is in the term"
+                )
+        if friction.stribeck is not None and not isinstance(friction.stribeck.speed, str):
+            speed = friction.stribeck.speed
+            if not 0 < speed < math.inf:
+                raise ModelError(
+                    f"{words} falls with speed at vs = {speed:g}; a speed is positive: give one, in units of "
+                    f"{self.output} per s"
+                )
         if self.order.names:
             return
         alpha = self.order.constant
@@ -187,16 +284,16 @@ class Equation:
                 f"{words} acts on its velocity, but alpha = {alpha:g} is outside (1, 2]; leave it out, or choose "
                 "another order"
             )
-        for term in self.terms:
-            if not term.order.names and term.order.constant >= alpha - 1e-9:
+        for item in self.terms:
+            if not item.order.names and item.order.constant >= alpha - 1e-9:
                 raise ModelError(
-                    f"order {term.order.constant:g} of {term.signal} is not below alpha = {alpha:g}, and {words} then "
+                    f"order {item.order.constant:g} of {item.signal} is not below alpha = {alpha:g}, and {words} then "
                     "has no velocity to follow; lower it"
                 )
 
     @property
     def friction(self) -> Friction | None:
-        """Coulomb friction of the output's own velocity; None without."""
+        """Friction of the output's own velocity; None without."""
         return self.coulomb if isinstance(self.coulomb, Friction) else None
 
     @property
@@ -212,8 +309,8 @@ class Equation:
     @property
     def coefficient_names(self) -> tuple[str, ...]:
         """Free coefficients in order of appearance."""
-        friction = () if self.friction is None else (self.friction,)
-        return tuple(t.coefficient for t in (*self.terms, *friction) if isinstance(t.coefficient, str))
+        friction = () if self.friction is None else self.friction.names
+        return (*(t.coefficient for t in self.terms if isinstance(t.coefficient, str)), *friction)
 
     def with_orders(self, values: Mapping[str, float]) -> Equation:
         """Return the equation with these free orders replaced by values; others stay free.
@@ -240,10 +337,7 @@ class Equation:
             else t
             for t in self.terms
         )
-        coulomb = self.coulomb
-        if isinstance(coulomb, Friction) and isinstance(coulomb.coefficient, str) and coulomb.coefficient in values:
-            name = coulomb.coefficient
-            coulomb = replace(coulomb, coefficient=real_number(name, values[name]), name=name)
+        coulomb = self.coulomb.with_coefficients(values) if isinstance(self.coulomb, Friction) else self.coulomb
         return Equation(self.output, self.order, terms, coulomb)
 
     @property
@@ -267,5 +361,8 @@ def numeric(item: Equation, inputs: Mapping[str, str] | None = None) -> str:
     parts = [f"{t.fixed or 0.0:+.6g} {derivative(t.order, texts.get(t.signal, t.signal))}" for t in item.terms]
     right = " ".join([parts[0].removeprefix("+"), *(f"{p[0]} {p[1:]}" for p in parts[1:])])
     if item.friction is not None:
-        right += f" - {item.friction.strength or 0.0:.6g} sign(D {item.output})"
+        fc, fs, vs = item.friction.law
+        right += f" - {fc:.6g} sign(D {item.output})"
+        if item.friction.stribeck is not None:
+            right += f" - {fs:.6g} exp(-(D {item.output}/{vs:.6g})^2) sign(D {item.output})"
     return f"{derivative(item.order, item.output)} = {right}"

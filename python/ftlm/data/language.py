@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 
 from msgspec import UNSET
 
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
-from ftlm.data.equations import Equation, Friction, Term
+from ftlm.data.equations import Equation, Friction, Stribeck, Term
 from ftlm.data.limits import SHORT, Limit, LimitLaw, Value, in_order
 from ftlm.data.orders import Order, Values
 from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial, check_offset
@@ -44,7 +45,8 @@ def equation(
         name. Several equations are separated by ``;`` or by lines. A term that is ``c`` alone (or ``c0``, ``c1``, …)
         is an offset, an unknown constant; a signal of that name is ``1 c``. ``- fc*sign(D y)`` in the equation of y is
         Coulomb friction: the sign of the velocity that the equation itself gives, and at rest whatever within
-        [-1, 1] keeps it there.
+        [-1, 1] keeps it there. ``- fs*exp(-(D y/vs)^2)*sign(D y)`` beside it is what friction has more near rest
+        (Stribeck), fs and the speed vs > 0 each a name or a number; y then breaks away where the force exceeds fc + fs.
     orders
         Values of the free orders: a number fixes one, ``"0.5:1.5:0.05"`` or (low, high, step) gives its lattice.
     fixed
@@ -211,6 +213,7 @@ def _parse(text: str) -> tuple[Equation, bool, _Words]:
     terms = []
     offset = False
     friction: Friction | None = None
+    near: Stribeck | None = None
     while True:
         sign = 1.0
         while words.peek()[1] in "+-" and words.peek()[0] == "symbol":
@@ -225,14 +228,18 @@ def _parse(text: str) -> tuple[Equation, bool, _Words]:
             offset = True
             words.take()
         elif (rubs := _parse_friction(words, sign)) is not None:
-            if friction is not None:
-                raise ModelError(f"equation {text!r}: friction of D {output} stands there twice; write it once")
+            if (near if isinstance(rubs[0], Stribeck) else friction) is not None:
+                which = "Stribeck friction" if isinstance(rubs[0], Stribeck) else "friction"
+                raise ModelError(f"equation {text!r}: {which} of D {output} stands there twice; write it once")
             if rubs[1] != output:
                 raise ModelError(
                     f"equation {text!r}: friction follows the velocity of the equation's own output, which is "
                     f"{output}, not {rubs[1]}; the sign of a measured rate is the signal coulomb_{rubs[1]}"
                 )
-            friction = rubs[0]
+            if isinstance(rubs[0], Stribeck):
+                near = rubs[0]
+            else:
+                friction = rubs[0]
         else:
             terms.append(_parse_term(words, sign))
         kind, value, _ = words.peek()
@@ -240,37 +247,82 @@ def _parse(text: str) -> tuple[Equation, bool, _Words]:
             break
         if not (kind == "symbol" and value in "+-"):
             raise words.fail("'+', '-' or the end")
+    if near is not None and friction is None:
+        raise ModelError(
+            f"equation {text!r}: Stribeck friction is what a body has near rest beyond the friction that it has at "
+            f"speed; write '- fc*sign(D {output})' beside it, or '- 0*sign(D {output})' where there is none"
+        )
+    if near is not None and friction is not None:
+        friction = replace(friction, more=near)
     return Equation(output, order, tuple(terms), friction or UNSET), offset, words
 
 
-def _parse_friction(words: _Words, sign: float) -> tuple[Friction, str] | None:
-    """``fc*sign(D y)`` with its signal; None where the term is another one."""
+def _parse_friction(words: _Words, sign: float) -> tuple[Friction | Stribeck, str] | None:
+    """``fc*sign(D y)`` or ``fs*exp(-(D y/vs)^2)*sign(D y)`` with its signal; None where the term is another one."""
     ahead = 0
     factor, coefficient = sign, 1.0
     named: str | None = None
     if words.peek(ahead)[0] == "number":
         coefficient = float(words.peek(ahead)[1])
         ahead += 1 + (words.peek(ahead + 1)[1] == "*")
-    if words.peek(ahead)[0] == "name" and words.peek(ahead)[1] not in ("D", "sign"):
+    if words.peek(ahead)[0] == "name" and words.peek(ahead)[1] not in ("D", "sign", "exp"):
         named = words.peek(ahead)[1]
         ahead += 1 + (words.peek(ahead + 1)[1] == "*")
-    if words.peek(ahead)[1] != "sign" or words.peek(ahead + 1)[1] != "(":
+    if words.peek(ahead)[1] not in ("sign", "exp") or words.peek(ahead + 1)[1] != "(":
         return None
-    words.position += ahead + 2
+    words.position += ahead
+    near: tuple[str, str | float] | None = None
+    if words.peek()[1] == "exp":
+        near = _parse_fall(words)
+        if words.peek()[1] == "*":
+            words.take()
+        if words.peek()[1] != "sign":
+            raise words.fail(f"sign(D {near[0]})")
+    words.take()
+    _expect(words, "(")
     if words.peek()[1] != "D" or words.peek(1)[0] != "name":
         raise words.fail("D and the name of a signal, as in sign(D y)")
     words.take()
     signal = words.take()[1]
-    if words.peek()[1] != ")":
-        raise words.fail("')'")
-    words.take()
-    if factor > 0:
+    _expect(words, ")")
+    if near is not None and near[0] != signal:
         raise ModelError(
-            f"equation {words.text!r}: friction takes energy, so it is subtracted: write '- fc*sign(D {signal})'"
+            f"equation {words.text!r}: Stribeck friction has the speed of {near[0]} and the sign of {signal}; it "
+            "follows one velocity"
         )
-    if named is not None:
-        return Friction(named, factor * coefficient), signal
-    return Friction(coefficient, factor), signal
+    if factor > 0:
+        shape = "fc*" if near is None else f"fs*exp(-(D {signal}/vs)^2)*"
+        raise ModelError(
+            f"equation {words.text!r}: friction takes energy, so it is subtracted: write '- {shape}sign(D {signal})'"
+        )
+    strength = (named, factor * coefficient) if named is not None else (coefficient, factor)
+    return (Friction(*strength) if near is None else Stribeck(strength[0], near[1], strength[1])), signal
+
+
+def _parse_fall(words: _Words) -> tuple[str, str | float]:
+    """``exp(-(D y/vs)^2)``: the signal, and the speed's name or value."""
+    words.take()
+    for symbol in "(-(":
+        _expect(words, symbol, "-(D y/vs)^2, as in exp(-(D y/vs)^2)")
+    if words.peek()[1] != "D" or words.peek(1)[0] != "name":
+        raise words.fail("D and the name of a signal, as in exp(-(D y/vs)^2)")
+    words.take()
+    signal = words.take()[1]
+    _expect(words, "/")
+    kind, value, _ = words.peek()
+    if kind not in ("name", "number"):
+        raise words.fail("a speed, its name or a positive number")
+    words.take()
+    for symbol in (")", "^", "2", ")"):
+        _expect(words, symbol, f"'{symbol}', as in exp(-(D y/vs)^2)")
+    return signal, float(value) if kind == "number" else value
+
+
+def _expect(words: _Words, symbol: str, wanted: str | None = None) -> None:
+    """Take what stands next, which is this."""
+    if words.peek()[1] != symbol:
+        raise words.fail(wanted or f"'{symbol}'")
+    words.take()
 
 
 def _is_offset(words: _Words) -> bool:

@@ -28,8 +28,8 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Orders and coefficients by name as they were estimated, and their standard errors where there are any.
     covariance
         Of every number of the model in the order of its equations (alpha, then order and coefficient of each term, then
-        the coefficient of friction where there is some); None where the estimator gives none. It may be singular: laws
-        tie numbers.
+        the coefficient of friction where there is some, with those of Stribeck's term fc, fs and vs); None where the
+        estimator gives none. It may be singular: laws tie numbers.
     fit
         Fit of the free run on these runs in percent, by output.
     information
@@ -83,8 +83,9 @@ class Solved:
     def coefficients(self) -> dict[str, float]:
         """Coefficients by name."""
         named = {t.name: float(t.coefficient) for e in self.equations for t in e.terms if t.name is not None}
-        rubs = [e.friction for e in self.equations if e.friction is not None]
-        return named | {f.name: float(f.coefficient) for f in rubs if f.name is not None}
+        for item in self.equations:
+            named |= {} if item.friction is None else item.friction.found
+        return named
 
     @property
     def equations(self) -> tuple[Equation, ...]:

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 
 from ftlm.base.errors import DataError, FtlmError
 from ftlm.base.statistics import noise_of
-from ftlm.data.equations import Friction, Term
+from ftlm.data.equations import Friction, Stribeck, Term
 from ftlm.data.orders import Order
 from ftlm.data.readings import read
 from ftlm.data.run import Run
@@ -24,6 +24,9 @@ from ftlm.solve.records import COULOMB
 SHARES = (0.01, 0.05, 0.2, 0.5)
 #: The same as shares of what the measured sign of the velocity says.
 MULTIPLES = (1.0, 0.3)
+#: Stribeck friction at a start as shares of Coulomb's, and its speed as shares of that of the body.
+NEAR = (0.02, 0.2, 1.0)
+FALLS = (0.05, 0.2, 0.6)
 #: A body that moves by less than this many deviations of its noise, peak to peak, has not moved.
 STILL = 10.0
 
@@ -34,7 +37,8 @@ def race_with_friction(
     """Coarse fits of a body with friction, best first, every output weighing alike.
 
     The sign of the measured velocity makes the equation linear; where the body rests it is noise, and so are its
-    numbers, but they are near enough. Beside them stand those without friction, with some of it put in.
+    numbers, but they are near enough. Beside them stand those without friction, with some of it put in. Friction that
+    falls with speed starts where friction that does not ends, with some more of it near rest.
     """
     problem, runs = alike.problem, alike.runs
     structure = problem.structure
@@ -42,13 +46,25 @@ def race_with_friction(
     rubs = structure.equations[0].friction
     if rubs is None:
         return race(alike, floor, threads, progress)
-    signed = with_measured_sign(structure, rubs)
-    reached = race(replace(alike, problem=FreeProblem.of(signed)), floor, threads, progress)
     coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
     starts: list[Attempt] = []
+    if rubs.stribeck is not None:
+        less = FreeProblem.of(with_friction(structure, replace(rubs, more=UNSET)))
+        reached = race_with_friction(replace(alike, problem=less), floor, threads, progress)
+        for attempt in reached[:FINALISTS]:
+            values = dict(zip(less.names, attempt.values.tolist(), strict=True))
+            starts += falling(coarse, values, rubs.stribeck, attempt.origin)
+        return raced(coarse, starts, threads)
+    signed = with_measured_sign(structure, rubs)
+    reached = race(replace(alike, problem=FreeProblem.of(signed)), floor, threads, progress)
     for attempt in reached[:FINALISTS]:
         values = dict(zip(FreeProblem.of(signed).names, attempt.values.tolist(), strict=True))
         starts += started(coarse, values, rubs, attempt.origin)
+    return raced(coarse, starts, threads)
+
+
+def raced(coarse: Grid, starts: list[Attempt], threads: int) -> list[Attempt]:
+    """Where starts get on coarse grids, best first."""
     laps = Laps(len(starts), threads, None)
     ended = laps.run(coarse, starts, FIRST_LAP)
     while coarse.every < FINEST and not ended:
@@ -67,6 +83,11 @@ def check_moves(runs: Sequence[Run], structure: Structure) -> None:
         )
 
 
+def with_friction(structure: Structure, rubs: Friction | UnsetType) -> Structure:
+    """The structure with other friction, or none."""
+    return replace(structure, equations=(replace(structure.equations[0], coulomb=rubs),))
+
+
 def with_measured_sign(structure: Structure, rubs: Friction) -> Structure:
     """The structure with the sign of the measured velocity as a signal in the place of friction."""
     item = structure.equations[0]
@@ -83,8 +104,7 @@ def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str)
     said = values[name] if values[name] > 0 else 0.0
     strengths = [(m * said, f"{m:g} of the measured sign") for m in MULTIPLES if said > 0]
     out = [at(problem, {**values, name: v}, f"{origin}, friction {words}") for v, words in strengths]
-    item = problem.structure.equations[0]
-    plain = replace(problem.structure, equations=(replace(item, coulomb=UNSET),))
+    plain = with_friction(problem.structure, UNSET)
     linear = FreeProblem.of(plain)
     try:
         without = replace(coarse, problem=linear).descend(at(linear, values, origin), FIRST_LAP)
@@ -97,6 +117,37 @@ def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str)
         strength = share * force / -rubs.factor
         out.append(at(problem, {**values, name: strength}, f"{origin}, friction {share:g} of what drives"))
     return out
+
+
+def falling(coarse: Grid, values: dict[str, float], more: Stribeck, origin: str) -> list[Attempt]:
+    """Starts at numbers of a fit with Coulomb friction alone, with some more of it at low speeds."""
+    problem = coarse.problem
+    rubs = problem.structure.equations[0].friction
+    fc = (
+        abs(rubs.factor) * values.get(str(rubs.coefficient), 0.0) if rubs is not None and rubs.strength is None else 0.0
+    )
+    fc = fc or (0.0 if rubs is None else rubs.strength or 0.0)
+    plain = with_friction(problem.structure, UNSET)
+    size = fc or driving(coarse.runs, plain.with_coefficients({n: values[n] for n in plain.coefficient_names}))
+    pace = speed_of(coarse)
+    forces = (
+        [(NEAR[0], None)] if not isinstance(more.coefficient, str) else [(n, n * size / -more.factor) for n in NEAR]
+    )
+    speeds = [(FALLS[0], None)] if not isinstance(more.speed, str) else [(f, f * pace) for f in FALLS]
+    out = []
+    for near, force in forces:
+        for fall, speed in speeds:
+            known = {str(more.coefficient): force, str(more.speed): speed}
+            here = values | {n: v for n, v in known.items() if v is not None}
+            out.append(at(problem, here, f"{origin}, Stribeck {near:g} of Coulomb below {fall:g} of the speed"))
+    return out
+
+
+def speed_of(coarse: Grid) -> float:
+    """Root mean square of the body's measured speed, over intervals that noise does not fill."""
+    output = coarse.problem.structure.outputs[0]
+    parts = [np.diff(read(run[output])[:: coarse.decimation]) / (run.step * coarse.decimation) for run in coarse.runs]
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
 def at(problem: FreeProblem, values: dict[str, float], origin: str) -> Attempt:

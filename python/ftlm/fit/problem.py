@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.arrays import Floats
+from ftlm.data.equations import Friction, Stribeck
 from ftlm.data.limits import FreeInput
 from ftlm.data.orders import MAX_ORDER, SEARCHED_ORDER, Order
 from ftlm.data.structures import Hints, Structure
@@ -84,8 +85,12 @@ class FreeProblem:
             f for _, factors in self.products.values() for f in factors if f not in named and self._exceeds(f) == 1
         }
 
+        more = [e.friction.stribeck for e in self.structure.equations if e.friction is not None]
+        speeds = {s.speed for s in more if s is not None}
+
         def coordinate(name: str, value: float) -> str:
-            if plain or value == 0:
+            # A speed is positive, wherever it goes.
+            if (plain or value == 0) and name not in speeds:
                 return "plain"
             return "excess" if name in ratios and value > self._exceeds(name) == 1 else "logarithm"
 
@@ -110,14 +115,18 @@ class FreeProblem:
             for e in self.structure.equations
         ]  # fmt: skip
 
-    def strength(self) -> tuple[float, list[tuple[int, int]]]:
-        """What friction of the only equation holds at most, as a monomial in the free coefficients."""
-        rubs = self.structure.equations[0].friction
-        if rubs is None:
-            return 0.0, []
-        if isinstance(rubs.coefficient, str):
-            return -rubs.factor, [(self.coefficients.index(rubs.coefficient), 1)]
-        return float(rubs.strength or 0.0), []
+    def strength(self) -> list[tuple[float, list[tuple[int, int]]]]:
+        """Numbers fc, fs and vs of the friction of the only equation, as monomials in the free coefficients."""
+        rubs = self.structure.equations[0].friction or Friction(0.0)
+        more = rubs.stribeck or Stribeck(0.0, 1.0)
+
+        def monomial(coefficient: str | float, factor: float) -> tuple[float, list[tuple[int, int]]]:
+            if isinstance(coefficient, str):
+                return factor, [(self.coefficients.index(coefficient), 1)]
+            return factor * coefficient, []
+
+        numbers = [(rubs.coefficient, -rubs.factor), (more.coefficient, -more.factor), (more.speed, 1.0)]
+        return [monomial(coefficient, factor) for coefficient, factor in numbers]
 
     def named(self, values: Sequence[float]) -> dict[str, float]:
         """Every coefficient of the structure by name from the free ones."""
@@ -132,7 +141,7 @@ class FreeProblem:
         """Derivatives of a model's numbers (rows) with respect to everything that is free (columns).
 
         Rows are, equation by equation, alpha, then order and coefficient of each term, then the coefficient of friction
-        where there is some; numbers of inputs are none of them.
+        where there is some (of Stribeck's term after it fs and vs); numbers of inputs are none of them.
         """
         free = dict(zip(self.coefficients, coefficients, strict=True))
         count, idle = len(self.orders), len(self.inputs)
@@ -151,10 +160,12 @@ class FreeProblem:
                         others = [free[f] for j, f in enumerate(factors) if j != k]
                         row[count + list(free).index(name)] += term.factor * sign * math.prod(others)
                 rows += [of_order(term.order), row]
-            if item.friction is not None:
+            rubs, more = item.friction, None if item.friction is None else item.friction.stribeck
+            numbers = [] if rubs is None else [rubs.coefficient]
+            for number in numbers + ([] if more is None else [more.coefficient, more.speed]):
                 row = np.zeros(count + len(free) + idle)
-                if isinstance(item.friction.coefficient, str):
-                    row[count + list(free).index(item.friction.coefficient)] = 1.0
+                if isinstance(number, str):
+                    row[count + list(free).index(number)] = 1.0
                 rows.append(row)
         return np.stack(rows)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -13,7 +13,7 @@ from msgspec import UNSET, UnsetType
 
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import write_atomically
-from ftlm.data.equations import Equation, Friction, Term
+from ftlm.data.equations import Equation, Friction, Stribeck, Term
 from ftlm.data.limits import Limit, LimitLaw
 from ftlm.data.orders import Order
 from ftlm.data.solved import Estimate, Solved
@@ -22,9 +22,9 @@ from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
 #: Largest model file read: a model is a few kilobytes.
 MAX_MODEL_BYTES = 1 << 20
 #: Schema of a model that every version since the first reads, of one that has an offset, of one that has intervals by
-#: profile likelihood or whose sensor filter names what is no output, of one that has friction, and of
-#: one whose inputs have limits.
-SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA = 2, 3, 4, 5, 6
+#: profile likelihood or whose sensor filter names what is no output, of one that has friction, of
+#: one whose inputs have limits, and of one whose friction falls with speed.
+SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA, STRIBECK_SCHEMA = 2, 3, 4, 5, 6, 7
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -37,12 +37,43 @@ class TermFile(msgspec.Struct, forbid_unknown_fields=True):
     name: str | None = None
 
 
+class StribeckFile(msgspec.Struct, forbid_unknown_fields=True):
+    """What friction has more near rest: coefficient is its number without the factor, speed that at which it falls."""
+
+    coefficient: float
+    speed: float
+    factor: float = -1.0
+    name: str | None = None
+    speed_name: str | None = None
+
+
 class FrictionFile(msgspec.Struct, forbid_unknown_fields=True):
-    """Coulomb friction of an equation's own output: coefficient is its number without the factor."""
+    """Friction of an equation's own output: coefficient is Coulomb's number without the factor."""
 
     coefficient: float
     factor: float = -1.0
     name: str | None = None
+    stribeck: StribeckFile | UnsetType = UNSET
+
+    @classmethod
+    def of(cls, rubs: Friction) -> FrictionFile:
+        """Write friction."""
+        out, near = cls(float(rubs.coefficient), rubs.factor, rubs.name), rubs.stribeck
+        if near is not None:
+            more = StribeckFile(float(near.coefficient), float(near.speed), near.factor, near.name, near.speed_name)
+            out.stribeck = more
+        return out
+
+    def friction(self) -> Friction:
+        """Give the friction back."""
+        s = self.stribeck
+        near = UNSET if s is UNSET else Stribeck(s.coefficient, s.speed, s.factor, s.name, s.speed_name)
+        return Friction(self.coefficient, self.factor, self.name, near)
+
+    @property
+    def count(self) -> int:
+        """Numbers of it."""
+        return 1 if self.stribeck is UNSET else 3
 
 
 class LimitFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -65,16 +96,26 @@ class EquationFile(msgspec.Struct, forbid_unknown_fields=True):
     def of(cls, item: Equation) -> EquationFile:
         """Write an equation."""
         terms = [TermFile(t.signal, t.order.constant, float(t.coefficient), t.factor, t.name) for t in item.terms]
-        rubs = item.friction
-        friction = UNSET if rubs is None else FrictionFile(float(rubs.coefficient), rubs.factor, rubs.name)
+        friction = UNSET if item.friction is None else FrictionFile.of(item.friction)
         return cls(item.output, item.order.constant, terms, friction)
 
     def equation(self) -> Equation:
         """Give the equation back."""
         terms = tuple(Term(t.signal, Order(t.order), t.coefficient, t.factor, t.name) for t in self.terms)
-        rubs = self.friction
-        coulomb = UNSET if rubs is UNSET else Friction(rubs.coefficient, rubs.factor, rubs.name)
-        return Equation(self.output, Order(self.order), terms, coulomb)
+        rubs = UNSET if self.friction is UNSET else self.friction.friction()
+        return Equation(self.output, Order(self.order), terms, rubs)
+
+    @property
+    def count(self) -> int:
+        """Numbers of it, as a covariance has them."""
+        return 1 + 2 * len(self.terms) + (0 if self.friction is UNSET else self.friction.count)
+
+    @property
+    def friction_schema(self) -> int:
+        """Schema that its friction needs."""
+        if self.friction is UNSET:
+            return SCHEMA
+        return FRICTION_SCHEMA if self.friction.stribeck is UNSET else STRIBECK_SCHEMA
 
 
 class FilterFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -138,11 +179,10 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         sensor = FilterFile.of(s)
         known = [(limit, limit.value) for limit in s.limits]
         limits = [LimitFile(limit.signal, limit.law, v) for limit, v in known if not isinstance(v, tuple)] or UNSET
-        least = FRICTION_SCHEMA if s.has_friction else schema_of(offset, sensor, model.estimate)
+        equations = [EquationFile.of(e) for e in s.equations]
         return cls(
-            "ftlm-model", least if limits is UNSET else LIMIT_SCHEMA, s.name,
-            [EquationFile.of(e) for e in s.equations], s.coupling, dict(s.delay),
-            s.initial if isinstance(s.initial, str) else list(s.initial), sensor, dict(model.units),
+            "ftlm-model", schema_of(equations, limits, offset, sensor, model.estimate), s.name, equations, s.coupling,
+            dict(s.delay), s.initial if isinstance(s.initial, str) else list(s.initial), sensor, dict(model.units),
             dict(model.orders), model.m, dict(model.about), model.estimate, offset, limits,
         )  # fmt: skip
 
@@ -163,19 +203,24 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
             limited=UNSET if self.limits is UNSET else tuple(Limit(x.signal, x.law, x.value) for x in self.limits),
         )  # fmt: skip
         if self.estimate is not None and self.estimate.covariance is not None:
-            count = sum(1 + 2 * len(e.terms) + (e.friction is not UNSET) for e in self.equations)
+            count = sum(e.count for e in self.equations)
             rows = self.estimate.covariance
             if len(rows) != count or any(len(row) != count for row in rows):
                 raise ModelError(f"its covariance is not of {count} by {count} numbers, as its equations need")
         return Solved(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 
-def schema_of(offset: Offset | UnsetType, sensor: FilterFile | None, estimate: Estimate | None) -> int:
+def schema_of(
+    equations: Sequence[EquationFile], limits: list[LimitFile] | UnsetType, offset: Offset | UnsetType,
+    sensor: FilterFile | None, estimate: Estimate | None,
+) -> int:  # fmt: skip
     """Schema of a model: the least that has all of it, so that what has less is as it was."""
     profiled = estimate is not None and estimate.intervals is not UNSET
-    if profiled or (sensor is not None and not isinstance(sensor.signals, UnsetType)):
-        return PROFILE_SCHEMA
-    return SCHEMA if isinstance(offset, UnsetType) else OFFSET_SCHEMA
+    named = sensor is not None and not isinstance(sensor.signals, UnsetType)
+    return max(
+        SCHEMA if isinstance(offset, UnsetType) else OFFSET_SCHEMA, PROFILE_SCHEMA if profiled or named else SCHEMA,
+        SCHEMA if isinstance(limits, UnsetType) else LIMIT_SCHEMA, *(e.friction_schema for e in equations),
+    )  # fmt: skip
 
 
 def write_model(model: Solved, path: str | os.PathLike[str], *, force: bool) -> Path:
@@ -202,14 +247,7 @@ def read_model(path: str | os.PathLike[str]) -> Solved:
         raise
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
-    rubs = any(e.friction is not UNSET for e in read.equations)
-    latest = (
-        LIMIT_SCHEMA
-        if read.limits is not UNSET
-        else FRICTION_SCHEMA
-        if rubs
-        else schema_of(read.offset, read.sensor_filter, read.estimate)
-    )
+    latest = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)
     if read.schema > latest or read.schema < 1:
         raise DataError(f"{file} has schema {read.schema}, this version reads up to {latest}; upgrade ftlm")
     try:

@@ -22,6 +22,9 @@ ORDER_DECIMALS = 4
 THIN = Markup('<mspace width="0.17em"></mspace>')  # our constant
 _LATE = Markup("<mrow><mo>(</mo><mi>t</mi><mo>−</mo>{}{}<mi>s</mi><mo>)</mo></mrow>")
 _LIMITED = Markup("<mrow><mi>{}</mi><mo>(</mo>{}<mo>,</mo>{}<mo>)</mo></mrow>")
+_FALL = Markup(
+    "<msup><mi>e</mi><mrow><mo>−</mo><msup><mrow><mo>(</mo>{}<mo>/</mo>{}<mo>)</mo></mrow><mn>2</mn></msup></mrow></msup>"
+)
 _PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
@@ -47,9 +50,13 @@ def equation_html(item: Equation, delay: Mapping[str, float] | None = None, limi
                            _derivative_math(term.order, term.signal, (delay or {}).get(term.signal, 0.0), limits),
                            "term"))  # fmt: skip
     if item.friction is not None:
-        rubs = Markup('<mo form="infix">−</mo>') + _number_math(item.friction.strength or 0.0) + THIN
-        velocity = Markup("<mi>sgn</mi><mo>(</mo>") + _derivative_math(Order(1.0), item.output) + Markup("<mo>)</mo>")
-        parts.append(_math(rubs + velocity, "term"))
+        fc, fs, vs = item.friction.law
+        speed = _derivative_math(Order(1.0), item.output)
+        minus, sign = Markup('<mo form="infix">−</mo>'), Markup("<mi>sgn</mi><mo>(</mo>{}<mo>)</mo>").format(speed)
+        parts.append(_math(minus + _number_math(fc) + THIN + sign, "term"))
+        if item.friction.stribeck is not None:
+            fall = _FALL.format(speed, _number_math(vs))
+            parts.append(_math(minus + _number_math(fs) + THIN + fall + THIN + sign, "term"))
     return Markup('<span class="equation">{}</span>').format(Markup(" ").join(parts))
 
 
@@ -152,11 +159,15 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
             shown.add(term.name)
             # + 0.0 makes the negative zero of a product of signs a plain zero.
             rows.append(row(term.name, float(term.coefficient), None if stated is None else stated + 0.0, place))
-        if item.friction is not None and item.friction.name is not None:
-            name = item.friction.name
-            shown.add(name)
-            place = Markup("Coulomb friction in the equation of {}").format(symbol_html(item.output))
-            rows.append(row(name, float(item.friction.coefficient), reference.get(name), place))
+        if item.friction is not None:
+            near = item.friction.stribeck
+            of = {item.friction.name: "Coulomb friction"}
+            if near is not None:
+                of |= {near.name: "Stribeck friction, beyond Coulomb's at rest,", near.speed_name: "Stribeck's speed"}
+            for name, value in item.friction.found.items():
+                shown.add(name)
+                place = Markup("{} in the equation of {}").format(of[name], symbol_html(item.output))
+                rows.append(row(name, value, reference.get(name), place))
     inputs = {input_name("delay", n): (f"delay of {symbol(n)} in s", v) for n, v in model.structure.delay.items()}
     for limit in model.structure.limits:
         if not isinstance(limit.value, tuple):
@@ -188,5 +199,5 @@ def model_html(model: Solved) -> str:
         Markup("<p>{}</p>").format(equation_html(e, model.structure.delay, model.structure.limits))
         for e in model.equations
     )
-    known = model.orders or any(t.name for e in model.equations for t in e.terms)
+    known = model.orders or model.coefficients
     return str(lines + parameter_table(model).to_html() if known else lines)

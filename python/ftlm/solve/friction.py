@@ -9,7 +9,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import ModelError
-from ftlm.data.equations import Equation
+from ftlm.data.equations import Equation, Friction
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.solve.instants import has_own_times
@@ -26,10 +26,11 @@ def motion_with_friction(item: Equation, rec: Record, powers: list[tuple[float, 
     Returns
     -------
     dict
-        ``output`` (pulse means), ``velocity`` (at the edges of the pulses, one more; exactly 0 at rest), ``sign`` (mean
-        of the friction's sign over each pulse) and ``stuck`` (whether the body is at rest at the end of each).
+        ``output`` (pulse means), ``velocity`` (at the edges of the pulses, one more; exactly 0 at rest), ``force``
+        (mean of the friction over each pulse, in the unit of D^alpha y) and ``stuck`` (whether the body is at rest at
+        the end of each).
     """
-    strength = 0.0 if item.friction is None else float(item.friction.strength or 0.0)
+    strength = (item.friction or Friction(0.0)).law
     coefficients = [float(t.fixed or 0.0) for t in item.terms]
     return _core.friction_respond(rec.core(), linear_tuple(item, rec.signals), coefficients, strength, powers)
 
@@ -62,9 +63,9 @@ def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | 
         output, (alpha, []),
         [(s, (order, []), (float(t.fixed or 0.0), [])) for (s, order), t in zip(terms, item.terms, strict=True)],
     )  # fmt: skip
-    strength = 0.0 if item.friction is None else float(item.friction.strength or 0.0)
+    strength: list[tuple[float, list[Any]]] = [(x, []) for x in (item.friction or Friction(0.0)).law]
     return _core.friction_error(
-        [experiment], law, (strength, []), [], [], initial_tuple(rec.initial, rec.offset), [], [], [],
+        [experiment], law, strength, [], [], initial_tuple(rec.initial, rec.offset), [], [], [],
         [] if near is None else [near], EVALUATIONS, STILL,
     )  # fmt: skip
 
