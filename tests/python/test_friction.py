@@ -210,8 +210,8 @@ def test_derivatives_are_those_of_finite_differences(orders) -> None:
 
     def at(point):
         return _core.friction_error(
-            runs, law, [(1.0, [(2, 1)]), (0.0, []), (1.0, [])], [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 3, (True, [], 1), list(point[:2]),
-            list(point[2:5]), [], [list(point[5:8]), list(point[8:])], 1, 1e-9,
+            runs, law, [(1.0, [(2, 1)]), (0.0, []), (1.0, [])], [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 3,
+            (True, [], 1), list(point[:2]), list(point[2:5]), [], [list(point[5:8]), list(point[8:])], 1, 1e-9,
         )  # fmt: skip
 
     point = np.array([*orders, 0.7, 1.1, 0.9, 0.1, 0.2, 0.05, -0.2, 0.4, -0.1])

@@ -366,10 +366,13 @@ def _excitation(run: Measured, inputs: list[str]) -> Iterator[Finding]:
 def excitation_for(run: Measured, structure: Structure) -> Iterator[Finding]:
     """Whether the inputs have lines enough for the free numbers of each equation.
 
-    In steady state a spectral line tells two numbers of every output that it reaches, a constant level one.
+    In steady state a spectral line tells two numbers of every output that it reaches, a constant level one. What sticks
+    answers a line with others, so that lines do not count what it tells.
     """
     run = run.bridged()
     for item in structure.equations:
+        if item.friction is not None:
+            continue
         inputs = [s for s in item.signals if s in run.inputs]
         # What is measured of the other outputs drives the equation, too.
         if structure.coupling == "measured":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -43,9 +44,20 @@ class FreeProblem:
 
     @property
     def all_bounds(self) -> list[tuple[float, float]]:
-        """Bounds of everything that is free; those of coefficients are infinite."""
+        """Bounds of everything that is free; those of coefficients are infinite, but friction takes energy."""
         ends = [item.bounds for item in self.inputs]
-        return [*self.bounds, *[(-math.inf, math.inf)] * len(self.coefficients), *ends]
+        least = {n: 0.0 for f in self._rubs for n in f.names} | {n: sys.float_info.min for n in self._speeds}
+        return [*self.bounds, *((least.get(n, -math.inf), math.inf) for n in self.coefficients), *ends]
+
+    @property
+    def _rubs(self) -> list[Friction]:
+        """Friction of the equations that have some."""
+        return [item.friction for item in self.structure.equations if item.friction is not None]
+
+    @property
+    def _speeds(self) -> set[str]:
+        """Free speeds at which friction falls."""
+        return {f.stribeck.speed for f in self._rubs if f.stribeck is not None and isinstance(f.stribeck.speed, str)}
 
     def split(self, values: Sequence[float]) -> tuple[list[float], list[float], list[float]]:
         """Values of orders, coefficients and numbers of inputs."""
@@ -85,8 +97,7 @@ class FreeProblem:
             f for _, factors in self.products.values() for f in factors if f not in named and self._exceeds(f) == 1
         }
 
-        more = [e.friction.stribeck for e in self.structure.equations if e.friction is not None]
-        speeds = {s.speed for s in more if s is not None}
+        speeds = self._speeds
 
         def coordinate(name: str, value: float) -> str:
             # A speed is positive, wherever it goes.

@@ -24,7 +24,7 @@ from ftlm.identification.judged import Task
 from ftlm.identification.offsets import with_decided_offset
 from ftlm.identification.reference import by_reference, driven_by
 from ftlm.identification.result import Identification
-from ftlm.identification.warnings import discretisation, growing, one_sided, unexcited
+from ftlm.identification.warnings import discretisation, growing, one_sided, unexcited, unslowed
 from ftlm.judge.comparison import Comparison, compared_samples, free_runs
 from ftlm.judge.criteria import InformationCriteria, information_criteria
 from ftlm.judge.metrics import finite
@@ -213,7 +213,9 @@ def judged(fit: Fit) -> Identification:
     comparison = compared_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
     warnings = [*comparison.warnings, *fit.warnings]
     warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings] + unexcited(runs, fit.task.structure)
-    warnings += discretisation(model, comparison) + growing(model) + one_sided(model, free)
+    warnings += (
+        discretisation(model, comparison) + growing(model) + one_sided(model, free) + unslowed(model, runs, free)
+    )
     tests, criteria = None, None
     try:
         tests = tested_residuals(model, runs, free, lags=LAGS)

@@ -41,6 +41,8 @@ COARSE = 2.0
 ROUNDED = 0.01
 #: Share of its range by which an output must move within a sample to count as moving.
 TURNED = 1e-6
+#: Fewer intervals than this in which a body moves at less than so many times vs tell nothing of how friction falls.
+FEWEST_SLOW, SLOW = 5, 2.0
 #: Two coefficients further apart than this share do not obey the coefficient law.
 LAW_BROKEN = 0.05
 
@@ -290,6 +292,31 @@ def one_sided(model: Model, free: Sequence[Sampled]) -> list[str]:
         f"the velocity of {output} never changes its sign in a run: while it slides, friction is a constant like the "
         "offset, and only the rests tell them apart; add a run that moves both ways, or use offset='none'"
     ]
+
+
+def unslowed(model: Model, runs: Sequence[Run], free: Sequence[Sampled]) -> list[str]:
+    """Warn where no run tells what friction has near rest from what it has at speed."""
+    said = []
+    for item in model.equations:
+        near = None if item.friction is None else item.friction.stribeck
+        if near is None or (near.name is None and near.speed_name is None):
+            continue
+        vs, column = float(near.speed), model.outputs.index(item.output)
+        paces = [np.abs(np.diff(there.outputs[column])) / run.step for run, there in zip(runs, free, strict=True)]
+        pace = np.concatenate([p[p > TURNED * p.max(initial=0.0)] for p in paces])
+        slow = int(np.sum(pace < SLOW * vs))
+        if slow < FEWEST_SLOW:
+            said.append(
+                f"{item.output} moves at less than {SLOW:g} vs = {SLOW * vs:.3g} per s in {slow} of {pace.size} "
+                "intervals: nothing tells fs and vs, what is seen of friction is fc alone; add a run that creeps, or "
+                "leave the Stribeck term out"
+            )
+        elif pace.max(initial=0.0) < vs:
+            said.append(
+                f"{item.output} never moves faster than vs = {vs:.3g} per s: what is seen of friction is fc and fs "
+                "together; add a run that slides faster, or leave the Stribeck term out"
+            )
+    return said
 
 
 def growing(model: Model) -> list[str]:
