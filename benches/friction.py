@@ -1,7 +1,8 @@
 """A body that sticks, measured: recovery with intervals, cost of a free run, hubs of real arms.
 
-``python benches/friction.py recovery [--seeds 20]``, ``speed``, ``measured``. Truth of the recovery is a cart in closed
-form between its events (tests/python/friction.py) with offsets a run; the real runs are those of ``FTLM_DATA``.
+``python benches/friction.py recovery [--seeds 20]``, ``stribeck [--seeds 20]``, ``speed``, ``measured``,
+``measured-stribeck``. Truth of the recovery is a cart in closed form between its events (tests/python/friction.py) with
+offsets a run, that of ``stribeck`` a sledge on a spring that sticks and slips; real runs are those of ``FTLM_DATA``.
 """
 
 from __future__ import annotations
@@ -28,6 +29,9 @@ CART = "D^2 y = - v D y + g u - fc*sign(D y) + c"
 TRUTH = {"v": 1.0, "g": 1.0, "fc": 0.8, "alpha": 2.0}
 HUB = "D^2 theta11 = - v D theta11 + g {current} + k theta12{rubs} + c"
 RUBS = " - fc*sign(D theta11)"
+FALLS = " - fs*exp(-(D theta11/vs)^2)*sign(D theta11)"
+SLEDGE = "D^2 y = - v D y - k y + g u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)"
+STICKS = {"v": 0.5, "k": 4.0, "g": 4.0, "fc": 0.5, "fs": 0.5, "vs": 0.2}
 #: Steps that are fitted; the amplifier of the arm clips its command at a limit that the fit is left to find.
 FITTED = ("30", "20", "minus10", "minus20")
 JUDGED = ("10", "minus30", "0_return", "5", "minus5")
@@ -71,15 +75,49 @@ def recovery(seeds: int) -> None:
             )
 
 
+def sledge(seed: int, noise: float, rows: int = 601) -> ftlm.Run:
+    """A sledge on a spring that two slow sinusoids pull, between its events."""
+    rng = np.random.default_rng(seed)
+    times, phases = np.arange(rows) * 0.02, rng.uniform(0.0, 2.0 * np.pi, 2)
+
+    def pulled(t: Any) -> Any:
+        return 0.9 * np.sin(0.9 * t + phases[0]) + 0.35 * np.sin(2.3 * t + phases[1])
+
+    y, _ = friction.between_events(lambda t: 4.0 * pulled(t), times, 0.5, 0.5, more=0.5, speed=0.2, spring=4.0)
+    y += noise * np.std(y) * rng.standard_normal(rows)
+    return ftlm.Run.from_arrays(step=0.02, inputs={"u": pulled(times)}, outputs={"y": y}, intersample={"u": "foh"},
+                                name=f"sledge {seed}")  # fmt: skip
+
+
+def stribeck(seeds: int) -> None:
+    """Coverage of 95 % intervals of a body that sticks and slips, a run a fit."""
+    structure = ftlm.equation(SLEDGE, initial="rest")
+    for noise in (0.002, 0.005, 0.02):
+        scores, inside, taken = [], [], []
+        for seed in range(seeds):
+            run = sledge(seed, noise)
+            begun = time.process_time()
+            found = ftlm.identify(run, structure, threads=1)
+            taken.append(time.process_time() - begun)
+            scores.append([(found.coefficients[n] - v) / found.standard_errors[n] for n, v in STICKS.items()])
+            inside.append([found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in STICKS.items()])
+        z = np.array(scores)
+        counts = ", ".join(f"{n} {c}" for n, c in zip(STICKS, np.sum(inside, axis=0), strict=True))
+        mean = ", ".join(f"{v:+.2f}" for v in z.mean(axis=0))
+        print(f"| {noise:g} | {counts} of {seeds} | {mean} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
+              flush=True)  # fmt: skip
+
+
 def speed() -> None:
-    """A free run of order 1.8 with friction beside the linear one."""
+    """A free run of order 1.8 with friction, at one strength and falling, beside the linear one."""
     rng = np.random.default_rng(0)
     equation = (0, 1.8, [(0, 0.9), (1, 0.0)])
     for m in (1 << 11, 1 << 14, 1 << 17):
         record = (1e-3, np.stack([np.zeros(m), rng.normal(size=m)]), None)
         rubs = timed(partial(_core.friction_respond, record, equation, [-3.0, 1.0], (0.5, 0.0, 1.0), []))
+        falls = timed(partial(_core.friction_respond, record, equation, [-3.0, 1.0], (0.5, 0.3, 0.01), []))
         plain = timed(partial(_core.respond, record, [(equation, [-3.0, 1.0])], [False, True], [[]]))
-        print(f"| {m} | {1e3 * rubs:.1f} | {rubs / plain:.1f} |", flush=True)
+        print(f"| {m} | {1e3 * rubs:.1f} | {rubs / plain:.1f} | {falls / plain:.1f} |", flush=True)
 
 
 def timed(work: Any) -> float:
@@ -120,6 +158,22 @@ def measured() -> None:
                  steps)  # fmt: skip
 
 
+def measured_stribeck() -> None:
+    """The same hubs with friction that falls with speed, beside friction that does not."""
+    runs = {
+        "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", slice=(1.1, 19.5)),
+        "lqr": run_of(DATA / "two_link_lqr" / "lqr.csv", "Im1_meas_A", name="lqr"),
+    }
+    for words in (RUBS, RUBS + FALLS):
+        for run in runs.values():
+            told(ftlm.equation(HUB.format(current="I1", rubs=words), initial="caputo"), [run], runs)
+    steps = {n: run_of(DATA / "two_link_steps" / f"lqr_{n}.csv", "Im1_cmd_A", name=n) for n in (*FITTED, *JUDGED)}
+    for words in (RUBS, RUBS + FALLS):
+        told(
+            ftlm.equation(HUB.format(current=SATURATES, rubs=words), initial="caputo"), [steps[n] for n in SEEN], steps
+        )
+
+
 def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm.Run]) -> None:
     """Fit, print numbers with standard errors, and judge on every run."""
     begun = time.process_time()
@@ -129,6 +183,8 @@ def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm
     numbers = ", ".join(f"{n} {v:.4g} ± {found.standard_errors[n]:.2g}" for n, v in values.items())
     names = {run.name for run in fitted}
     print(f"{structure}: {numbers}; {taken:.2g} s", flush=True)
+    for warning in found.warnings:
+        print(f"    ! {warning}", flush=True)
     for name, run in runs.items():
         there = found.model.compare(run)
         print(f"    {name} {'fitted' if name in names else 'judged'}: {there.fit_percent['theta11']:.2f}, "
@@ -138,10 +194,13 @@ def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm
 def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("recovery", "speed", "measured"))
+    parser.add_argument("what", choices=("recovery", "stribeck", "speed", "measured", "measured-stribeck"))
     parser.add_argument("--seeds", type=int, default=20)
     asked = parser.parse_args()
-    {"recovery": lambda: recovery(asked.seeds), "speed": speed, "measured": measured}[asked.what]()
+    {
+        "recovery": lambda: recovery(asked.seeds), "stribeck": lambda: stribeck(asked.seeds), "speed": speed,
+        "measured": measured, "measured-stribeck": measured_stribeck,
+    }[asked.what]()  # fmt: skip
 
 
 if __name__ == "__main__":

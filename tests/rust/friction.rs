@@ -3,7 +3,7 @@
 use ftlm::equation::{AffineOrder, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimate::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
-use ftlm::friction::law::Phase;
+use ftlm::friction::law::{Moves, Phase};
 use ftlm::friction::march::March;
 use ftlm::friction::online::{Heads, Online};
 use ftlm::friction::{fit, Body, FreeLaw, FrictionModel, Law, Start};
@@ -53,6 +53,93 @@ fn a_march_obeys_its_law() {
             Phase::Turn => assert!(march.edges[k] * march.edges[k + 1] < 0.0),
         }
     }
+}
+
+/// The march of a law that falls with speed, and its plain sum over the past.
+#[test]
+fn a_march_that_falls_with_speed_obeys_its_law() {
+    let m = 2000;
+    let response: Vec<f64> = (0..m).map(|n| 0.01 * (-0.002 * n as f64).exp()).collect();
+    let linear = force(m);
+    let law = Law { coulomb: 1.0, stribeck: 1.5, speed: 0.05 };
+    let march = March::new(&linear, &Heads::new(&response), response[0], law, 0.0);
+    for phase in [Phase::Slip, Phase::Stick, Phase::Turn] {
+        assert!(march.phases.contains(&phase), "{phase:?}");
+    }
+    for k in 0..m {
+        let past: f64 = (0..=k).map(|j| response[k - j] * march.force[j]).sum();
+        let (v, end) = (march.edges[k], march.edges[k + 1]);
+        assert!((end - (linear[k] - past)).abs() < 1e-9, "{k}");
+        assert!(march.force[k].abs() <= law.breakaway() * (1.0 + 1e-9));
+        if march.phases[k] == Phase::Slip {
+            // The mean over a velocity that is linear in the pulse, by many points.
+            let mean = (0..2000).map(|i| {
+                let x: f64 = v + (end - v) * (f64::from(i) + 0.5) / 2000.0;
+                law.coulomb + law.stribeck * (-(x / law.speed).powi(2)).exp()
+            });
+            let side = if v == 0.0 { end.signum() } else { v.signum() };
+            assert!((march.force[k] - side * mean.sum::<f64>() / 2000.0).abs() < 1e-5, "{k}");
+        }
+    }
+}
+
+#[test]
+fn slopes_of_a_pulse_are_those_of_differences() {
+    let law = Law { coulomb: 0.4, stribeck: 0.7, speed: 0.3 };
+    // (velocity, free end, first number of the response): slips near and far, from rest, both ways; stops; turns.
+    let pulses = [
+        (0.5, 0.52, 0.05),
+        (0.2, 0.9, 0.3),
+        (-0.4, -0.41, 0.02),
+        (0.9, 0.5, 0.2),
+        (0.0, 0.5, 0.2),
+        (0.0, -0.3, 0.1),
+        (0.01, 0.0, 0.1),
+        (0.0, 0.05, 0.1),
+        (0.02, -0.4, 0.2),
+        (-0.05, 0.6, 0.3),
+    ];
+    let mut seen = Vec::new();
+    for (v, p, g) in pulses {
+        let at = law.pulse(v, p, g, 0.0);
+        seen.push(at.phase);
+        for moved in 0..6 {
+            // A body at rest leaves it with its force, not with its velocity.
+            if moved == 0 && v == 0.0 {
+                continue;
+            }
+            let mut unit = [0.0; 6];
+            unit[moved] = 1.0;
+            let near = |by: f64| {
+                let [dv, dp, dg, dc, ds, dw] = unit.map(|u| by * u);
+                let there = Law { coulomb: law.coulomb + dc, stribeck: law.stribeck + ds, speed: law.speed + dw };
+                there.pulse(v + dv, p + dp, g + dg, 0.0)
+            };
+            let (up, down) = (near(1e-6), near(-1e-6));
+            assert_eq!((up.phase, down.phase), (at.phase, at.phase));
+            let moves = Moves { start: unit[0], free: unit[1], first: unit[2], law: [unit[3], unit[4], unit[5]] };
+            let (force, end) = law.slope(v, p, g, &at, &moves);
+            assert!((force - (up.force - down.force) / 2e-6).abs() < 1e-6 * (1.0 + force.abs()), "{v} {p} {moved}");
+            assert!((end - (up.end - down.end) / 2e-6).abs() < 1e-6 * (1.0 + end.abs()), "{v} {p} {moved}");
+        }
+    }
+    for phase in [Phase::Slip, Phase::Stick, Phase::Turn] {
+        assert!(seen.contains(&phase), "{phase:?}");
+    }
+}
+
+#[test]
+fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
+    let record = Record::new(0.01, vec![vec![0.0; 50], vec![1.0; 50]], None)?;
+    for (stribeck, speed) in [(-0.1, 0.2), (0.1, 0.0), (0.1, -0.2)] {
+        let mut wrong = body(1.8, 0.5);
+        wrong.friction = Law { stribeck, speed, ..wrong.friction };
+        assert!(matches!(wrong.run(&record, &[]), Err(Error::OutOfRange { .. })));
+    }
+    let mut lost = body(1.8, 0.5);
+    lost.friction.speed = f64::NAN;
+    assert!(matches!(lost.run(&record, &[]), Err(Error::NotFinite { .. })));
+    Ok(())
 }
 
 #[test]
