@@ -61,7 +61,7 @@ fn a_march_that_falls_with_speed_obeys_its_law() {
     let m = 2000;
     let response: Vec<f64> = (0..m).map(|n| 0.01 * (-0.002 * n as f64).exp()).collect();
     let linear = force(m);
-    let law = Law { coulomb: 1.0, stribeck: 1.5, speed: 0.05 };
+    let law = Law { coulomb: 2.0, stribeck: 3.0, speed: 0.05 };
     let march = March::new(&linear, &Heads::new(&response), response[0], law, 0.0);
     for phase in [Phase::Slip, Phase::Stick, Phase::Turn] {
         assert!(march.phases.contains(&phase), "{phase:?}");
