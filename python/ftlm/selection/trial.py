@@ -168,6 +168,8 @@ class Trial:
         Whether it has a pole with a positive real part: within a run the inputs may hide what it does, later nothing.
     failed
         Why there are no figures; None where there are.
+    joint
+        The fit on all runs.
     """
 
     name: str
