@@ -55,6 +55,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             f"at {joint.refinement} pulses a sample the step still moves estimates by over a tenth of their standard "
             "errors: the model is stiffer than the sampling; sample faster or trust its fast poles less"
         )
+    warnings += _growth(joint)
     errors = joint.standard_errors
     unseen = [n for n in joint.names if math.isinf(errors[n])]
     if unseen:
@@ -95,6 +96,25 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             "standard errors allow for the colour, not for the bias of what is left out"
         )
     return warnings
+
+
+def _growth(joint: JointFit) -> list[str]:
+    """Say what was made of an optimum whose free run grows."""
+    if joint.growth is None:
+        return []
+    excess = 100.0 * joint.growth.excess
+    if not joint.growth.kept:
+        smaller = 100.0 * (1.0 - 1.0 / (1.0 + joint.growth.excess))
+        return [
+            f"an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the run "
+            "did before its start takes a growing mode away until its end; the stable one was kept"
+        ]
+    if not math.isfinite(excess):
+        return ["no stable optimum was found beside this one, whose free run grows"]
+    return [
+        f"the free run of this optimum grows; the best stable one found has residuals {excess:.2g} % larger, which the "
+        "runs refuse at 99 %: an unstable machine in a closed loop, or a term that is missing"
+    ]
 
 
 def _bounded(joint: JointFit, name: str) -> bool:
