@@ -44,10 +44,10 @@ class Growth:
 
 
 def can_grow(problem: FreeProblem) -> bool:
-    """Whether the free run of every equation stands alone, so that its own terms say whether it grows."""
+    """Whether own terms alone say that a free run grows, and initial terms may take away what it becomes."""
     structure = problem.structure
     alone = structure.coupling == "measured" or len(structure.equations) == 1
-    return alone and not structure.has_friction
+    return alone and not structure.has_friction and structure.initial != "rest"
 
 
 def grows(problem: FreeProblem, attempt: Attempt) -> bool:
