@@ -84,7 +84,8 @@ def test_a_steady_descent_stays_where_free_runs_die_away() -> None:
     free, kept = grid.descend(start, 60, plain=True), held.descend(start, 60, plain=True)
     assert grows(problem, free) and not grows(problem, kept)
     assert free.level < kept.level < held.descend(start, 1).level
-    assert not grows(problem, dissipative(problem, free))
+    turned, places = dissipative(problem, free)
+    assert not grows(problem, turned) and places == [1]
     assert forced(grid, free, kept)
     # From where it grows, it may leave.
     assert grows(problem, held.descend(free, 20, plain=True))

@@ -143,9 +143,9 @@ class Attempt:
 
 def descend(
     problem: FreeProblem, experiments: list[Any], attempt: Attempt, *, evaluations: int, plain: bool = False,
-    held: int | None = None, tolerance: float = TOLERANCE, steady: bool = False,
+    held: int | Sequence[int] = (), tolerance: float = TOLERANCE, steady: bool = False,
 ) -> Attempt:  # fmt: skip
-    """Levenberg-Marquardt from an attempt; one of the numbers, by its place, may be held where it is.
+    """Levenberg-Marquardt from an attempt; numbers, by their places, may be held where they are.
 
     A steady one goes from a free run that dies away to none that grows.
     """
@@ -153,10 +153,10 @@ def descend(
     states = structure.filter_states(structure.initial) if structure.behind_filter else 0
     coordinates = problem.coordinates(attempt.coefficients, plain=plain)
     bounds, ends = list(problem.bounds), [item.bounds for item in problem.inputs]
-    if held is not None:
-        coefficient = held - len(bounds)
+    for number in (held,) if isinstance(held, int) else held:
+        coefficient = number - len(bounds)
         if coefficient < 0:
-            bounds[held] = (attempt.orders[held],) * 2
+            bounds[number] = (attempt.orders[number],) * 2
         elif coefficient < len(coordinates):
             coordinates[coefficient] = "held"
         else:
@@ -227,7 +227,7 @@ class Grid:
         return replace(self, every=2 * self.every)
 
     def descend(
-        self, attempt: Attempt, evaluations: int, *, plain: bool = False, held: int | None = None,
+        self, attempt: Attempt, evaluations: int, *, plain: bool = False, held: int | Sequence[int] = (),
         tolerance: float = TOLERANCE,
     ) -> Attempt:  # fmt: skip
         """Levenberg-Marquardt from an attempt; see :func:`descend`."""

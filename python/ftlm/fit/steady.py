@@ -67,15 +67,22 @@ def grows(problem: FreeProblem, attempt: Attempt) -> bool:
     return False
 
 
-def dissipative(problem: FreeProblem, attempt: Attempt) -> Attempt:
-    """The point with own terms that all pull back: of orders up to 2 its free run dies away."""
-    own = {t.coefficient for e in problem.structure.equations for t in e.terms if t.signal == e.output}
-    factors = {t.coefficient: t.factor for e in problem.structure.equations for t in e.terms}
-    values = [
-        -abs(v) * math.copysign(1.0, factors[n]) if n in own else v
-        for n, v in zip(problem.coefficients, attempt.coefficients, strict=True)
-    ]
-    return replace(attempt, coefficients=values, origin=f"{attempt.origin}, all own terms pulling back")
+def dissipative(problem: FreeProblem, attempt: Attempt) -> tuple[Attempt, list[int]]:
+    """The point with own terms that all pull back, whose free run dies away up to order 2, and which of them turned.
+
+    Those are held where the rest follows first: released at once, what drives would be that of the growing optimum.
+    """
+    own = {
+        t.coefficient: t.factor for e in problem.structure.equations for t in e.terms
+        if t.signal == e.output and isinstance(t.coefficient, str)
+    }  # fmt: skip
+    turned = [
+        k for k, (n, v) in enumerate(zip(problem.coefficients, attempt.coefficients, strict=True))
+        if n in own and v * own[n] > 0.0
+    ]  # fmt: skip
+    values = [-v if k in turned else v for k, v in enumerate(attempt.coefficients)]
+    origin = f"{attempt.origin}, all own terms pulling back"
+    return replace(attempt, coefficients=values, origin=origin), [len(problem.orders) + k for k in turned]
 
 
 def steadied(best: Attempt, grid: Grid, reached: Sequence[Attempt]) -> tuple[Attempt, Grid, Growth | None]:
@@ -84,19 +91,21 @@ def steadied(best: Attempt, grid: Grid, reached: Sequence[Attempt]) -> tuple[Att
     if not grows(problem, best):
         return best, grid, None
     held = replace(grid, steady=True)
-    others = [a for a in reached if not grows(problem, a)][:LOOKED_AT]
+    starts: list[tuple[Attempt, list[int]]] = [(a, []) for a in reached if not grows(problem, a)]
     ends = []
-    for start in (*others, dissipative(problem, best)):
+    for start, turned in (*starts[:LOOKED_AT], dissipative(problem, best)):
         if grows(problem, start):
             continue
         try:
-            ends.append(held.descend(start, EVALUATIONS, plain=True))
+            near = held.descend(start, EVALUATIONS, plain=True, held=turned) if turned else start
+            ends.append(held.descend(near, EVALUATIONS, plain=True))
         except FtlmError:
             # No finite free run on this grid; the others have one.
             continue
     if not ends:
         return best, grid, Growth(kept=True, excess=math.inf)
-    other = held.finer.ranked(ends)[0]
+    # Where free runs begin to grow a descent stands at a wall, which is no optimum.
+    other = held.finer.ranked([a for a in ends if a.converged] or ends)[0]
     excess = math.sqrt(other.level / best.level) - 1.0 if best.level > 0 else math.inf
     if forced(grid, best, other):
         return best, grid, Growth(kept=True, excess=excess)
