@@ -10,6 +10,7 @@ from ftlm import _core
 from ftlm.cli.options import StructureOptions
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
+from ftlm.fit.simpler import whole
 from ftlm.fit.steady import dissipative, forced, grows
 from measured import DATA, needs_data
 
@@ -102,6 +103,27 @@ def arm_run(name: str, thin: int) -> ftlm.Run:
         step=thin * run.step, inputs={n: run[n][::thin] for n in run.inputs},
         outputs={n: run[n][::thin] for n in ANGLES}, units=run.units, name=name,
     )  # fmt: skip
+
+
+def test_whole_orders_are_where_fractional_ones_start() -> None:
+    link = StructureOptions().structure("arm:2")
+    (less,) = whole(FreeProblem.of(link), [0.31])
+    assert less.orders == (0.0,) and less.problem.orders == ()
+    at = less.embedded(Attempt([], [-400.0, -1.0, -2.0, -3.0, 0.1, 0.1], "x", {}), FreeProblem.of(link))
+    assert (at.orders, at.origin) == ([0.0], "x, from whole orders")
+    # Without a physics, those nearest to where the fit is; none that are out of bounds or make two terms one.
+    words = FreeProblem.of(ftlm.equation("D^alpha y = a D^nu y + b u"))
+    assert [w.orders for w in whole(words, [1.6, 0.7])] == [(2.0, 1.0)]
+    assert whole(words, [0.3, 0.2]) == [] and whole(words, [0.8, 0.7]) == []
+    assert whole(FreeProblem.of(ftlm.equation("D y = a y + b u")), []) == []
+
+
+def test_a_driven_link_has_its_spring_below_its_damper() -> None:
+    # Exchanged they were the same equation, and a fit ended at either.
+    link = FreeProblem.of(ftlm.flexible_link(stage=1, hub=False, laws=("orders", "coefficients", "velocities")))
+    assert dict(zip(link.orders, link.bounds, strict=True)) == {"beta2": (0.0, 0.5), "mu2": (0.5, 1.95)}
+    free = FreeProblem.of(ftlm.flexible_link(stage=1, laws=("orders", "coefficients", "velocities")))
+    assert dict(zip(free.orders, free.bounds, strict=True))["beta2"] == (0.0, 3.0)
 
 
 @needs_data

@@ -128,7 +128,8 @@ def unbounded_ends(joint: JointFit, unseen: Sequence[str]) -> list[str]:
         n: [s for s, end in (("below", p.low), ("above", p.high)) if math.isinf(end)]
         for n, p in joint.profiles.items() if n not in unseen
     }  # fmt: skip
-    words = [f"{n} {' or '.join(s)}" for n, s in sides.items() if s]
+    # An order that ends at 0 has nothing below it.
+    words = [f"{n} {' or '.join(s)}" for n, s in sides.items() if s and (s != ["below"] or joint.orders.get(n) != 0.0)]
     if not words:
         return []
     return [
