@@ -1,8 +1,8 @@
 """Optima whose free run grows: kept where the runs force them, not where one that dies away explains them as well.
 
 A run that starts in motion gives an equation initial terms of its own. They cost a growing mode nothing: fitted, they
-take away all that it becomes until the end of the run, and what is left runs backwards in time. Such an equation answers
-its inputs before they come, which no machine does, and where residuals are coloured it may well leave less.
+take away all that it becomes until the end of the run, and what is left runs backwards in time. Such an equation
+answers its inputs before they come, which no machine does, and where residuals are coloured it may well leave less.
 """
 
 from __future__ import annotations
@@ -37,10 +37,13 @@ class Growth:
         Whether the growing one is the fit's, because the runs force it or there was no other.
     excess
         Share by which residuals of the other one are larger (root mean square); infinite where there was none.
+    at_limit
+        Whether the other one stands where free runs begin to grow, no optimum of its own.
     """
 
     kept: bool
     excess: float
+    at_limit: bool = False
 
 
 def can_grow(problem: FreeProblem) -> bool:
@@ -109,7 +112,7 @@ def steadied(best: Attempt, grid: Grid, reached: Sequence[Attempt]) -> tuple[Att
     excess = math.sqrt(other.level / best.level) - 1.0 if best.level > 0 else math.inf
     if forced(grid, best, other):
         return best, grid, Growth(kept=True, excess=excess)
-    return other, held, Growth(kept=False, excess=excess)
+    return other, held, Growth(kept=False, excess=excess, at_limit=not other.converged)
 
 
 def forced(grid: Grid, best: Attempt, other: Attempt) -> bool:

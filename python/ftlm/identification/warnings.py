@@ -104,10 +104,12 @@ def _growth(joint: JointFit) -> list[str]:
         return []
     excess = 100.0 * joint.growth.excess
     if not joint.growth.kept:
+        limit = joint.growth.at_limit
         smaller = 100.0 * (1.0 - 1.0 / (1.0 + joint.growth.excess))
         return [
-            f"an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the run "
-            "did before its start takes a growing mode away until its end; the stable one was kept"
+            f"an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the "
+            "run did before its start takes a growing mode away until its end; the stable one was kept"
+            + (", which stands where free runs begin to grow: the runs do not tell its damping" if limit else "")
         ]
     if not math.isfinite(excess):
         return ["no stable optimum was found beside this one, whose free run grows"]

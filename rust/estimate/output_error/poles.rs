@@ -92,7 +92,13 @@ mod tests {
         for k in 0..200 {
             let c = -2.5 + 0.025 * f64::from(k);
             let disc = 0.25 * c * c - 1.0;
-            let angle = if disc < 0.0 { (-disc).sqrt().atan2(0.5 * c) } else if c > 0.0 { 0.0 } else { PI };
+            let angle = if disc < 0.0 {
+                (-disc).sqrt().atan2(0.5 * c)
+            } else if c > 0.0 {
+                0.0
+            } else {
+                PI
+            };
             if (angle - 0.3 * PI).abs() > 1e-3 {
                 assert_eq!(grows(1.2, &[(c, 0.6), (-1.0, 0.0)]), angle < 0.3 * PI, "c = {c}");
             }
