@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ftlm.base.errors import FtlmError
+from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.structures import History
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
@@ -89,7 +89,11 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
     others: list[Simpler | LowerOrder | Whole] = [*simpler(problem), *lower_orders(problem, runs)]
     others += whole(problem, reached[0].orders) if reached else []
     for less in others if reached else []:
-        runners = delayed_attempts(runs, less.problem, threads)
+        try:
+            runners = delayed_attempts(runs, less.problem, threads)
+        except ModelError:
+            # At whole orders two of its terms have become one.
+            continue
         if isinstance(less, Simpler) and less.driven:
             # Driven by the measurement, most starts lead to one optimum: those that are nearest already will do.
             runners = laps.run(coarse, runners, 1, less.problem)[:FEWEST]
