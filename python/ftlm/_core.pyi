@@ -31,6 +31,7 @@ __all__ = [
     "fractional_memory",
     "friction_error",
     "friction_respond",
+    "grows",
     "grunwald_letnikov_weights",
     "haar_inverse",
     "haar_matrix",
@@ -219,7 +220,9 @@ def output_error(
     inputs: Sequence[tuple[int, str, tuple[float, float], float]],
     evaluations: int,
     tolerance: float,
+    steady: bool = False,
 ) -> _Fit: ...
+def grows(alpha: float, own_terms: Sequence[tuple[float, float]]) -> bool: ...
 
 class _Motion(TypedDict):
     output: _Vector

@@ -216,6 +216,10 @@ pub(super) fn free_inputs(inputs: &[FreeInputArg]) -> PyResult<Vec<joint::FreeIn
 }
 
 #[pyfunction]
+#[pyo3(signature = (
+    runs, laws, order_bounds, coordinates, coupled, terms, start_orders, start_coefficients, inputs, evaluations, tolerance,
+    steady=false,
+))]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
 pub fn output_error<'py>(
     py: Python<'py>,
@@ -230,6 +234,7 @@ pub fn output_error<'py>(
     inputs: Vec<FreeInputArg>,
     evaluations: usize,
     tolerance: f64,
+    steady: bool,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
     let equations = laws.into_iter().map(free_equation).collect();
@@ -243,7 +248,8 @@ pub fn output_error<'py>(
     let model =
         joint::FreeModel { equations, order_bounds, coordinates, inputs: free, coupled, initial: initial(terms)? };
     let settings = joint::Settings { evaluations, tolerance };
-    let fit = detached(py, || joint::fit(&model, &experiments, &start, settings))?;
+    let fitted = if steady { joint::fit_steady } else { joint::fit };
+    let fit = detached(py, || fitted(&model, &experiments, &start, settings))?;
     let dict = PyDict::new(py);
     dict.set_item("orders", fit.point.orders)?;
     dict.set_item("coefficients", fit.point.coefficients)?;
@@ -256,6 +262,13 @@ pub fn output_error<'py>(
     dict.set_item("evaluations", fit.evaluations)?;
     dict.set_item("status", status(fit.status))?;
     Ok(dict)
+}
+
+/// Whether s^alpha less the own terms (coefficient, order) has a zero to the right of the imaginary axis, or on it.
+#[pyfunction]
+#[allow(clippy::needless_pass_by_value)]
+pub fn grows(py: Python<'_>, alpha: f64, own_terms: Vec<(f64, f64)>) -> PyResult<bool> {
+    detached(py, || Ok(joint::poles::grows(alpha, &own_terms)))
 }
 
 /// Recursion (44) on a stream of samples; see the module `estimate::streaming` of the core.

@@ -25,7 +25,7 @@ mod _core {
     };
 
     #[pymodule_export]
-    use super::estimate::{instrumental_variables, least_squares, multi_innovation, output_error, Streaming};
+    use super::estimate::{grows, instrumental_variables, least_squares, multi_innovation, output_error, Streaming};
 
     #[pymodule_export]
     use super::friction::{friction_error, friction_respond};

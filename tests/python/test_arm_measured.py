@@ -96,11 +96,13 @@ def test_the_second_link_is_the_same_machine_in_two_laboratories(runs) -> None:
     link = ftlm.flexible_link(stage=2, cross_stage="inertial", sensor_filter="stock").equation("theta22")
     link = link.with_orders({"beta4": 0.0, "gamma4": 2.0, "mu4": 1.0})
     assert link.sensor_filter.signals == ("theta12", "theta22")
-    for fitted, other, own, unseen in (("psf", "lqr", 91.0, 70.6), ("lqr", "psf", 84.2, 73.7)):
+    # On lqr a link that feeds energy, taken away by its initial terms, has 84.2 and 73.7: no more than chance.
+    for fitted, other, own, unseen in (("psf", "lqr", 91.0, 70.6), ("lqr", "psf", 83.6, 72.3)):
         found = ftlm.identify(runs[fitted], link, method="output-error")
         assert found.fit_percent["theta22"] == pytest.approx(own, abs=0.5)
         assert found.model.compare(runs[other]).fit_percent["theta22"] == pytest.approx(unseen, abs=0.5)
-        assert found.coefficients["p4"] == pytest.approx(-2.0, abs=0.1)
+        assert found.coefficients["p4"] == pytest.approx(-2.05, abs=0.12)
+        assert found.coefficients["d4"] < 0.0
 
 
 @pytest.mark.slow

@@ -363,3 +363,12 @@ def test_the_classic_data_sets_give_a_model_each(
     (fit,) = (figures["fit"] for figures in data["output_error"].values())
     assert fit > least
     assert ftlm.load_model(tmp_path / "m.json").outputs == tuple(data["output_error"])
+
+
+def test_an_equation_is_a_structure(folder: Path) -> None:
+    for words in (["--equation", EQUATION], [f"--equation={EQUATION}"]):
+        found = ftlm_command("identify", "square.csv", *words, cwd=folder)
+        assert found.returncode == 2
+        assert "No such option: --equation; --structure takes equations in words, too." in found.stderr
+    # Where there is no structure, it is as unknown as any other.
+    assert "No such option: --equation" in ftlm_command("doctor", "--equation", "x", cwd=folder).stderr

@@ -25,6 +25,8 @@ CROSS_ORDER = 0.0
 HIGHEST = (1.2, 2.0)
 #: Values beside the whole orders of a link's physics: damping on the rate or a little below, stiffness on the angle.
 NATURAL = {"alpha": (2.0,), "gamma": (0.9, 1.0), "beta": (0.0, 0.15), "mu": (0.8, 1.0)}
+#: Where the orders of a link's elasticity and of its damping lie (low, high, step) where no other equation tells them.
+APART = {"beta": (0.0, 0.5, 0.05), "mu": (0.5, 1.95, 0.05)}
 #: Orders by the letter of the coefficient whose term they differentiate, as in (22)-(25).
 ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 Form: TypeAlias = Literal["lagrange", "published"]
@@ -168,7 +170,8 @@ def flexible_link(
         f_2 theta_21.
     hub
         False leaves the hub's equation out: a deflection driven by the measured hub, whose friction nobody knows. No
-        ratio of inertias is left to tie coefficients.
+        ratio of inertias is left to tie coefficients, and no other equation to tell the link's spring from its damper:
+        beta is sought up to 1/2, mu from there.
     laws
         ``"orders"``: orders obey :func:`order_law`, five are free. Without it each equation has its own four orders.
         With the Lagrange form and with ``"derived"`` alpha_2 (alpha_4) is fixed at 2: it is seen only through the
@@ -262,6 +265,9 @@ def flexible_link(
     )  # fmt: skip
     if form == "lagrange" or input_order == "derived":
         structure = structure.with_orders({f"alpha{2 * j}": 2.0 for j in stages})
+    if not hub:
+        # Nothing else tells the link's two own terms apart: exchanged, they are the same equation.
+        structure = structure.with_orders({f"{n}{2 * j}": APART[n] for j in stages for n in APART})
     return structure
 
 

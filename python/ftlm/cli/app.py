@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from ftlm import _core
+from ftlm.cli.command import Command
 from ftlm.cli.identify import identify, resume, search, status
 from ftlm.cli.inspect import doctor, inspect
 from ftlm.cli.judge import compare, export, plot, report, resid, simulate
@@ -40,7 +41,7 @@ for _command in (
     demo, record, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce, plot,
     export, doctor,
 ):  # fmt: skip
-    app.command()(_command)
+    app.command(cls=Command)(_command)
 
 
 def main() -> None:

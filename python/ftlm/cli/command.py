@@ -12,11 +12,26 @@ from dataclasses import fields, is_dataclass
 from typing import Any, get_type_hints
 
 import typer
+from typer.core import TyperCommand
 
 from ftlm.base.errors import FtlmError, InternalError, ModelError, RigFault
 from ftlm.cli.words import in_options
 
+#: Options that people take for others, from other programs or from the names of ftlm's functions.
+MEANT = {"--equation": "--structure"}
 EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
+
+
+class Command(TyperCommand):
+    """A command that knows which of its options another name was meant for."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Options as usual; one that is another's name ends in a sentence."""
+        known = {name for parameter in self.params for name in parameter.opts}
+        for given in (a.partition("=")[0] for a in args):
+            if given not in known and MEANT.get(given) in known:
+                ctx.fail(f"No such option: {given}; {MEANT[given]} takes equations in words, too.")
+        return super().parse_args(ctx, args)
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:

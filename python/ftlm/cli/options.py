@@ -184,7 +184,9 @@ class StructureOptions:
             built = built.equation(self.only)
         if self.offset is not None:
             built = replace(built, offset=self.offset)
-        built = replace(built, initial=check_initial(self._initial())).with_delays(ranges("--delay", self.delay))
+        if self.initial != "auto":
+            built = replace(built, initial=check_initial(self._initial()))
+        built = built.with_delays(ranges("--delay", self.delay))
         built = built.with_limits(
             saturation=ranges("--saturation", self.saturation), dead_zone=ranges("--dead-zone", self.dead_zone)
         )
@@ -235,7 +237,8 @@ class StructureOptions:
     def _arm(self, text: str) -> Structure:
         """Deflections of the arm that exists: whole orders but that of the link's elasticity, driven by all angles.
 
-        What reads a deflection is a gauge, whose zero is each run's own.
+        What reads a deflection is a gauge, whose zero is each run's own. A spring-pot that is nearly a spring remembers
+        next to nothing: runs start with the link's angle and velocity, unless a history is asked for.
         """
         given = self._of_the_link() | {"--coupling": self.coupling is not None}
         given |= {"--filtered": bool(self.filtered), "--low-pass": self.low_pass is not None}
@@ -253,6 +256,7 @@ class StructureOptions:
             stage=stage, hub=False, cross_stage="inertial", cross_sensitivity=True, sensor_filter="stock",
             laws=("orders", "coefficients", "velocities"), offset="constant",
         )  # fmt: skip
+        built = replace(built, initial="caputo")
         return built.with_orders({n: 1.0 for n in built.order_names if n.startswith("mu")})
 
     def _flexible_link(self, text: str) -> Structure:

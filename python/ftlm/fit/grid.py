@@ -143,17 +143,20 @@ class Attempt:
 
 def descend(
     problem: FreeProblem, experiments: list[Any], attempt: Attempt, *, evaluations: int, plain: bool = False,
-    held: int | None = None, tolerance: float = TOLERANCE,
+    held: int | Sequence[int] = (), tolerance: float = TOLERANCE, steady: bool = False,
 ) -> Attempt:  # fmt: skip
-    """Levenberg-Marquardt from an attempt; one of the numbers, by its place, may be held where it is."""
+    """Levenberg-Marquardt from an attempt; numbers, by their places, may be held where they are.
+
+    A steady one goes from a free run that dies away to none that grows.
+    """
     structure, signals = problem.structure, problem.structure.signals
     states = structure.filter_states(structure.initial) if structure.behind_filter else 0
     coordinates = problem.coordinates(attempt.coefficients, plain=plain)
     bounds, ends = list(problem.bounds), [item.bounds for item in problem.inputs]
-    if held is not None:
-        coefficient = held - len(bounds)
+    for number in (held,) if isinstance(held, int) else held:
+        coefficient = number - len(bounds)
         if coefficient < 0:
-            bounds[held] = (attempt.orders[held],) * 2
+            bounds[number] = (attempt.orders[number],) * 2
         elif coefficient < len(coordinates):
             coordinates[coefficient] = "held"
         else:
@@ -170,7 +173,7 @@ def descend(
     outcome = _core.output_error(
         experiments, problem.laws(signals), bounds, coordinates, structure.coupling == "simulated",
         initial_tuple(structure.initial, structure.offset, states), attempt.orders, attempt.coefficients,
-        inputs, evaluations, tolerance,
+        inputs, evaluations, tolerance, steady,
     )  # fmt: skip
     numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
     return Attempt(numbers[0], numbers[1], attempt.origin, outcome, numbers[2])
@@ -195,7 +198,8 @@ def _with_friction(
 class Grid:
     """A problem on its runs, what each output weighs, pulses a sample interval, and of how many samples one counts.
 
-    Shares of these weights by run, a row an output, are those of a robust loss.
+    Shares of these weights by run, a row an output, are those of a robust loss. On a steady one no descent goes from a
+    free run that dies away to one that grows.
     """
 
     problem: FreeProblem
@@ -204,6 +208,7 @@ class Grid:
     every: int = 1
     decimation: int = 1
     shares: Sequence[Floats] | None = None
+    steady: bool = False
 
     @cached_property
     def experiments(self) -> list[Any]:
@@ -222,13 +227,13 @@ class Grid:
         return replace(self, every=2 * self.every)
 
     def descend(
-        self, attempt: Attempt, evaluations: int, *, plain: bool = False, held: int | None = None,
+        self, attempt: Attempt, evaluations: int, *, plain: bool = False, held: int | Sequence[int] = (),
         tolerance: float = TOLERANCE,
     ) -> Attempt:  # fmt: skip
         """Levenberg-Marquardt from an attempt; see :func:`descend`."""
         return descend(
             self.problem, self.experiments, attempt, evaluations=evaluations, plain=plain, held=held,
-            tolerance=tolerance,
+            tolerance=tolerance, steady=self.steady,
         )  # fmt: skip
 
     def lowest(self, attempt: Attempt, evaluations: int) -> Attempt:

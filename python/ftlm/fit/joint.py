@@ -27,6 +27,7 @@ from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.race import SAME_COST, finalists, race
 from ftlm.fit.robust import Robust, huber_shares, same_shares, scales
+from ftlm.fit.steady import Growth, steadied
 from ftlm.fit.uncertainty import covariance, deviation
 from ftlm.solve.instants import compared_values
 
@@ -89,6 +90,8 @@ class JointFit:
         Where the fit came from, if it had no starts of its own.
     profiles
         95 % intervals by profile likelihood, of the parameters that have one.
+    growth
+        Where an optimum's free run grows: whether it is this one, and what one that dies away leaves beside it.
     """
 
     orders: dict[str, float]
@@ -111,6 +114,7 @@ class JointFit:
     on_grid: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
     origin: str = "the start that was given"
     profiles: Mapping[str, ProfileInterval] = field(default_factory=dict)
+    growth: Growth | None = None
 
     @property
     def choice(self) -> str:
@@ -197,6 +201,7 @@ def fit_output_error(
     alike = Grid(problem, runs, [1.0 / (COARSE_SHARE * sizes[o]) for o in outputs])
     weighed = Grid(problem, runs, [1.0 / noise[o] for o in outputs])
     starts: list[tuple[float, str]] = []
+    reached: list[Attempt] = []
     if start is None:
         floor = float(np.mean([(noise[o] / (COARSE_SHARE * sizes[o])) ** 2 for o in outputs]))
         runners = race_with_friction if structure.has_friction else race
@@ -214,9 +219,11 @@ def fit_output_error(
         weighed = weighed.finer
     best = weighed.descend(winner(contenders, replace(alike, every=weighed.every)), LAST_LAP)
     best, weighed = with_settled_weights(best, weighed, loss)
-    return joint_fit(
-        refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True), starts
-    )
+    best, weighed, growth = steadied(best, weighed, reached)
+    if growth is not None and not growth.kept:
+        best, weighed = with_settled_weights(best, weighed, loss)
+    optimum = refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True)
+    return replace(joint_fit(optimum, starts), growth=growth)
 
 
 def first_noise(runs: Sequence[Run], structure: Structure, output: str, size: float) -> float:

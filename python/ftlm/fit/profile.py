@@ -98,7 +98,9 @@ class Valley:
     def of(cls, joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> Valley:
         """The valley in which a fit ended."""
         weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
-        grid = Grid(problem, runs, weights, joint.refinement, shares=joint.shares)
+        # Where a growing optimum was left, its valley is not this one.
+        steady = joint.growth is not None and not joint.growth.kept
+        grid = Grid(problem, runs, weights, joint.refinement, shares=joint.shares, steady=steady)
         return cls.at(grid, joint.on_grid, joint.values - joint.on_grid)
 
     @classmethod

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ftlm.base.errors import FtlmError
+from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.structures import History
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.simpler import LowerOrder, Simpler, lower_orders, simpler
+from ftlm.fit.simpler import LowerOrder, Simpler, Whole, lower_orders, simpler, whole
 from ftlm.fit.starts import delayed_attempts
 
 #: Samples a run of the coarse fits that compare starts; the best ones continue on all samples.
@@ -86,9 +86,14 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
         reached = laps.run(coarse, starts, FIRST_LAP)
     # Whatever a simpler equation reaches, this one reaches too: it starts there with the term's coefficient at 0, or
     # with a pole too fast to see.
-    others: list[Simpler | LowerOrder] = [*simpler(problem), *lower_orders(problem, runs)]
+    others: list[Simpler | LowerOrder | Whole] = [*simpler(problem), *lower_orders(problem, runs)]
+    others += whole(problem, reached[0].orders) if reached else []
     for less in others if reached else []:
-        runners = delayed_attempts(runs, less.problem, threads)
+        try:
+            runners = delayed_attempts(runs, less.problem, threads)
+        except ModelError:
+            # At whole orders two of its terms have become one.
+            continue
         if isinstance(less, Simpler) and less.driven:
             # Driven by the measurement, most starts lead to one optimum: those that are nearest already will do.
             runners = laps.run(coarse, runners, 1, less.problem)[:FEWEST]

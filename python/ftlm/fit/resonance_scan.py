@@ -99,5 +99,7 @@ def _projected(
     solved = equation_tuple(rest.with_coefficients(values), signals)
     missed = [_core.equation_error(core, solved, inputs, initial) for core in cores]
     size = math.sqrt(sum(float(np.sum(np.square(r.of(item.output)))) for r in records))
-    error = math.sqrt(sum(float(e @ e) for e in missed)) / max(size, 1e-300)
+    # A point that the step does not carry grows beyond the numbers; the caller leaves out what is not finite.
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = math.sqrt(sum(float(e @ e) for e in missed)) / max(size, 1e-300)
     return error, values

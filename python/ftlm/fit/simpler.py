@@ -103,6 +103,39 @@ class Simpler:
         )
 
 
+@dataclass(frozen=True)
+class Whole:
+    """A problem with every free order at a whole value: what a fractional one is to be better than."""
+
+    problem: FreeProblem
+    orders: tuple[float, ...]
+
+    def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
+        """The same point of the whole problem."""
+        return replace(attempt, orders=list(self.orders), origin=f"{attempt.origin}, from whole orders")
+
+
+def whole(problem: FreeProblem, near: Sequence[float]) -> list[Whole]:
+    """The problem with whole orders, the physics' own or those nearest to a point; none where they make no equation."""
+    natural = (problem.structure.hints or Hints()).natural
+    orders = []
+    for name, value, (low, high) in zip(problem.orders, near, problem.bounds, strict=True):
+        known = [v for v in natural.get(name, ()) if v == round(v)]
+        order = float(min(known, key=lambda v: abs(v - value))) if known else float(round(value))
+        if not low <= order <= high:
+            return []
+        orders.append(order)
+    if not orders:
+        return []
+    try:
+        reduced = FreeProblem.of(problem.structure.with_orders(dict(zip(problem.orders, orders, strict=True))))
+    except FtlmError:
+        # Two terms of a signal have become one.
+        return []
+    # Terms in the order in which they stand, so coefficients keep their places.
+    return [Whole(reduced, tuple(orders))] if reduced.coefficients == problem.coefficients else []
+
+
 def simpler(problem: FreeProblem) -> list[Simpler]:
     """Problems with one term less; none under a law, where no coefficient can be 0 by itself.
 

@@ -57,6 +57,7 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
             f"at {joint.refinement} pulses a sample the step still moves estimates by over a tenth of their standard "
             "errors: the model is stiffer than the sampling; sample faster or trust its fast poles less"
         )
+    warnings += _growth(joint)
     errors = joint.standard_errors
     unseen = [n for n in joint.names if math.isinf(errors[n])]
     if unseen:
@@ -99,6 +100,27 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
     return warnings
 
 
+def _growth(joint: JointFit) -> list[str]:
+    """Say what was made of an optimum whose free run grows."""
+    if joint.growth is None:
+        return []
+    excess = 100.0 * joint.growth.excess
+    if not joint.growth.kept:
+        limit = joint.growth.at_limit
+        smaller = 100.0 * (1.0 - 1.0 / (1.0 + joint.growth.excess))
+        return [
+            f"an optimum that is not stable has residuals {smaller:.2g} % smaller, by no more than chance: what the "
+            "run did before its start takes a growing mode away until its end; the stable one was kept"
+            + (", which stands where free runs begin to grow: the runs do not tell its damping" if limit else "")
+        ]
+    if not math.isfinite(excess):
+        return ["no stable optimum was found beside this one, whose free run grows"]
+    return [
+        f"the free run of this optimum grows; the best stable one found has residuals {excess:.2g} % larger, which the "
+        "runs refuse at 99 %: an unstable machine in a closed loop, or a term that is missing"
+    ]
+
+
 def _bounded(joint: JointFit, name: str) -> bool:
     """Whether the profile of the likelihood has both ends of a number's interval."""
     return name in joint.profiles and not joint.profiles[name].is_open
@@ -110,7 +132,8 @@ def unbounded_ends(joint: JointFit, unseen: Sequence[str]) -> list[str]:
         n: [s for s, end in (("below", p.low), ("above", p.high)) if math.isinf(end)]
         for n, p in joint.profiles.items() if n not in unseen
     }  # fmt: skip
-    words = [f"{n} {' or '.join(s)}" for n, s in sides.items() if s]
+    # An order that ends at 0 has nothing below it.
+    words = [f"{n} {' or '.join(s)}" for n, s in sides.items() if s and (s != ["below"] or joint.orders.get(n) != 0.0)]
     if not words:
         return []
     return [

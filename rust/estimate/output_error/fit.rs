@@ -33,6 +33,8 @@ pub struct Fit {
 struct OutputError<'a> {
     model: &'a FreeModel,
     experiments: &'a [Experiment],
+    /// Whether a free run that grows is no place to go.
+    steady: bool,
 }
 
 impl Problem for OutputError<'_> {
@@ -85,7 +87,7 @@ impl Problem for OutputError<'_> {
 
     /// Where the grids see all of each equation: a fit would follow noise with what they do not see.
     fn trusted(&self, point: &Point) -> bool {
-        self.model.resolved(self.experiments, point)
+        self.model.resolved(self.experiments, point) && !(self.steady && self.model.grows(point))
     }
 }
 
@@ -155,6 +157,27 @@ fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
 /// # }
 /// ```
 pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+    fit_within(model, experiments, start, settings, false)
+}
+
+/// The same, but from a start whose free run does not grow no step leads to one that does.
+///
+/// With initial terms that are estimated, a growing mode costs nothing: they take it away until the end of the run, and
+/// what is left depends on what the inputs will be. Equations that drive each other as simulated are not looked at.
+///
+/// # Errors
+/// As [`fit`].
+pub fn fit_steady(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
+    fit_within(model, experiments, start, settings, true)
+}
+
+fn fit_within(
+    model: &FreeModel,
+    experiments: &[Experiment],
+    start: &Point,
+    settings: Settings,
+    steady: bool,
+) -> Result<Fit> {
     check_length("orders", model.order_bounds.len(), start.orders.len())?;
     check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
     check_length("inputs", model.inputs.len(), start.inputs.len())?;
@@ -163,7 +186,7 @@ pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, setting
     let mut point = start.clone();
     point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
     point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
-    let found = minimise(&OutputError { model, experiments }, point, settings)?;
+    let found = minimise(&OutputError { model, experiments, steady }, point, settings)?;
     Ok(Fit {
         point: found.point,
         cost: found.cost,

@@ -15,10 +15,11 @@ mod free_run;
 pub mod input;
 pub mod levenberg_marquardt;
 pub mod model;
+pub mod poles;
 mod sensitivities;
 
 pub use experiment::{Experiment, Instant, OwnTimes};
-pub use fit::{fit, Fit};
+pub use fit::{fit, fit_steady, Fit};
 pub use input::{FreeInput, InputLaw};
 pub use levenberg_marquardt::{Settings, Status};
 pub use model::{Coordinate, FreeEquation, FreeModel, Monomial, Point};

@@ -3,6 +3,7 @@
 
 use super::experiment::Experiment;
 use super::input::FreeInput;
+use super::poles::grows;
 use crate::equation::{AffineOrder, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
@@ -203,6 +204,22 @@ impl FreeModel {
         }
     }
 
+    /// Order of each equation, and coefficients and orders of its own terms.
+    fn own_terms(&self, point: &Point) -> Vec<(f64, Vec<(f64, f64)>)> {
+        let own = |(structure, equation): (&Structure, &FreeEquation)| {
+            let terms = structure.terms.iter().zip(&equation.terms);
+            let own = terms.filter(|(term, _)| term.signal == structure.output);
+            (structure.order, own.map(|(term, (_, _, c))| (c.at(&point.coefficients), term.order)).collect())
+        };
+        self.structures(&point.orders).iter().zip(&self.equations).map(own).collect()
+    }
+
+    /// Whether the free run of an equation grows, as far as equations stand alone.
+    pub(super) fn grows(&self, point: &Point) -> bool {
+        let alone = !self.coupled || self.equations.len() == 1;
+        alone && self.own_terms(point).iter().any(|(order, own)| grows(*order, own))
+    }
+
     /// Whether every grid sees what the own terms of each equation do, as far as equations stand alone.
     ///
     /// At Nyquist's frequency the divisor is [`nyquist_margin`] beside its leading coefficient: negative, the scheme has
@@ -211,15 +228,8 @@ impl FreeModel {
         if self.coupled && self.equations.len() > 1 {
             return true;
         }
-        let structures = self.structures(&point.orders);
-        structures.iter().zip(&self.equations).all(|(structure, equation)| {
-            let own: Vec<(f64, f64)> = structure
-                .terms
-                .iter()
-                .zip(&equation.terms)
-                .filter(|(term, _)| term.signal == structure.output)
-                .map(|(term, (_, _, c))| (c.at(&point.coefficients), structure.order - term.order))
-                .collect();
+        self.own_terms(point).iter().all(|(order, terms)| {
+            let own: Vec<(f64, f64)> = terms.iter().map(|(c, nu)| (*c, order - nu)).collect();
             experiments.iter().all(|experiment| {
                 let h = experiment.record.step();
                 let first = |&(c, eta): &(f64, f64)| c * libm::pow(h, eta) / libm::tgamma(eta + 2.0);
