@@ -99,5 +99,7 @@ def _projected(
     solved = equation_tuple(rest.with_coefficients(values), signals)
     missed = [_core.equation_error(core, solved, inputs, initial) for core in cores]
     size = math.sqrt(sum(float(np.sum(np.square(r.of(item.output)))) for r in records))
-    error = math.sqrt(sum(float(e @ e) for e in missed)) / max(size, 1e-300)
+    # A shape that leaves the range of numbers is the worst of all, and nothing to warn of.
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = math.sqrt(sum(float(e @ e) for e in missed)) / max(size, 1e-300)
     return error, values
