@@ -111,9 +111,9 @@ def _derivative_section(found: Recomputed) -> Section:
         "Eliminating the hub angle's highest derivative from (15) by (17) differentiates the current as well, by the "
         "order α₂ − μ₂ + γ₁ − α₁, which (19) and (21) leave out. It vanishes for whole orders. Without it a fractional "
         "link bends with the current, where a real one bends against it. A symbolic test derives both. Rows of p, "
-        "least squares, instrumental variables and the genetic algorithm are the paper's (22)–(25) all the same, as its tables "
-        "are; with orders free they make up for it by orders that are not the arm's. Output error, and whole "
-        "orders identified, have (14)–(15) as they stand, which flexible_link() is."
+        "least squares, instrumental variables and the genetic algorithm are the paper's (22)–(25) all the same, as "
+        "its tables are; with orders free they make up for it by orders that are not the arm's. Output error, and "
+        "whole orders identified, have (14)–(15) as they stand, which flexible_link() is."
     )
     charts = [figures.derivative_chart(stage.derived) for stage in found.stages.values()]
     return Section("The dropped derivative", [words], figures=charts)
