@@ -81,12 +81,12 @@ def test_one_of_two_orders_tells_a_run_apart():
 
 def test_a_fractional_damping_earns_its_place_where_the_link_has_one(fractional):
     link = fractional.deflections["theta12"]
-    assert link.verdict("damping").earns is True
-    assert link.verdict("both orders").earns is True
-    assert min(link.gains("damping").values()) > 2 * MARGIN
-    for low, high in link.intervals("damping")["mu2"].values():
+    assert link.verdict("fractional damping").earns is True
+    assert link.verdict("both fractional").earns is True
+    assert min(link.gains("fractional damping").values()) > 2 * MARGIN
+    for low, high in link.intervals("fractional damping")["mu2"].values():
         assert low < 0.4 < high
-    assert sentence("theta12", link.verdict("damping")) == (
+    assert sentence("theta12", link.verdict("fractional damping")) == (
         "θ₁₂: a fractional order of the damping earns its place."
     )  # fmt: skip
 
@@ -105,14 +105,14 @@ def test_fits_are_those_of_the_models_on_the_other_run(fractional):
             for other, run in runs.items():
                 wanted = fitted.result.model.compare(run.select(["theta11", "theta12"])).fit_percent["theta12"]
                 assert fitted.fit(other) == pytest.approx(wanted, abs=1e-9), (name, other)
-    gain = link.fits["damping"]["first"].fit("second") - link.fits["whole orders"]["first"].fit("second")
-    assert link.gains("damping")["first", "second"] == pytest.approx(gain)
-    assert set(link.gains("damping")) == {("first", "second"), ("second", "first")}
+    gain = link.fits["fractional damping"]["first"].fit("second") - link.fits["whole orders"]["first"].fit("second")
+    assert link.gains("fractional damping")["first", "second"] == pytest.approx(gain)
+    assert set(link.gains("fractional damping")) == {("first", "second"), ("second", "first")}
 
 
 def test_the_lower_of_two_orders_is_the_elasticity_s_whatever_the_fit_called_it(fractional):
     link = fractional.deflections["theta12"]
-    for fitted in link.fits["both orders"].values():
+    for fitted in link.fits["both fractional"].values():
         found = fitted.estimates
         assert found["beta2"][0] < found["mu2"][0]
         # The stiff term of the truth has 170, the other 8.
@@ -132,13 +132,13 @@ def test_numbers_are_counted(fractional):
 def test_a_fit_that_failed_cannot_be_told(fractional):
     link = fractional.deflections["theta12"]
     lacking = {kind: dict(each) for kind, each in link.fits.items()}
-    del lacking["damping"]["second"]
-    broken = replace(link, fits=lacking, failed={("damping", "second"): "no start"})
-    verdict = broken.verdict("damping")
+    del lacking["fractional damping"]["second"]
+    broken = replace(link, fits=lacking, failed={("fractional damping", "second"): "no start"})
+    verdict = broken.verdict("fractional damping")
     assert verdict.earns is None
     assert "second → first" in verdict.words
     assert "no fit" in verdict.words
-    assert broken.verdict("both orders").earns is True
+    assert broken.verdict("both fractional").earns is True
     assert sentence("theta12", verdict).endswith("cannot be told.")
 
 
@@ -150,8 +150,8 @@ def test_the_page_begins_with_verdicts_and_pictures(fractional, tmp_path):
     for title in ("θ₁₂ on second, fitted to first", "θ₁₂ on first, fitted to second"):
         assert title in first
     link = fractional.deflections["theta12"]
-    for kind in ("whole orders", "both orders"):
-        assert f"{kind} {link.fits[kind]['first'].fit('second'):.1f} %" in first
+    for kind in ("whole orders", "both fractional"):
+        assert f"{kind[1:]} {link.fits[kind]['first'].fit('second'):.1f} %" in first
     assert "http://" not in text.replace("http://www.w3.org", "")
     assert page.stat().st_size < 1_000_000
     assert unseen_page(fractional, tmp_path / "again.html").read_bytes() == page.read_bytes()
@@ -164,11 +164,11 @@ def test_the_page_begins_with_verdicts_and_pictures(fractional, tmp_path):
 def test_a_page_without_a_fit_says_so(fractional, tmp_path):
     link = fractional.deflections["theta12"]
     lacking = {kind: dict(each) for kind, each in link.fits.items()}
-    del lacking["both orders"]["first"]
-    broken = replace(link, fits=lacking, failed={("both orders", "first"): "no start was found"})
+    del lacking["both fractional"]["first"]
+    broken = replace(link, fits=lacking, failed={("both fractional", "first"): "no start was found"})
     found = replace(fractional, deflections={"theta12": broken})
     text = unseen_page(found, tmp_path / "orders.html").read_text()
-    assert "both orders: no fit" in text
+    assert "both fractional: no fit" in text
     assert "no start was found" in text
     assert "cannot be told." in text
     assert "no fit" in unseen_text(found)

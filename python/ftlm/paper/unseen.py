@@ -17,14 +17,14 @@ from ftlm.identification.identify import identify
 from ftlm.identification.result import Identification
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.metrics import finite
-from ftlm.paint.text import symbol, unbounded
+from ftlm.paint.text import symbol
 from ftlm.paper.arm import STAGES, StageNumber
 from ftlm.paper.work import thinned
 
 #: What may be fractional, by the orders that are free then; whole is what they are otherwise.
 WHOLE = "whole orders"
 KINDS: dict[str, tuple[str, ...]] = {
-    WHOLE: (), "elasticity": ("beta",), "damping": ("mu",), "both orders": ("beta", "mu"),
+    WHOLE: (), "fractional elasticity": ("beta",), "fractional damping": ("mu",), "both fractional": ("beta", "mu"),
 }  # fmt: skip
 WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
 #: Rows that a fit takes at most of a run; the arm's modes are a decade below the rate that is left of 20 s.
@@ -151,7 +151,7 @@ class Deflection:
         )  # fmt: skip
         fits = "; ".join(f"{run} → {other} {before[run, other]}, then {after[run, other]}" for run, other in before)
         orders = "; ".join(
-            f"{symbol(name)} " + ", ".join(f"{_end(low)} to {_end(high)} on {run}" for run, (low, high) in each.items())
+            f"{symbol(name)} " + ", ".join(f"{_range(low, high)} on {run}" for run, (low, high) in each.items())
             for name, each in told.items()
         )
         agree = "" if all(overlapping(each.values()) for each in told.values()) else " The runs contradict each other."
@@ -183,8 +183,12 @@ def judged(
     return None
 
 
-def _end(value: float) -> str:
-    return unbounded(value, ".2f").replace("-", "−")
+def _range(low: float, high: float) -> str:
+    """An interval in short; an end that the run does not bound is left out."""
+    ends = [f"{v:.2f}".replace("-", "−") if math.isfinite(v) else "" for v in (low, high)]
+    if all(ends):
+        return " to ".join(ends)
+    return f"up to {ends[1]}" if ends[1] else f"from {ends[0]} up" if ends[0] else "anything"
 
 
 def percent(value: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,11 +21,11 @@ from ftlm.paint.text import Cell, Exact, symbol, symbol_html, unbounded
 from ftlm.paper.unseen import KINDS, MARGIN, WHOLE, Deflection, UnseenOrders, Verdict, percent
 
 #: The structure of the pictures: everything that the paper says of a link may be fractional.
-SHOWN = "both orders"
+SHOWN = "both fractional"
 #: What each kind is called in a verdict, and how it goes on.
 WHAT = {
-    "elasticity": ("a fractional order of the elasticity", "earns its place", "does not earn its place"),
-    "damping": ("a fractional order of the damping", "earns its place", "does not earn its place"),
+    "fractional elasticity": ("a fractional order of the elasticity", "earns its place", "does not earn its place"),
+    "fractional damping": ("a fractional order of the damping", "earns its place", "does not earn its place"),
     SHOWN: ("fractional orders", "earn their place", "do not earn their place"),
 }  # fmt: skip
 #: Points of a line of the pictures.
@@ -61,10 +62,12 @@ def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
                 continue
             lines.append((kind, fitted.compared[judged].simulated[output][0]))
             told.append(f"{kind} {percent(fitted.fit(judged))} % with {fitted.numbers} numbers")
+        words = "; ".join(told)
         charts.append(
             line_chart(
                 pulse_times(at), lines, title=f"{symbol(output)} on {judged}, fitted to {run}", x_label="time [s]",
-                y_label=f"{symbol(output)} [rad]", points=LINE_POINTS, width=SMALL, caption=f"{'; '.join(told)}.",
+                y_label=f"{symbol(output)} [rad]", points=LINE_POINTS, width=SMALL,
+                caption=f"{words[0].upper()}{words[1:]}.",
             )
         )  # fmt: skip
     return charts
@@ -88,7 +91,7 @@ def fits_table(found: UnseenOrders) -> Table:
             rows.append([kind, None if numbers is None else Exact(numbers), *fits])
     heads = [f"{run}, fitted" if run == other else f"{run} → {other}" for run, other in pairs]
     return Table(
-        "Fit of the free run in percent", ("orders that may be fractional", "numbers free", *heads), rows,
+        "Fit of the free run in percent", ("structure", "numbers free", *heads), rows,
         headings=headings,
         note="In bold the runs that were not fitted to. 100 is perfect, 0 is as good as the mean. Initial terms, the "
         "filter's state and the gauge's zero are each run's own; of the judged run nothing else is estimated.",
@@ -103,7 +106,7 @@ def estimates_table(deflection: Deflection) -> Table:
         for run, fitted in each.items():
             headings[len(rows)] = f"{kind}, fitted to {run}"
             for name, (value, low, high) in fitted.estimates.items():
-                rows.append([symbol_html(name), value, unbounded(low), unbounded(high)])
+                rows.append([symbol_html(name), value, *(v if math.isfinite(v) else unbounded(v) for v in (low, high))])
     title = f"{symbol(deflection.output)}: estimates and their 95 % intervals"
     return Table(title, ("number", "estimate", "from", "to"), rows, headings=headings)
 
@@ -195,7 +198,7 @@ def unseen_text(found: UnseenOrders) -> str:
     names = [run.name or "" for run in found.runs]
     for output, deflection in found.deflections.items():
         lines += ["", f"{output}: fit of the free run in percent, fitted to the first, judged on the second"]
-        lines.append(" " * 16 + "numbers".rjust(8) + "".join(f"{a} → {b}".rjust(20) for a in names for b in names))
+        lines.append(" " * 24 + "numbers".rjust(8) + "".join(f"{a} → {b}".rjust(18) for a in names for b in names))
         lines += [_line(kind, deflection, names) for kind in KINDS]
     return "\n".join([*lines, *(f"note: {n}" for n in found.notes)])
 
@@ -204,4 +207,4 @@ def _line(kind: str, deflection: Deflection, names: Sequence[str]) -> str:
     each = deflection.fits[kind]
     numbers = next((str(f.numbers) for f in each.values()), "–")
     shown = [percent(each[a].fit(b)) if a in each else "no fit" for a in names for b in names]
-    return kind.ljust(16) + numbers.rjust(8) + "".join(text.rjust(20) for text in shown)
+    return kind.ljust(24) + numbers.rjust(8) + "".join(text.rjust(18) for text in shown)
