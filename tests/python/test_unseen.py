@@ -142,6 +142,21 @@ def test_a_fit_that_failed_cannot_be_told(fractional):
     assert sentence("theta12", verdict).endswith("cannot be told.")
 
 
+def test_a_fit_that_is_worse_than_what_it_contains_tells_nothing(fractional):
+    link = fractional.deflections["theta12"]
+    assert link.worse("both fractional") == []
+    fitted = link.fits["fractional damping"]["first"]
+    own = fitted.compared["first"]
+    flown = replace(own, output_error={n: replace(f, fit=50.0) for n, f in own.output_error.items()})
+    lost = replace(fitted, compared={**fitted.compared, "first": flown})
+    fits = {**link.fits, "fractional damping": {**link.fits["fractional damping"], "first": lost}}
+    broken = replace(link, fits=fits)
+    assert broken.worse("fractional damping") == ["first"]
+    verdict = broken.verdict("fractional damping")
+    assert verdict.earns is None
+    assert "On first it fits worse than the whole orders that it contains" in verdict.words
+
+
 def test_the_page_begins_with_verdicts_and_pictures(fractional, tmp_path):
     page = unseen_page(fractional, tmp_path / "orders.html")
     text = page.read_text()

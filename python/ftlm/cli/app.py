@@ -37,8 +37,8 @@ def version(
 
 
 for _command in (
-    demo, record, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce, orders,
-    plot, export, doctor,
+    demo, record, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce,
+    orders, plot, export, doctor,
 ):  # fmt: skip
     app.command()(_command)
 

@@ -126,6 +126,11 @@ class Deflection:
                     found[run, judged] = 0.0 if alone == free else free - alone
         return found
 
+    def worse(self, kind: str) -> list[str]:
+        """Runs on which a fit is worse than that of whole orders, which its structure contains."""
+        both = ((run, each, self.fits[WHOLE][run]) for run, each in self.fits[kind].items())
+        return [run for run, free, whole in both if not free.fit(run) > whole.fit(run) - MARGIN]
+
     def intervals(self, kind: str) -> dict[str, dict[str, tuple[float, float]]]:
         """95 % intervals of the free orders, by order, then by the run that was fitted."""
         return {
@@ -142,7 +147,8 @@ class Deflection:
         """Of one kind, from its gains and intervals."""
         told = self.intervals(kind)
         whole = {name: WHOLE_ORDERS[name.rstrip("0123456789")] for name in told}
-        complete = not any(k in (kind, WHOLE) for k, _ in self.failed)
+        worse = self.worse(kind)
+        complete = not worse and not any(k in (kind, WHOLE) for k, _ in self.failed)
         earns = judged(list(self.gains(kind).values()), told, whole) if complete else None
         before, after = (
             {pair: "no fit" if pair[0] not in self.fits[k] else percent(self.fits[k][pair[0]].fit(pair[1]))
@@ -154,8 +160,12 @@ class Deflection:
             f"{symbol(name)} " + ", ".join(f"{_range(low, high)} on {run}" for run, (low, high) in each.items())
             for name, each in told.items()
         )
-        agree = "" if all(overlapping(each.values()) for each in told.values()) else " The runs contradict each other."
-        return Verdict(kind, earns, f"Fit of unseen runs, percent: {fits}. 95 % intervals: {orders}.{agree}")
+        words = f"Fit of unseen runs, percent: {fits}. 95 % intervals: {orders}."
+        if not all(overlapping(each.values()) for each in told.values()):
+            words += " The runs contradict each other."
+        if worse:
+            words += f" On {', '.join(worse)} it fits worse than the whole orders that it contains: no optimum found."
+        return Verdict(kind, earns, words)
 
 
 def overlapping(intervals: Any) -> bool:
@@ -251,12 +261,14 @@ class UnseenOrders:
 def link_structure(stage: StageNumber, *, both: bool, filtered: bool) -> Structure:
     """A deflection as (15) has it, driven by the measured hub: elasticity and damping of any order, gauge and cable.
 
-    With the other stage's angles its accelerations besides, by the energies of the planar arm.
+    With the other stage's angles its accelerations besides, by the energies of the planar arm. Initial terms are
+    Caputo's: a history would give fractional orders more numbers of the judged run than whole ones.
     """
-    return flexible_link(
+    made = flexible_link(
         stage=stage, hub=False, cross_stage="inertial" if both else False, cross_sensitivity=True,
         sensor_filter="stock" if filtered else None, laws=("orders", "coefficients", "velocities"), offset="constant",
     )  # fmt: skip
+    return replace(made, initial="caputo")
 
 
 def orders_on_unseen_runs(

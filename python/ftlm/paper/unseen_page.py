@@ -143,7 +143,7 @@ def _method_section(found: UnseenOrders) -> Section:
         f"An order earns its place where every fitted run's 95 % interval excludes the whole one, the runs' intervals "
         f"have a value in common, no unseen run loses {MARGIN:g} points of fit and the middle one gains as much. "
         "It does not where no unseen run gains that, or no interval excludes the whole order and the middle run gains "
-        "less. The rest cannot be told.",
+        "less. The rest cannot be told, as where a fit is worse on its own run than the whole orders that it contains.",
         *found.notes,
     ]
     return Section("How it is judged", words, tables=[Table("Runs", ("run", "rows", "step [s]", "length [s]"), rows)])
