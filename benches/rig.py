@@ -120,7 +120,7 @@ def truth() -> None:
         blank = ftlm.Run.from_arrays(
             step=run.step, inputs={n: run[n] for n in run.inputs}, outputs={n: np.zeros(run.length) for n in names}
         )
-        solved = demo_plant(stage).simulate(blank, tolerance=1e-7)
+        solved = demo_plant(stage, form="published").simulate(blank, tolerance=1e-7)
         clean |= {n: solved[n] for n in names}
     arm = linear.arm(run.step, 600.0)
     states = np.empty((run.length, 4))

@@ -33,7 +33,7 @@ def plant_a_run(hub: float = 1e-3, deflection: float = 1e-4) -> ftlm.Run:
     blank = ftlm.Run.from_arrays(
         step=0.002, inputs={"I1": current}, outputs={n: np.zeros(rows) for n in ("theta11", "theta12")}, name="plant A"
     )
-    truth = ftlm.simulate(demo_plant(1), blank, tolerance=1e-8)
+    truth = ftlm.simulate(demo_plant(1, form="published"), blank, tolerance=1e-8)
     rng = np.random.default_rng(7)
     noisy = {"theta11": hub, "theta12": deflection}
     return ftlm.Run.from_arrays(

@@ -70,7 +70,7 @@ def stage(path, progress=None):
     current = np.where(np.arange(rows) % 400 < 230, 0.3, -0.3)
     outputs = {"theta11": np.zeros(rows), "theta12": np.zeros(rows)}
     empty = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=outputs, name="stage")
-    clean = demo_plant(1).simulate(empty, tolerance=1e-6)
+    clean = demo_plant(1, form="published").simulate(empty, tolerance=1e-6)
     noise = np.random.default_rng(1)
     noisy = {n: clean[n] + 1e-4 * noise.standard_normal(rows) for n in outputs}
     given = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy, name="stage")

@@ -3,6 +3,9 @@
 from ftlm.paper.claims import Claim, implied_spreads, printed_saturation, table_3_coefficients
 from ftlm.paper.records import Candidate, Rival, Stage
 from ftlm.paper.reproduction import Reproduction, reproduce
+from ftlm.paper.unseen import Deflection, UnseenOrders, Verdict, orders_on_unseen_runs
+from ftlm.paper.unseen_page import unseen_page
 
-__all__ = ["Candidate", "Claim", "Reproduction", "Rival", "Stage", "implied_spreads", "printed_saturation",
-           "reproduce", "table_3_coefficients"]  # fmt: skip
+__all__ = ["Candidate", "Claim", "Deflection", "Reproduction", "Rival", "Stage", "UnseenOrders", "Verdict",
+           "implied_spreads", "orders_on_unseen_runs", "printed_saturation", "reproduce", "table_3_coefficients",
+           "unseen_page"]  # fmt: skip

@@ -40,7 +40,7 @@ def clean_run(name: str) -> ftlm.Run:
     current = np.where((np.arange(rows) % 1000) < 500, 0.3, -0.3)
     outputs = {f"theta{stage}{i}": np.zeros(rows) for i in (1, 2)}
     blank = ftlm.Run.from_arrays(step=step, inputs={f"I{stage}": current}, outputs=outputs, name=name)
-    return demo_plant(stage).simulate(blank, tolerance=1e-8)
+    return demo_plant(stage, form="published").simulate(blank, tolerance=1e-8)
 
 
 def noisy_run(name: str, snr: float, seed: int) -> ftlm.Run:
@@ -72,7 +72,7 @@ def truth(name: str) -> dict[str, float]:
     if name == "3T":
         return dict(THREE_TERMS)
     stage = 1 if name == "A" else 2
-    model = demo_plant(stage)
+    model = demo_plant(stage, form="published")
     h, d = 2 * stage - 1, 2 * stage
     free = {n: model.coefficients[f"{n}{h}"] for n in "abdg"}
     named = {f"{n}{h}": v for n, v in free.items()}

@@ -311,7 +311,7 @@ def arm_in_motion(rows, noise=0.0):
         blank = ftlm.Run.from_arrays(
             step=step, inputs={f"I{stage}": current}, outputs={n: np.zeros(rows) for n in names}
         )
-        clean = demo_plant(stage).simulate(blank, tolerance=1e-6)
+        clean = demo_plant(stage, form="published").simulate(blank, tolerance=1e-6)
         outputs |= {n: clean[n] + noise * np.std(clean[n]) * rng.standard_normal(rows) for n in names}
     return ftlm.Run.from_arrays(step=step, inputs={"I1": current, "I2": current}, outputs=outputs)
 
@@ -361,7 +361,7 @@ def test_the_whole_arm_is_one_joint_fit():
     )
     assert len(found.joint.names) == 20
     for stage in (1, 2):
-        for name, value in demo_plant(stage).orders.items():
+        for name, value in demo_plant(stage, form="published").orders.items():
             assert abs(found.orders[name] - value) < 5 * found.standard_errors[name], name
     assert min(found.fit_percent.values()) > 99
 

@@ -43,7 +43,7 @@ def arm_run(stage: int, rows: int, noise: float, seed: int) -> ftlm.Run:
     blank = ftlm.Run.from_arrays(
         step=0.002, inputs={f"I{stage}": current}, outputs={n: np.zeros(rows) for n in names}, name="arm"
     )
-    clean = ftlm.simulate(demo_plant(stage), blank, tolerance=1e-7)
+    clean = ftlm.simulate(demo_plant(stage, form="published"), blank, tolerance=1e-7)
     rng = np.random.default_rng(seed)
     outputs = {n: clean[n] + noise * np.std(clean[n]) * rng.standard_normal(rows) for n in names}
     return ftlm.Run.from_arrays(step=0.002, inputs={f"I{stage}": current}, outputs=outputs, name="arm")
@@ -128,7 +128,8 @@ def test_intervals_cover_the_truth_as_often_as_they_say() -> None:
 def test_the_arm_is_recovered_from_an_automatic_start_under_both_laws(stage: int, noise: float) -> None:
     run = arm_run(stage, 3001, noise, 3)
     found = ftlm.identify(run, ftlm.flexible_link(form="published", stage=stage), method="output-error")
-    truth = {n: v for n, v in demo_plant(stage).orders.items()} | demo_plant(stage).coefficients
+    plant = demo_plant(stage, form="published")
+    truth = {n: v for n, v in plant.orders.items()} | plant.coefficients
     assert found.joint is not None
     for name, value in {**found.orders, **found.joint.coefficients}.items():
         if name in truth:

@@ -23,7 +23,7 @@ def fitted() -> ftlm.Identification:
 
 def law(name: str) -> dict[str, float]:
     """Every coefficient of a plant."""
-    return demo_plant(1 if name == "A" else 2).coefficients
+    return demo_plant(1 if name == "A" else 2, form="published").coefficients
 
 
 def test_instrumental_variables_find_the_coefficients_that_least_squares_loses() -> None:

@@ -11,7 +11,7 @@ from ftlm.cli.command import Command
 from ftlm.cli.identify import identify, resume, search, status
 from ftlm.cli.inspect import doctor, inspect
 from ftlm.cli.judge import compare, export, plot, report, resid, simulate
-from ftlm.cli.paper import demo, reproduce
+from ftlm.cli.paper import demo, orders, reproduce
 from ftlm.cli.record import record
 from ftlm.cli.select import select
 
@@ -38,8 +38,8 @@ def version(
 
 
 for _command in (
-    demo, record, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce, plot,
-    export, doctor,
+    demo, record, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce,
+    orders, plot, export, doctor,
 ):  # fmt: skip
     app.command(cls=Command)(_command)
 

@@ -11,12 +11,14 @@ from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_folder, check_free
 from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show_json
-from ftlm.cli.options import Force, GeneticOptions, Json, LatticeStep, Page, ReadingOptions, Text, Threads
+from ftlm.cli.options import Files, Force, GeneticOptions, Json, LatticeStep, Page, ReadingOptions, Text, Threads
 from ftlm.paper import reproduction
 from ftlm.paper.demo import run_demo
 from ftlm.paper.demo_page import demo_page, demo_text
 from ftlm.paper.page import reproduction_text
 from ftlm.paper.reproduction import ALWAYS_SAVED
+from ftlm.paper.unseen import orders_on_unseen_runs
+from ftlm.paper.unseen_page import unseen_page, unseen_text
 
 
 @command
@@ -74,3 +76,24 @@ def reproduce(
         show_json({**result.to_dict(), "files": [str(f) for f in files]})
     else:
         print(f"{reproduction_text(result)}\n\nwritten: {', '.join(str(f) for f in files)}")
+
+
+@command
+def orders(
+    *, files: Files, out: Page = "orders.html", reading: ReadingOptions,
+    filtered: Annotated[
+        bool, Option("--stock-filter/--no-filter", help="Whether deflections passed the stock 2 Hz low-pass.")
+    ] = True,
+    threads: Threads = None, force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Integer against fractional orders of the arm's links, fitted to each run and judged on the others: a page."""
+    check_free(out, force=force, words=COMMAND)
+    runs = reading.runs(files, apart=True)
+    with Progress("", quiet=as_json) as progress:
+        found = orders_on_unseen_runs(runs, filtered=filtered, threads=threads, say=progress.say, progress=progress)
+        progress.say("writing the page")
+        page = unseen_page(found, out, force=force)
+    if as_json:
+        show_json({**found.to_dict(), "files": [str(page)]})
+    else:
+        print(f"{unseen_text(found)}\n\nwritten: {page}")

@@ -12,10 +12,10 @@ from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.fit.recursion import Trace
 from ftlm.identification.result import Identification
-from ftlm.judge.metrics import Metrics
+from ftlm.judge.metrics import Metrics, finite
 from ftlm.paper.arm import STAGES, demo_run, truth_of
 from ftlm.paper.printed import INNOVATION_LENGTHS, OUTPUTS
-from ftlm.paper.records import Candidate
+from ftlm.paper.records import Candidate, Derived
 from ftlm.paper.rows import letters_of
 from ftlm.paper.work import Preset, StageWork
 
@@ -68,6 +68,8 @@ class Demo:
         Identifications by stage and label.
     traces
         Convergence by output and p.
+    derived
+        By stage, what the published equations make of the numbers that were found.
     files
         What was written.
     """
@@ -77,6 +79,7 @@ class Demo:
     rows: dict[int, list[StageRow]]
     results: dict[int, dict[str, Identification]]
     traces: dict[str, dict[int, Trace]]
+    derived: dict[int, Derived]
     files: list[Path]
 
     @property
@@ -107,6 +110,9 @@ class Demo:
                 for stage, results in self.results.items()
                 for label, result in results.items()
             },
+            "correlation with the current": {
+                d.output: {words: finite(v) for words, v in d.correlations.items()} for d in self.derived.values()
+            },
             "files": [str(f) for f in self.files],
         }
 
@@ -131,6 +137,8 @@ def run_demo(
     progress: Callable[[int, int], None] | None = None,
 ) -> Demo:  # fmt: skip
     """Simulate, identify every equation with p = 1, 3, 5, 7, by least squares and by output error, compare, save.
+
+    Output error has the arm as it is, (14)-(15); the others have the paper's (22)-(25), whose links bend the wrong way.
 
     Parameters
     ----------
@@ -161,7 +169,7 @@ def run_demo(
     check_folder(folder, ["square.csv", "sine.csv", *names, "demo.html"], force=force)
     say("recording both stages on the virtual rig, under a square and a sine current")
     square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
-    demo = Demo(square, sine, {}, {}, {}, [])
+    demo = Demo(square, sine, {}, {}, {}, {}, [])
     for run in (square, sine):
         demo.files.append(folder / f"{run.name}.csv")
         run.to_csv(demo.files[-1], force=force)
@@ -174,6 +182,7 @@ def run_demo(
         demo.rows[stage] = [row for candidate in models.values() for row in rows_of(candidate)]
         demo.results[stage] = {label: c.result for label, c in models.items() if c.result is not None}
         demo.traces.update(work.traces(models))
+        demo.derived[stage] = work.derived(models["output error"].model)
         for stem, label in SAVED.items():
             demo.files.append(folder / f"stage{stage}-{stem}.json")
             models[label].model.save(demo.files[-1], force=force)

@@ -41,7 +41,7 @@ def stage_section(
 ) -> Section:  # fmt: skip
     """The joint model's equations, then tables with that of all searches, and figures."""
     searches = {f"{n}, {o}": s for n, r in results.items() if r is not None for o, s in r.searches.items()}
-    words = "Joint output error, order law and coefficient law imposed:"
+    words = "(14)–(15) by joint output error, order law and coefficient law imposed:"
     equations = [equation_html(e, joint.structure.delay, joint.structure.limits) for e in joint.equations]
     return Section(
         heading, [words, *equations, *notes], warnings=grouped_warnings(results),
@@ -109,11 +109,11 @@ def _near_section(found: Recomputed) -> Section:
 def _derivative_section(found: Recomputed) -> Section:
     words = (
         "Eliminating the hub angle's highest derivative from (15) by (17) differentiates the current as well, by the "
-        "order α₂ − μ₂ + γ₁ − α₁, which (19) and (21) leave out. It vanishes for whole orders. "
-        "flexible_link(input_order='derived') keeps it; a symbolic test derives both. Without it a fractional link "
-        "bends with the current, where a real one bends against it: the equations of this page are the paper's, and "
-        "its simulated runs are of an arm that obeys them, so that printed and recomputed numbers speak of one model. "
-        "For a real arm flexible_link() has (15) as it stands."
+        "order α₂ − μ₂ + γ₁ − α₁, which (19) and (21) leave out. It vanishes for whole orders. Without it a fractional "
+        "link bends with the current, where a real one bends against it. A symbolic test derives both. Rows of p, "
+        "least squares, instrumental variables and the genetic algorithm are the paper's (22)–(25) all the same, as "
+        "its tables are; with orders free they make up for it by orders that are not the arm's. Output error, and "
+        "whole orders identified, have (14)–(15) as they stand, which flexible_link() is."
     )
     charts = [figures.derivative_chart(stage.derived) for stage in found.stages.values()]
     return Section("The dropped derivative", [words], figures=charts)
@@ -179,9 +179,9 @@ def reproduction_page(found: Recomputed, path: str | os.PathLike[str], *, force:
     last = _weak_section, _near_section, _derivative_section, _landscape_section, _bode_section, _runs_section
     sections += [section(found) for section in last]
     names = " and ".join(f"“{run.name}”" for run in found.runs)
-    origin = "a simulated arm whose truth is known" if found.simulated else f"the runs {names}"
+    origin = "a simulated arm whose links hang on their hubs, truth known," if found.simulated else f"the runs {names},"
     lead = (
-        f"Section 5 of the paper, recomputed on {origin}, beside what the paper prints. {PAPER}. Numbers in rows "
+        f"Section 5 of the paper, recomputed on {origin} beside what the paper prints. {PAPER}. Numbers in rows "
         "marked “printed” are the paper's; every other number, figure and verdict on this page is computed."
     )
     return write_page(path, title="The paper reproduced", sections=sections, lead=lead, force=force)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from ftlm.base.arrays import Floats
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
@@ -100,13 +102,25 @@ class Rival:
 
 @dataclass(frozen=True)
 class Derived:
-    """What the derivative of the current that (19) drops would change in the deflection's free run."""
+    """What the derivative of the current that (19) drops does to the deflection's free run, all numbers alike."""
 
     output: str
     order: float  # that the current would have; 0 as published
     time: Floats  # middle of every pulse [s]
-    published: Floats  # pulse means, from the current alone
-    derived: Floats  # the same with that order, all other numbers alike
+    current: Floats  # pulse means
+    measured: Floats
+    published: Floats  # by (22)-(25)
+    derived: Floats  # by (14)-(15), nothing dropped
+
+    @property
+    def correlations(self) -> dict[str, float]:
+        """Of the deflection with the current: as measured, with nothing dropped, as published; nan for one at rest."""
+        found = {}
+        for words, series in (("measured", self.measured), ("derived", self.derived), ("published", self.published)):
+            parts = [v - np.mean(v) for v in (series, self.current)]
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                found[words] = float(np.dot(*parts) / np.sqrt(np.dot(parts[0], parts[0]) * np.dot(parts[1], parts[1])))
+        return found
 
 
 @dataclass(frozen=True)
@@ -161,7 +175,11 @@ class Stage:
             "weak prior": {o: {str(p): c for p, c in each.items()} for o, each in self.weak.items()},
             "genetic": {o: r.to_dict() for o, r in self.rivals.items()},
             "smallest equation error": self.by_equation.to_dict(),
-            "derived input order": {"output": self.derived.output, "order": self.derived.order},
+            "derived input order": {
+                "output": self.derived.output,
+                "order": self.derived.order,
+                "correlations": {n: finite(v) for n, v in self.derived.correlations.items()},
+            },
         }
 
 

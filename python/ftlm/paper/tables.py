@@ -102,7 +102,9 @@ def model_table(stage: Stage, title: str) -> Table:
         title, ("model", *HEADS, *CRITERIA), rows, groups=(*GROUPS, ("output error (free run)", 3)),
         note="Free runs are driven as the method drives them: rows of p, least squares, instrumental variables and the "
         "identified integer model by the current and the measured other angle; the manual's integer model (by explicit "
-        "Euler at the run's step, and exactly) and output error by the current alone. Errors in rad. " + PRINTED_NOTE,
+        "Euler at the run's step, and exactly) and output error by the current alone. Output error and the identified "
+        "integer model are (14)–(15), whose deflection hangs on the hub's motion and has no current; all other rows "
+        "are the paper's (22)–(25). Errors in rad. " + PRINTED_NOTE,
     )  # fmt: skip
 
 

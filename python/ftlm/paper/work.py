@@ -13,7 +13,6 @@ from ftlm.arm.link import flexible_link, link_model, order_law
 from ftlm.arm.parameters import INTEGER_ORDERS
 from ftlm.base.errors import ConvergenceError, ModelError
 from ftlm.data.lattice import Lattice
-from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.genetic import Genetic
@@ -65,27 +64,33 @@ class StageWork:
     notes: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        # The paper's own structure, for what its tables are set beside, and the arm as it is.
         self.measured = flexible_link(stage=self.number, form="published", coupling="measured", laws=())
-        self.coupled = flexible_link(stage=self.number, form="published")
+        self.published = flexible_link(stage=self.number, form="published")
+        self.coupled = flexible_link(stage=self.number, coupling="simulated")
         own = list(self.measured.signals)
         self.on = self.square.select(own)
         self.off = None if self.sine is None else self.sine.select(own)
         if not starts_at_rest(self.on, self.measured):
             # The paper's equation errors have few terms; ten powers of t more would be combinations of them.
-            self.measured, self.coupled = (replace(s, initial="caputo") for s in (self.measured, self.coupled))
+            self.measured, self.published, self.coupled = (
+                replace(s, initial="caputo") for s in (self.measured, self.published, self.coupled)
+            )
 
     def reproduced(self, genetic: Genetic | None) -> Stage:
         """Everything that section 5 says of a stage."""
         exact = self.manual("integer, exact")
         candidates = {"integer, Euler": self.stepped("integer, Euler", exact), "integer, exact": exact}
-        whole = {n: INTEGER_ORDERS.get(n.rstrip("0123456789"), 2.0) for n in self.measured.order_names}
+        by_hand = flexible_link(stage=self.number, coupling="measured", laws=("orders",))
+        whole = {n: INTEGER_ORDERS.get(n.rstrip("0123456789"), 2.0) for n in by_hand.order_names}
         candidates["integer, identified"] = self.joint(
-            "integer, identified", self.measured.with_orders(whole),
+            "integer, identified", replace(by_hand, initial=self.measured.initial).with_orders(whole),
             "whole orders, each equation driven by the measured other angle, by output error",
         )  # fmt: skip
         candidates |= self.searches()
         candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
-        candidates["output error"] = self.best()
+        candidates["output error"] = self.best("output error", self.coupled)
+        candidates["published, output error"] = self.best("published, output error", self.published)
         traces: dict[str, dict[int, Trace]] = {}
         weak: dict[str, dict[int, Trace]] = {}
         if prepare([self.on], self.measured, None, power_of_two=True)[0].initial == "rest":
@@ -200,17 +205,17 @@ class StageWork:
             run = thinned(run, every)
         return self.identified(label, run, structure)
 
-    def best(self) -> Candidate:
+    def best(self, label: str, structure: Structure) -> Candidate:
         """Joint output error from the current alone, or driven by the measured other angle where that has no start."""
-        words = "all orders and coefficients together, "
+        words = f"all orders and coefficients together{' in the published form' * (structure is self.published)}, "
         try:
-            return self.joint("output error", self.coupled, f"{words}from the current alone, by output error")
+            return self.joint(label, structure, f"{words}from the current alone, by output error")
         except ConvergenceError as error:
             self.notes.append(
-                f"stage {self.number}: from the current alone, {error}; the row of output error is driven by the "
-                "measured other angle instead"
+                f"stage {self.number}, {label}: from the current alone, {error}; that row is driven by the measured "
+                "other angle instead"
             )
-        return self.joint("output error", replace(self.coupled, coupling="measured"), f"{words}by output error")
+        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error")
 
     def traces(self, candidates: Mapping[str, Candidate], prior: float = 1.0) -> dict[str, dict[int, Trace]]:
         """Convergence of every equation with every p, at the orders of the model of that p."""
@@ -264,18 +269,26 @@ class StageWork:
         )  # fmt: skip
 
     def derived(self, model: Model) -> Derived:
-        """The deflection with the current's order as published and as derived, all other numbers alike."""
+        """The deflection by (14)-(15), and with the same numbers by (22)-(25) as published."""
+        h, d = self.number * 2 - 1, self.number * 2
         output = self.measured.outputs[1]
-        order = order_law(self.number, "derived")["input"].at(model.orders)
-        equations = []
-        for item in model.equations:
-            terms = [replace(t, order=Order(order)) if t.signal in self.on.inputs else t for t in item.terms]
-            equations.append(replace(item, terms=tuple(terms)) if item.output == output else item)
-        other = replace(model, structure=replace(model.structure, equations=tuple(equations)))
-        published, derived = (compare_means(m, self.on) for m in (model, other))
+        known = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
+        known |= {n: model.coefficients[n] for n in (f"b{h}", f"g{h}")}
+        known |= {f"{c}{d}": -known[f"{c}{h}"] for c in "bg"}
+        known |= {f"{c}{d}": known[f"{c}{d}"] - known[f"{c}{h}"] for c in "ad"}
+        orders = {**model.orders, f"alpha{d}": next(e.order.constant for e in model.equations if e.output == output)}
+        other = link_model(
+            stage=self.number, form="published", orders=orders, coefficients=known,
+            coupling=model.structure.coupling,
+        )  # fmt: skip
+        other = replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
+        whole, published = (compare_means(m, self.on) for m in (model, other))
+        drive = f"I{self.number}"
+        current = _core.pulse_means(self.on[drive], whole.m, self.on.intersample[drive] == "zoh")
         return Derived(
-            output, order, pulse_times(published), published.simulated[output][0], derived.simulated[output][0]
-        )
+            output, order_law(self.number, "derived")["input"].at(orders), pulse_times(whole), current,
+            whole.measured[output][0], published.simulated[output][0], whole.simulated[output][0],
+        )  # fmt: skip
 
 
 def thinned(run: Run, every: int) -> Run:
