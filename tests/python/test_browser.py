@@ -230,7 +230,7 @@ def test_the_paper_s_page_names_what_holds_first(browser, folder):
         page = opened.page
         heads = page.locator("h2").all_inner_texts()
         assert heads[0] == "What holds and what does not"
-        assert page.locator(".verdict strong").count() == 11
+        assert page.locator(".verdict strong").count() == 12
         assert page.locator("svg.chart.narrow").first.is_visible()
         # Zooming works here, too.
         page.locator(".zoom.narrow button:visible").first.click()

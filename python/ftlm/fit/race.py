@@ -94,9 +94,9 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
         except ModelError:
             # At whole orders two of its terms have become one.
             continue
-        if isinstance(less, Simpler) and less.driven:
-            # Driven by the measurement, most starts lead to one optimum: those that are nearest already will do.
-            runners = laps.run(coarse, runners, 1, less.problem)[:FEWEST]
+        if isinstance(less, Whole) or (isinstance(less, Simpler) and less.driven):
+            # Driven by the measurement, or at given orders, most starts lead to one optimum: the nearest ones will do.
+            runners = laps.run(coarse, runners, 1, less.problem)[: FINALISTS if isinstance(less, Whole) else FEWEST]
         ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
         ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
         reached = sorted(reached + [less.embedded(a, problem) for a in ended[:1]], key=lambda a: a.level)

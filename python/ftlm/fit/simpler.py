@@ -11,7 +11,11 @@ from ftlm.data.run import Run
 from ftlm.data.structures import Hints, History
 from ftlm.fit.grid import Attempt
 from ftlm.fit.problem import FreeProblem
+from ftlm.fit.starts import whole_orders
 
+#: Whole orders that stand for a free one, and how many points of them a race looks at.
+WHOLE = (0.0, 1.0, 2.0, 3.0)
+MOST_WHOLE = 12
 #: A pole of this many radians a sample is faster than the samples see.
 FAST_POLE = 0.2
 
@@ -116,24 +120,40 @@ class Whole:
 
 
 def whole(problem: FreeProblem, near: Sequence[float]) -> list[Whole]:
-    """The problem with whole orders, the physics' own or those nearest to a point; none where they make no equation."""
+    """The problem with whole orders: the usual ones, those nearest to a point, and each with one of them at another.
+
+    Between two whole orders the coefficient of what drives may change its sign, and no descent crosses that: what is
+    nearest need not be what is lowest. None where they make no equation.
+    """
     natural = (problem.structure.hints or Hints()).natural
-    orders = []
-    for name, value, (low, high) in zip(problem.orders, near, problem.bounds, strict=True):
-        known = [v for v in natural.get(name, ()) if v == round(v)]
-        order = float(min(known, key=lambda v: abs(v - value))) if known else float(round(value))
-        if not low <= order <= high:
-            return []
-        orders.append(order)
-    if not orders:
+    usual = whole_orders(problem)
+    values: list[list[float]] = []
+    points: list[list[float]] = []
+    for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
+        known = [v for v in natural.get(name, ()) if v == round(v)] or WHOLE
+        values.append([v for v in known if low <= v <= high])
+    if not values or not all(values):
         return []
+    for point in (usual, near):
+        first = [_nearest(v, at) for v, at in zip(values, point, strict=True)]
+        points += [first, *([*first[:k], w, *first[k + 1 :]] for k, v in enumerate(values) for w in v if w != first[k])]
+    each = {tuple(point): None for point in points}
+    return [found for orders in each if (found := _at_whole(problem, orders)) is not None][:MOST_WHOLE]
+
+
+def _nearest(values: Sequence[float], at: float) -> float:
+    return min(values, key=lambda v: abs(v - at))
+
+
+def _at_whole(problem: FreeProblem, orders: Sequence[float]) -> Whole | None:
+    """The problem at some whole orders, if they make an equation."""
     try:
         reduced = FreeProblem.of(problem.structure.with_orders(dict(zip(problem.orders, orders, strict=True))))
     except FtlmError:
         # Two terms of a signal have become one.
-        return []
+        return None
     # Terms in the order in which they stand, so coefficients keep their places.
-    return [Whole(reduced, tuple(orders))] if reduced.coefficients == problem.coefficients else []
+    return Whole(reduced, tuple(orders)) if reduced.coefficients == problem.coefficients else None
 
 
 def simpler(problem: FreeProblem) -> list[Simpler]:

@@ -9,6 +9,8 @@ const WIDEST: f64 = 0.25;
 const NARROWEST: f64 = 1e-12;
 /// Largest turn of the curve [rad] between two points.
 const TURN: f64 = 0.5;
+/// Powers of s nearer to each other than this are told apart beyond ω = e^1000 alone.
+const SAME: f64 = 1e-3;
 /// Zeros to the right, counted by the argument, from which there is one: half of one that lies on the axis counts.
 const ONE: f64 = 0.25;
 
@@ -26,8 +28,7 @@ const ONE: f64 = 0.25;
 /// ```
 #[must_use]
 pub fn grows(alpha: f64, own: &[(f64, f64)]) -> bool {
-    let powers: Vec<(f64, f64)> =
-        std::iter::once((1.0, alpha)).chain(own.iter().map(|&(c, nu)| (-c, nu))).filter(|(c, _)| *c != 0.0).collect();
+    let powers = distinct(std::iter::once((1.0, alpha)).chain(own.iter().map(|&(c, nu)| (-c, nu))).collect());
     let by_power = |a: &&(f64, f64), b: &&(f64, f64)| a.1.total_cmp(&b.1);
     let (Some(&low), Some(&high)) = (powers.iter().min_by(by_power), powers.iter().max_by(by_power)) else {
         return false;
@@ -52,6 +53,20 @@ pub fn grows(alpha: f64, own: &[(f64, f64)]) -> bool {
     0.5 * (high.1 - low.1) - turned / PI > ONE
 }
 
+/// Powers that differ: those nearer to each other than [`SAME`] are one at all frequencies that anything is measured at.
+fn distinct(mut powers: Vec<(f64, f64)>) -> Vec<(f64, f64)> {
+    powers.sort_by(|a, b| a.1.total_cmp(&b.1));
+    let mut out: Vec<(f64, f64)> = Vec::with_capacity(powers.len());
+    for (c, p) in powers {
+        match out.last_mut() {
+            Some(last) if p - last.1 < SAME => last.0 += c,
+            _ => out.push((c, p)),
+        }
+    }
+    out.retain(|(c, _)| *c != 0.0 && c.is_finite());
+    out
+}
+
 /// The curve at ω, in units of its largest power.
 fn curve(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
     let logs = || powers.iter().map(|(c, p)| c.abs().ln() + p * log_omega);
@@ -66,10 +81,11 @@ fn curve(powers: &[(f64, f64)], log_omega: f64) -> (f64, f64) {
 fn turn(powers: &[(f64, f64)], from: (f64, (f64, f64)), to: (f64, (f64, f64))) -> f64 {
     let ((a, (x, y)), (b, (u, v))) = (from, to);
     let angle = (x * v - y * u).atan2(x * u + y * v);
-    if angle.abs() <= TURN || b - a < NARROWEST {
+    let middle = 0.5 * (a + b);
+    // Far out neighbouring numbers are wider apart than the narrowest step.
+    if angle.abs() <= TURN || b - a < NARROWEST || middle <= a || middle >= b {
         return angle;
     }
-    let middle = 0.5 * (a + b);
     let there = (middle, curve(powers, middle));
     turn(powers, from, there) + turn(powers, there, to)
 }
@@ -103,6 +119,19 @@ mod tests {
                 assert_eq!(grows(1.2, &[(c, 0.6), (-1.0, 0.0)]), angle < 0.3 * PI, "c = {c}");
             }
         }
+    }
+
+    #[test]
+    fn powers_that_nearly_agree_end() {
+        // What a fit of a real link came to: two own terms beside the highest, whose small differences are all there is.
+        for gap in [1e-15, 1e-12, 1e-9, 1e-6, 1e-3, 1.1e-3, 2e-3, 1e-2] {
+            for c in [1.0, 0.999_999, -1.0, 1e-9, 1e9] {
+                grows(2.0, &[(c, 2.0 - gap), (-c, gap)]);
+                grows(2.0, &[(c, 2.0 - gap), (-c, 2.0 - 2.0 * gap), (-1.0, 0.0)]);
+            }
+        }
+        assert!(!grows(2.0, &[(-2.0, 1.0), (-2.0, 1.0 + 1e-12), (-4.0, 0.0)]));
+        assert!(grows(2.0, &[(2.0, 1.0), (2.0, 1.0 + 1e-12), (-4.0, 0.0)]));
     }
 
     #[test]
