@@ -124,10 +124,14 @@ mod tests {
     #[test]
     fn powers_that_nearly_agree_end() {
         // What a fit of a real link came to: two own terms beside the highest, whose small differences are all there is.
-        for gap in [1e-15, 1e-12, 1e-9, 1e-6, 1e-3, 1.1e-3, 2e-3, 1e-2] {
-            for c in [1.0, 0.999_999, -1.0, 1e-9, 1e9] {
-                grows(2.0, &[(c, 2.0 - gap), (-c, gap)]);
-                grows(2.0, &[(c, 2.0 - gap), (-c, 2.0 - 2.0 * gap), (-1.0, 0.0)]);
+        for c in [1.0, 0.999_999, -1.0, 1e-9, 1e9] {
+            for gap in [1e-15, 1e-12, 1e-9, 1e-6] {
+                // (1 − c) s² + c and s² + 1, on the axis at best.
+                assert_eq!(grows(2.0, &[(c, 2.0 - gap), (-c, gap)]), c != 1.0, "{c} {gap}");
+                assert!(grows(2.0, &[(c, 2.0 - gap), (-c, 2.0 - 2.0 * gap), (-1.0, 0.0)]), "{c} {gap}");
+            }
+            for gap in [1e-3, 1.1e-3, 2e-3, 1e-2] {
+                assert!(!grows(2.0, &[(-c.abs(), 2.0 - gap), (-c.abs(), 1.0), (-1.0, 0.0)]), "{c} {gap}");
             }
         }
         assert!(!grows(2.0, &[(-2.0, 1.0), (-2.0, 1.0 + 1e-12), (-4.0, 0.0)]));
