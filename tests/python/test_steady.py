@@ -125,11 +125,14 @@ def test_whole_orders_are_where_fractional_ones_start() -> None:
     assert less.problem.orders == ()
     at = less.embedded(Attempt([], [-400.0, -1.0, -2.0, -3.0, 0.1, 0.1], "x", {}), FreeProblem.of(link))
     assert (at.orders, at.origin) == ([0.0], "x, from whole orders")
-    # Without a physics, those nearest to where the fit is; none that are out of bounds or make two terms one.
+    # Without a physics, the usual ones, those nearest to where the fit is, and each with one of them at another.
     words = FreeProblem.of(ftlm.equation("D^alpha y = a D^nu y + b u"))
-    assert [w.orders for w in whole(words, [1.6, 0.7])] == [(2.0, 1.0)]
-    assert whole(words, [0.3, 0.2]) == []
-    assert whole(words, [0.8, 0.7]) == []
+    assert [w.orders for w in whole(words, [1.6, 0.7])] == [(2.0, 1.0), (3.0, 1.0), (2.0, 0.0)]
+    assert (1.0, 0.0) in [w.orders for w in whole(words, [1.4, 0.2])]
+    # None that are out of bounds or make two terms one.
+    assert all(nu < alpha for alpha, nu in (w.orders for w in whole(words, [0.8, 0.7])))
+    driven = FreeProblem.of(ftlm.equation("D^2 y = a y + b D^gamma u"))
+    assert {w.orders for w in whole(driven, [0.1])} == {(0.0,), (1.0,), (2.0,)}
     assert whole(FreeProblem.of(ftlm.equation("D y = a y + b u")), []) == []
 
 
