@@ -1,6 +1,7 @@
 """Structures chosen by what they predict: the true one among those inside a richer one, and words where none can be."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -176,6 +177,11 @@ def test_words_where_nothing_can_be_chosen(runs):
         ftlm.select(runs, {str(k): ftlm.equation(f"D^{1 + k * 1e-5:.6f} y = a y + b u") for k in range(10_001)})
     with pytest.raises(ftlm.DataError, match="has 40 rows, too few to be cut into 4 blocks"):
         ftlm.select(runs[0].slice(0, 0.8), second)
+    with pytest.raises(ftlm.ModelError, match="motor 1 is one of those that are fitted to, which judges nothing"):
+        ftlm.select(runs, second, validation=runs[1])
+    idle = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(300)}, outputs={"y": 1e-3 * np.sin(np.arange(300.0))})
+    with pytest.raises(ftlm.DataError, match="u is 0 throughout"):
+        ftlm.select(idle, replace(second, initial="rest"))
     with pytest.raises(ftlm.DataError, match="signal"):
         ftlm.select(runs, ftlm.equation("D^2 z = a z + b u"))
 

@@ -70,10 +70,10 @@ def select(
     Raises
     ------
     DataError
-        Runs that do not fit together or the structure, or that are too short to be cut.
+        Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing.
     ModelError
         No candidates, two that are the same, more than 10 000, words that are not known, one run where several are
-        needed.
+        needed, a validation run that is fitted to.
     ConvergenceError
         No candidate that can be fitted.
 

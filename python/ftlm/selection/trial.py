@@ -106,7 +106,7 @@ class Folds:
         Raises
         ------
         ModelError
-            Words that are not known, or one run where several are needed.
+            Words that are not known, one run where several are needed, or a validation run that is fitted to.
         DataError
             Runs that do not fit together, or that are too short to be cut.
         """
@@ -114,6 +114,12 @@ class Folds:
         if not isinstance(validation, str):
             others = as_runs(validation)
             as_runs([*every, *others])
+            for run in others:
+                if any(_same(run, fitted) for fitted in every):
+                    raise ModelError(
+                        f"validation run {run.name} is one of those that are fitted to, which judges nothing; leave it "
+                        "out of one of the two, or use validation='runs'"
+                    )
             names = ", ".join(r.name for r in others)
             return cls(every, tuple(Fold(every, run) for run in others), f"{names}, not fitted to")
         if validation == "runs":
@@ -128,6 +134,12 @@ class Folds:
             raise ModelError(f"validation = {validation!r} is not known; use 'runs', 'blocks', or a run")
         parts = [Fold(every, run, rows) for run in every for rows in blocks(run)]
         return cls(every, tuple(parts), f"each of {len(parts)} blocks, its outputs unread, by the rest")
+
+
+def _same(one: Run, other: Run) -> bool:
+    """Whether two runs hold the same samples."""
+    names = one.signals
+    return one.length == other.length and all(np.array_equal(one[n], other[n], equal_nan=True) for n in names)
 
 
 def blocks(run: Run) -> list[tuple[int, int]]:
