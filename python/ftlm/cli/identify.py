@@ -34,6 +34,7 @@ from ftlm.data.lattice import Lattice
 from ftlm.data.settings import check_used
 from ftlm.data.structures import Structure
 from ftlm.identification import identify as estimation
+from ftlm.model.model import load_model
 from ftlm.search.job import run_job
 from ftlm.search.orders import make_job, resume_job, search_status
 from ftlm.search.result import SearchResult
@@ -57,6 +58,9 @@ def identify(
         Literal["auto", "quadratic", "profile"] | None,
         Option(help="Of output error: by profile likelihood for all numbers, or (default) where it matters."),
     ] = None,
+    start: Annotated[
+        Text, Option(metavar="MODEL", help="Of output error: a saved model, simpler or not, to start from as well.")
+    ] = None,
     threads: Threads = None,
     reference: Annotated[
         Text, Option(metavar="SIGNAL", help="What drives a closed loop from outside; also name it with -u.")
@@ -72,6 +76,7 @@ def identify(
     """Identify a model: orders on a lattice, coefficients, both errors, warnings in words."""
     check_free(out, report, force=force, words=COMMAND)
     wanted = shape.structure(structure)
+    begin = None if start is None else load_model(start)
     runs = reading.runs(files)
     # The slice is of the runs that are identified from.
     others = replace(reading, sliced=None).runs([validation]) if validation is not None else []
@@ -79,7 +84,7 @@ def identify(
         result = estimation.identify(
             runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
             genetic=genetic.settings(method), threads=threads, progress=progress, store=store,
-            loss=loss, intervals=intervals, reference=reference,
+            loss=loss, intervals=intervals, reference=reference, start=begin,
         )  # fmt: skip
     if out is not None:
         result.model.save(out, force=force)

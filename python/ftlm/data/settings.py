@@ -23,7 +23,7 @@ USED_BY: dict[str, tuple[str, ...]] = {
     "lattice": METHODS[1:], "criterion": _LATTICE, "norm": METHODS[1:], "keep": _LATTICE,
     "innovation_length": ("multi-innovation",), "prior_covariance": ("multi-innovation",),
     "rows": ("multi-innovation",), "genetic": ("genetic",), "loss": METHODS[:1], "reference": METHODS[:1],
-    "intervals": METHODS[:1],
+    "intervals": METHODS[:1], "start": METHODS[:1],
     "store": _LATTICE, "executor": _LATTICE,
 }  # fmt: skip
 #: What belongs to the search of orders: lattice methods use it only where an order is free.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +28,7 @@ RARE = 0.01
 def fit_any_start(
     runs: Sequence[Run], structure: Structure, start: Initial, *, threads: int = 1,
     progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
+    known: Sequence[Mapping[str, float]] = (),
 ) -> JointFit:  # fmt: skip
     """Fit a structure on runs whose initial terms look like `start`, and decide by the fit where it leaves them open.
 
@@ -37,7 +38,7 @@ def fit_any_start(
 
     def fitted(initial: Initial) -> JointFit:
         asked = replace(structure, initial=initial)
-        return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss)
+        return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss, known=known)
 
     joint = fitted(start)
     if structure.initial != "auto" or not has_memory(structure) or structure.has_friction:

@@ -174,12 +174,14 @@ class JointFit:
 def fit_output_error(
     runs: Sequence[Run], structure: Structure, *, threads: int = 1, start: Mapping[str, float] | None = None,
     refine: bool = True, progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
+    known: Sequence[Mapping[str, float]] = (),
 ) -> JointFit:  # fmt: skip
     """Fit all equations of a structure on all runs by output error, from an automatic start.
 
     A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
-    everything free by name; without `refine` the grid is not refined below the samples. Progress is told (starts done,
-    starts in all). The loss decides between optima on all samples, not between starts.
+    everything free by name, and is the only one; known ones stand beside the automatic ones. Without `refine` the grid
+    is not refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
+    all samples, not between starts.
 
     Raises
     ------
@@ -206,10 +208,10 @@ def fit_output_error(
         floor = float(np.mean([(noise[o] / (COARSE_SHARE * sizes[o])) ** 2 for o in outputs]))
         runners = race_with_friction if structure.has_friction else race
         reached = runners(alike, floor, threads, progress)
-        starts, contenders = [(a.level, a.origin) for a in reached], finalists(reached)
+        starts, contenders = [(a.level, a.origin) for a in reached], finalists(reached) if reached else []
+        contenders += [given(problem, values) for values in known]
     else:
-        orders, coefficients, inputs = problem.split([start[n] for n in problem.names])
-        contenders = [Attempt(orders, coefficients, "given start", {}, inputs)]
+        contenders = [given(problem, start)]
     if not contenders:
         raise ConvergenceError(
             f"no start of {', '.join(outputs)} has a finite free run; check the signs of the data and the bounds"
@@ -224,6 +226,12 @@ def fit_output_error(
         best, weighed = with_settled_weights(best, weighed, loss)
     optimum = refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True)
     return replace(joint_fit(optimum, starts), growth=growth)
+
+
+def given(problem: FreeProblem, values: Mapping[str, float]) -> Attempt:
+    """A start by name."""
+    orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
+    return Attempt(orders, coefficients, "given start", {}, inputs)
 
 
 def first_noise(runs: Sequence[Run], structure: Structure, output: str, size: float) -> float:

@@ -16,12 +16,14 @@ from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.data.settings import Intervals, Loss, Settings
+from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.coefficients import estimate_coefficients, step_bias
 from ftlm.fit.genetic import Genetic, genetic_search
 from ftlm.fit.history import fit_any_start
 from ftlm.fit.instrument import instrumented
 from ftlm.fit.joint import JointFit
+from ftlm.fit.known import known_starts, values_of_model
 from ftlm.fit.problem import FreeProblem
 from ftlm.identification.intervals import with_intervals
 from ftlm.identification.judged import Task
@@ -103,7 +105,8 @@ def loss_setting(joint: JointFit) -> dict[str, Any]:
 
 def by_output_error(
     task: Task, m: int | None, threads: int, progress: Told, answers: Sequence[Run] | None = None,
-    loss: Loss = "squares", intervals: Intervals = "auto",
+    loss: Loss = "squares", intervals: Intervals = "auto", begin: Solved | Mapping[str, float] | None = None,
+    more: Mapping[str, float] | None = None,
 ) -> Fit:  # fmt: skip
     """Orders and coefficients together by joint output error; answers of the inputs to a reference are instruments."""
     # An order with one value is known.
@@ -111,7 +114,14 @@ def by_output_error(
     structure = task.structure.with_orders(known)
     record = prepare(task.runs, structure.as_given(), m, power_of_two=False, gaps=True)[0]
     start = record.initial
-    joint = fit_any_start(answers or task.runs, structure, start, threads=threads, progress=progress, loss=loss)
+    begins: list[dict[str, float]] = []
+    if begin is not None:
+        free = FreeProblem.of(replace(structure, initial="rest"))
+        told = values_of_model(free, begin, more or {}) if isinstance(begin, Solved) else begin
+        begins = known_starts(free, told)
+    joint = fit_any_start(
+        answers or task.runs, structure, start, threads=threads, progress=progress, loss=loss, known=begins
+    )
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     lower: list[str] = []
     if answers is not None:

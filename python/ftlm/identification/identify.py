@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any, Literal
@@ -16,7 +16,7 @@ from ftlm.data.lattice import Lattice, check_lattice, check_lattice_names
 from ftlm.data.run import Run
 from ftlm.data.settings import INTERVALS, LOSSES, METHODS, Intervals, Loss, Settings, check_used
 from ftlm.data.several import as_runs
-from ftlm.data.solved import Estimate
+from ftlm.data.solved import Estimate, Solved
 from ftlm.data.structures import Structure, check_offset
 from ftlm.fit.genetic import Genetic
 from ftlm.identification.estimate import Fit, by_genetic_algorithm, by_lattice, by_output_error
@@ -56,6 +56,7 @@ def identify(
     reference: str | None = None,
     loss: Loss | None = None,
     intervals: Intervals | None = None,
+    start: Identification | Solved | Mapping[str, float] | None = None,
 ) -> Identification:
     """Identify a structure from measured runs.
 
@@ -118,6 +119,12 @@ def identify(
         ``"auto"`` (default), by profile likelihood for the numbers for which two free runs each say that the quadratic
         picture is off by over a tenth. See :meth:`ftlm.Identification.profile`.
 
+    start
+        Of output error: what is known already, from where it starts besides its automatic starts, so that it never
+        ends with a larger cost than one gets from there: an identification or a model of the same outputs, simpler or
+        not, or values of free numbers by name. What it does not have starts at the coefficient 0; an order that is
+        free now and was a number there starts at that number.
+
     Returns
     -------
     Identification
@@ -130,7 +137,8 @@ def identify(
         store of other searches, in use, damaged, or that cannot be written.
     ModelError
         A method that is not known, an option that it does not use, a lattice without or with too many candidates,
-        settings out of range, a store or an executor without an order search, a store with ``offset="auto"``.
+        settings out of range, a store or an executor without an order search, a store with ``offset="auto"``, a start
+        that has none of the free numbers, others, or values out of their bounds.
     ConvergenceError
         Regressors that cannot be told apart at the given orders, or an executor that has lost its workers.
     """
@@ -163,7 +171,7 @@ def identify(
         )
     others = {
         "loss": loss, "intervals": intervals, "lattice": lattice, "genetic": genetic, "store": store,
-        "executor": executor, "reference": reference,
+        "executor": executor, "reference": reference, "start": start,
     }  # fmt: skip
     given = [*(n for n, value in others.items() if value is not None), *words]
     estimator = "least-squares" if method in ("output-error", "genetic") else method
@@ -176,12 +184,18 @@ def identify(
             "offset='auto' may need two searches, and a store keeps those of one; use offset='none' or "
             "offset='constant' with store="
         )
+    if not (start is None or isinstance(start, (Identification, Solved, Mapping))):
+        raise ModelError(f"start is {type(start).__name__}; give an identification, a model, or values by name")
+    begin = start.model if isinstance(start, Identification) else start
+    more = start.joint_values if isinstance(start, Identification) else {}
     answers, weak = (None, []) if reference is None else driven_by(several, structure, reference)
 
     def estimate(asked: Structure) -> Fit:
         task = Task(tuple(several), asked, lattice)
         if method == "output-error":
-            return by_output_error(task, m, settings.threads, progress, answers, loss or "squares", intervals or "auto")
+            return by_output_error(
+                task, m, settings.threads, progress, answers, loss or "squares", intervals or "auto", begin, more
+            )
         if method == "genetic":
             return by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress)
         return by_lattice(task, settings, m, progress, store, executor)
