@@ -67,6 +67,12 @@ def test_the_command_takes_a_saved_model(run, simple, tmp_path):
     done = CliRunner().invoke(app, [*words, *more, "--start", str(tmp_path / "simple.json")])
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["output_error"]["y"]["rmse"] <= simple.output_error["y"].rmse * (1 + 1e-3)
+    unused = CliRunner().invoke(
+        app,
+        [*words, "--method", "least-squares", "--lattice", "alpha=1.5:2:0.1", "--start", str(tmp_path / "simple.json")],
+    )
+    assert unused.exit_code == 2
+    assert "--start is not used by --method least-squares" in unused.output
     wrong = CliRunner().invoke(app, [*words, *more, "--start", str(tmp_path / "none.json")])
     assert wrong.exit_code == 3
 

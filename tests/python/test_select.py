@@ -213,10 +213,14 @@ def test_the_command(tmp_path):
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["chosen"] == "D^2 y = d D^1 y + a y + b u"
     assert ftlm.load_model(model).coefficients["a"] == pytest.approx(-40, rel=0.02)
-    both = ["--by", "runs", "--validation", files[0]]
-    asked = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "D y = a y + b u", *both])
+    first = ["--structure", "D y = a y + b u"]
+    asked = CliRunner().invoke(app, ["select", files[0], *columns, *first, "--validation", "runs"])
     assert asked.exit_code == 2
-    assert "both say what judges" in asked.output
+    assert "--validation runs leaves one run out at a time, and there is one" in asked.output
+    assert "or use --validation blocks" in asked.output
+    by_file = CliRunner().invoke(app, ["select", files[0], *columns, *first, "--validation", files[1]])
+    assert by_file.exit_code == 0, by_file.output
+    assert "1, not fitted to" in by_file.output
     wrong = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "auto", "--order", "alpha=1"])
     assert wrong.exit_code == 2
     assert "--order: of a structure that is given, not used with --structure auto" in wrong.output

@@ -54,6 +54,8 @@ GIVEN = {
     "loss": ("huber", ["--loss", "huber"]),
     "intervals": ("quadratic", ["--intervals", "quadratic"]),
     "reference": ("r", ["--reference", "r"]),
+    # By command in test_known_starts.py: it names a file that must be there.
+    "start": ({"alpha": 1.5}, None),
 }
 #: What belongs to every method: what is identified, on which grid, with how much of the machine.
 EVERYONE = {"runs", "structure", "method", "offset", "m", "threads", "progress"}

@@ -19,11 +19,12 @@ from ftlm.selection import select as choice
 @command
 def select(
     *, files: Files, structures: CandidateTexts, reading: ReadingOptions, shape: StructureOptions,
-    by: Annotated[
-        Text, Option("--by", metavar="runs|blocks", help="Judge each run, or each quarter of a run, by the others.")
-    ] = None,
     validation: Annotated[
-        Text, Option(metavar="FILE", help="Judge by this run instead; nothing is fitted to it.")
+        Text,
+        Option(
+            metavar="runs|blocks|FILE",
+            help="Judge each run, or each quarter of every run, by the others; or by a run that nothing is fitted to.",
+        ),
     ] = None,
     threads: Threads = None, out: Out = None,
     report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
@@ -31,8 +32,6 @@ def select(
 ) -> None:  # fmt: skip
     """Choose the terms and orders that earn their place on what they were not fitted to."""
     check_free(out, report, force=force, words=COMMAND)
-    if by is not None and validation is not None:
-        raise ModelError(f"--by {by} and --validation {validation} both say what judges; leave one out")
     if "auto" in structures and len(structures) > 1:
         raise ModelError("--structure auto is searched by itself; leave the others out, or give them without it")
     if structures == ["auto"]:
@@ -45,7 +44,8 @@ def select(
         candidates = made[0] if len(made) == 1 else made
     runs = reading.runs(files)
     # The slice is of the runs that are fitted to.
-    judges = replace(reading, sliced=None).runs([validation]) if validation is not None else by
+    of_its_own = validation not in (None, "runs", "blocks")
+    judges = replace(reading, sliced=None).runs([str(validation)]) if of_its_own else validation
     with Progress("fitting candidates", quiet=as_json) as progress:
         found = choice.select(runs, candidates, validation=judges, threads=threads, progress=progress)
     if out is not None:

@@ -17,7 +17,8 @@ OPTIONS = {
     "input_order": "--input-order",
     "friction": "--friction", "cross_stage": "--cross-stage", "cross_sensitivity": "--cross-sensitivity",
     "tolerance": "--tolerance", "lags": "--lags",
-    "delay": "--delay", "force": "--force", "offset": "--offset", "reference": "--reference",
+    "delay": "--delay", "force": "--force", "offset": "--offset", "reference": "--reference", "start": "--start",
+    "validation": "--validation",
     "loss": "--loss", "intervals": "--intervals", "missing": "--missing",
 }  # fmt: skip
 #: ``force=True (--force)``, where the option stands beside the argument already.
