@@ -165,13 +165,12 @@ fn solve_sized<const L: usize>(k: usize, gram: &mut [Lanes<L>], rhs: &mut [Lanes
     singular
 }
 
-/// Solution of a symmetric positive definite system by nalgebra's Cholesky factor: the oracle of [`solve_lanes`].
-#[cfg(feature = "oracles")]
+/// Solution of a small symmetric row-major system; none where it is not positive definite. O(k³).
 #[must_use]
-pub fn solve_gram_oracle(gram: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
+pub fn positive_solve(matrix: &[f64], rhs: &[f64]) -> Option<Vec<f64>> {
     let k = rhs.len();
-    let solution = DMatrix::from_row_slice(k, k, gram).cholesky()?.solve(&DVector::from_column_slice(rhs));
-    Some(solution.as_slice().to_vec())
+    let solved = DMatrix::from_row_slice(k, k, matrix).cholesky()?.solve(&DVector::from_column_slice(rhs));
+    Some(solved.iter().copied().collect())
 }
 
 /// Solves `R x = c` for upper-triangular row-major R (k × k with row stride `stride`).

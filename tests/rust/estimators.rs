@@ -469,7 +469,7 @@ fn dependent_columns_of_a_gram_matrix() {
     assert_eq!(x[3], 0.0);
     columns.remove(3);
     let (g, b) = gram(&columns, &target);
-    let oracle = small::solve_gram_oracle(&g, &b).unwrap();
+    let oracle = small::positive_solve(&g, &b).unwrap();
     x.remove(3);
     assert!(relative_distance(&x, &oracle) < 1e-12);
     // NaN counts as dependent, and nothing at all is solved at once.
@@ -583,7 +583,7 @@ proptest! {
             .collect();
         let target = random.signal(60);
         let (g, b) = gram(&columns, &target);
-        let oracle = small::solve_gram_oracle(&g, &b).unwrap();
+        let oracle = small::positive_solve(&g, &b).unwrap();
         let (b, singular) = solve_one(&g, &b, k);
         prop_assert!(!singular);
         for i in 0..k {

@@ -208,3 +208,37 @@ fn a_short_step_is_no_minimum() {
     let found = minimise(&problem, vec![0.0], Settings { evaluations: 1000, tolerance: 1e-6 }).unwrap();
     assert_eq!(found.status, Status::Stalled);
 }
+
+/// The problem of Brown & Dennis: residuals of some hundred each at its minimum of 85822.2, where Gauss–Newton creeps
+/// (Moré, Garbow & Hillstrom, doi:10.1145/355934.355936, problem 16).
+#[test]
+fn large_residuals_bend_the_steps() {
+    let time = |i: usize| (i + 1) as f64 / 5.0;
+    let parts = move |x: &[f64], i: usize| {
+        let t = time(i);
+        (x[0] + t * x[1] - t.exp(), x[2] + t.sin() * x[3] - t.cos())
+    };
+    let problem = Closed {
+        residuals: move |x: &[f64]| Ok((0..20).map(|i| parts(x, i)).map(|(a, b)| a * a + b * b).collect()),
+        jacobian: move |x: &[f64]| {
+            let column = |of: &dyn Fn(f64, f64, f64) -> f64| {
+                (0..20)
+                    .map(|i| {
+                        let (a, b) = parts(x, i);
+                        of(a, b, time(i))
+                    })
+                    .collect::<Vec<f64>>()
+            };
+            vec![
+                column(&|a, _, _| 2.0 * a),
+                column(&|a, _, t| 2.0 * a * t),
+                column(&|_, b, _| 2.0 * b),
+                column(&|_, b, t| 2.0 * b * t.sin()),
+            ]
+        },
+    };
+    let settings = Settings { evaluations: 40, tolerance: 1e-12 };
+    let found = minimise(&problem, vec![25.0, 5.0, -5.0, -1.0], settings).unwrap();
+    assert_eq!(found.status, Status::Converged, "{} evaluations, {}", found.evaluations, found.cost);
+    check("Brown & Dennis", (2.0 * found.cost / 85_822.201_626_356_3 - 1.0).abs(), 1e-8);
+}

@@ -532,3 +532,87 @@ fn a_number_that_is_held_stays_and_the_others_are_the_optimum_beside_it() {
         }
     }
 }
+
+/// D^1.5 y = c₀ y + c₁ u₁ + c₂ D^0.3 u₂ on two runs.
+fn driven() -> (FreeModel, Vec<Experiment>) {
+    let fixed = |order: f64| AffineOrder { constant: order, weights: Vec::new() };
+    let model = FreeModel {
+        equations: vec![FreeEquation {
+            output: 0,
+            order: fixed(1.5),
+            terms: vec![
+                (0, fixed(0.0), monomial(1.0, &[0])),
+                (1, fixed(0.0), monomial(1.0, &[1])),
+                (2, fixed(0.3), monomial(-1.0, &[2])),
+            ],
+        }],
+        order_bounds: Vec::new(),
+        coordinates: vec![Coordinate::Logarithm; 3],
+        inputs: Vec::new(),
+        coupled: false,
+        initial: Initial::Caputo,
+    };
+    let mut random = Random::new(811);
+    let experiments = (0..2)
+        .map(|_| {
+            let inputs = [random.steps(240, 6), random.steps(240, 9)];
+            let signals = record(0.05, vec![vec![0.0; 240], inputs[0].clone(), inputs[1].clone()]);
+            let truth = equation(0, 1.5, &[(0, 0.0, -4.0), (1, 0.0, 3.0), (2, 0.3, -0.5)]);
+            let clean = simulate::respond(&[truth], &signals, &[Vec::new()]).unwrap();
+            let samples = point_samples(&clean[0]).iter().map(|v| v + 0.01 * random.normal()).collect();
+            Experiment::new(signals, 1, vec![samples], vec![1.0]).unwrap()
+        })
+        .collect();
+    (model, experiments)
+}
+
+#[test]
+fn what_drives_is_solved_for_as_dense_least_squares_does() {
+    let (mut model, experiments) = driven();
+    let once = Settings { evaluations: 1, ..Settings::default() };
+    let residuals = |b: f64, c: f64| fit(&model, &experiments, &point(&[], &[-3.0, b, c]), once).unwrap().residuals;
+    // The residuals are linear in both: columns by differences, and the normal equations.
+    let none = residuals(1e-300, 1e-300);
+    let columns: Vec<Vec<f64>> = [residuals(1.0, 1e-300), residuals(1e-300, 1.0)]
+        .iter()
+        .map(|there| there.iter().zip(&none).map(|(a, b)| a - b).collect())
+        .collect();
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+    let gram: Vec<f64> = columns.iter().flat_map(|a| columns.iter().map(|b| dot(a, b))).collect();
+    let rhs: Vec<f64> = columns.iter().map(|a| -dot(a, &none)).collect();
+    let best = dense_solve(&gram, &rhs);
+    model.coordinates[0] = Coordinate::Held;
+    for start in [[1.0, 1.0], [-700.0, 2e5]] {
+        let settings = Settings { evaluations: 5, ..Settings::default() };
+        let found = fit(&model, &experiments, &point(&[], &[-3.0, start[0], start[1]]), settings).unwrap();
+        assert_eq!(found.status, Status::Converged);
+        check("linear coefficients", relative_distance(&found.point.coefficients[1..], &best), 1e-8);
+    }
+}
+
+#[test]
+fn where_what_drives_starts_does_not_matter() {
+    let (model, experiments) = driven();
+    let settings = Settings { evaluations: 15, tolerance: 1e-12 };
+    let ends: Vec<Fit> = [[3.0, 0.5], [-3.0, -0.5], [1e4, -1e-4]]
+        .iter()
+        .map(|start| fit(&model, &experiments, &point(&[], &[-1.5, start[0], start[1]]), settings).unwrap())
+        .collect();
+    for found in &ends {
+        assert_eq!(found.status, Status::Converged, "{:?}", found.point);
+        check("truth", relative_distance(&found.point.coefficients, &[-4.0, 3.0, 0.5]), 0.02);
+        check("one optimum", relative_distance(&found.point.coefficients, &ends[0].point.coefficients), 1e-6);
+    }
+}
+
+#[test]
+fn what_nothing_excites_stays_where_it_was() {
+    let (model, experiments) = driven();
+    let still = |e: &Experiment| {
+        let signals = with_signal(&e.record, 2, vec![0.0; e.record.m()]);
+        Experiment::new(signals, 1, e.samples.clone(), vec![1.0]).unwrap()
+    };
+    let experiments: Vec<Experiment> = experiments.iter().map(still).collect();
+    let found = fit(&model, &experiments, &point(&[], &[-4.0, 3.0, 7.5]), Settings::default()).unwrap();
+    assert_eq!(found.point.coefficients[2], 7.5);
+}

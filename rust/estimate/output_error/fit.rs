@@ -4,8 +4,10 @@ use super::experiment::Experiment;
 use super::free_run::Evaluation;
 use super::input::FreeInput;
 use super::levenberg_marquardt::{minimise, Problem, Settings, Status};
-use super::model::{FreeModel, Point};
+use super::model::{Coordinate, FreeModel, Point};
+use super::shelf::Shelf;
 use crate::error::{check_finite, check_length, Error, Result};
+use std::cell::RefCell;
 
 /// The optimum and what describes it.
 #[derive(Debug, Clone, PartialEq)]
@@ -35,6 +37,10 @@ struct OutputError<'a> {
     experiments: &'a [Experiment],
     /// Whether a free run that grows is no place to go.
     steady: bool,
+    /// Coefficients that are solved for at every point.
+    linear: Vec<usize>,
+    /// What evaluations share, by experiment.
+    shelves: RefCell<Vec<Shelf>>,
 }
 
 impl Problem for OutputError<'_> {
@@ -42,15 +48,23 @@ impl Problem for OutputError<'_> {
     type Evaluation = Evaluation;
 
     fn evaluate(&self, point: &Point) -> Result<Evaluation> {
-        self.model.evaluate(self.experiments, point)
+        self.model.evaluate(self.experiments, &mut self.shelves.borrow_mut(), point, &self.linear)
+    }
+
+    fn settled(&self, evaluation: &Evaluation, _point: Point) -> Point {
+        evaluation.point.clone()
+    }
+
+    fn projected(&self, parameter: usize) -> bool {
+        parameter.checked_sub(self.model.order_bounds.len()).is_some_and(|c| self.linear.contains(&c))
     }
 
     fn residuals<'a>(&self, evaluation: &'a Evaluation) -> &'a [f64] {
         &evaluation.residuals
     }
 
-    fn jacobian(&self, point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
-        self.model.jacobian(self.experiments, point, evaluation)
+    fn jacobian(&self, _point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
+        self.model.jacobian(self.experiments, &mut self.shelves.borrow_mut(), &self.linear, evaluation)
     }
 
     fn moved(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
@@ -119,6 +133,9 @@ fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
 
 /// Weighted least squares on the output error from a start, by Levenberg–Marquardt with columns scaled by the Jacobian.
 ///
+/// Coefficients of what drives from outside are solved for at every point, so where they start does not matter, nor with
+/// which sign; a single evaluation is of the start as it is.
+///
 /// # Errors
 /// A start whose free run is not finite ([`Error::Diverged`]), or that lies outside its coordinates; a model that names
 /// what is not there, experiments that do not fit it ([`FreeModel::check`]).
@@ -186,7 +203,13 @@ fn fit_within(
     let mut point = start.clone();
     point.orders.iter_mut().zip(&model.order_bounds).for_each(|(o, &(low, high))| *o = o.clamp(low, high));
     point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
-    let found = minimise(&OutputError { model, experiments, steady }, point, settings)?;
+    // A single evaluation is of the start as it is.
+    let linear = if settings.evaluations > 1 { model.linear() } else { Vec::new() };
+    let mut model = model.clone();
+    // Solved for, they need no coordinate that keeps a sign.
+    linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
+    let shelves = RefCell::new(experiments.iter().map(|_| Shelf::default()).collect());
+    let found = minimise(&OutputError { model: &model, experiments, steady, linear, shelves }, point, settings)?;
     Ok(Fit {
         point: found.point,
         cost: found.cost,

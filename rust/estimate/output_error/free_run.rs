@@ -3,13 +3,16 @@
 use super::corners::Corners;
 use super::experiment::Experiment;
 use super::feedthrough::{Direct, Early};
+use super::linear::{best_moves, Driven};
 use super::model::{FreeModel, Point};
+use super::shelf::{Operator, Shelf};
 use crate::dense;
 use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimate::least_squares;
-use crate::excess::{kernel_and_slope, MAX_EXCESS};
+use crate::excess::MAX_EXCESS;
 use crate::series::{Buffers, Kernel, Solver, SumOfProducts};
+use std::rc::Rc;
 
 /// Own-output orders closer to α than this make the equation say that the output equals itself.
 const LEAST_INTEGRATION: f64 = 1e-3;
@@ -19,6 +22,8 @@ const SPANNED: f64 = 1e-12;
 
 /// Residuals at a point, and what their derivatives there are made of.
 pub(super) struct Evaluation {
+    /// The point, with the best values of what the residuals are linear in.
+    pub(super) point: Point,
     pub(super) residuals: Vec<f64>,
     /// Norm of the weighted samples, of which the residuals are differences.
     pub(super) size: f64,
@@ -27,21 +32,20 @@ pub(super) struct Evaluation {
     pub(super) parts: Vec<Part>,
 }
 
-/// Coefficient of a term, kernel of its integral, and the kernel's derivative with respect to the order.
-pub(super) type Operator = (f64, Vec<f64>, Vec<f64>);
-
 /// What one experiment leaves behind for its sensitivities.
 pub(super) struct Part {
     /// A of A y = b.
     pub(super) matrix: Vec<Vec<Vec<f64>>>,
-    /// Spectra of A⁻¹ where initial terms needed them already.
+    /// Spectra of A⁻¹ where initial terms or linear coefficients needed them already.
     pub(super) inverse: Option<Vec<Vec<Kernel>>>,
     /// Of each term of each equation.
-    pub(super) operators: Vec<Vec<Operator>>,
+    pub(super) operators: Vec<Vec<Rc<Operator>>>,
     /// Simulated pulse means, initial terms included.
     pub(super) response: Vec<Vec<f64>>,
     /// Orthonormal basis of the sampled responses to the initial terms.
     pub(super) basis: Vec<Vec<f64>>,
+    /// What each coefficient does that the residuals are linear in.
+    pub(super) driven: Vec<Driven>,
     /// Pulse means of each input with a free number once it acts, and their derivative with respect to it.
     pub(super) acted: Vec<(Vec<f64>, Vec<f64>)>,
     /// What feeds through at once.
@@ -52,33 +56,75 @@ pub(super) struct Part {
     pub(super) corners: Option<Corners>,
 }
 
+/// Response of an experiment to an initial term: its equation, weighted samples, pulse means.
+struct Free {
+    equation: usize,
+    samples: Vec<f64>,
+    means: Vec<Vec<f64>>,
+}
+
+/// An experiment's free run before its initial terms are added.
+struct Answer {
+    part: Part,
+    residuals: Vec<f64>,
+    free: Vec<Free>,
+}
+
 /// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
 pub(super) const FACTORS: usize = 3;
 
 impl FreeModel {
-    /// Residuals at a point.
-    pub(super) fn evaluate(&self, experiments: &[Experiment], point: &Point) -> Result<Evaluation> {
+    /// Residuals at a point, the coefficients that are named, in which they are linear, at their best (variable
+    /// projection, doi:10.1137/0710036).
+    pub(super) fn evaluate(
+        &self,
+        experiments: &[Experiment],
+        shelves: &mut [Shelf],
+        point: &Point,
+        linear: &[usize],
+    ) -> Result<Evaluation> {
         let structures = self.structures(&point.orders);
         let mut out = Evaluation {
+            point: point.clone(),
             residuals: Vec::new(),
             size: 0.0,
             initial: Vec::new(),
             exponents: structures.iter().map(|s| s.initial_exponents(&self.initial)).collect(),
             parts: Vec::with_capacity(experiments.len()),
         };
-        for experiment in experiments {
-            self.evaluate_one(experiment, &structures, point, &mut out)?;
+        let mut answers = Vec::with_capacity(experiments.len());
+        for (experiment, shelf) in experiments.iter().zip(shelves) {
+            answers.push(self.answer(experiment, shelf, &structures, point, linear, &mut out)?);
+        }
+        if !linear.is_empty() {
+            let sides = answers.iter().map(|a| (&a.residuals[..], &a.part.driven[..], &a.part.basis[..]));
+            let moves = best_moves(&sides.collect::<Vec<_>>())?;
+            linear.iter().zip(&moves).for_each(|(&j, by)| out.point.coefficients[j] += by);
+            for (answer, experiment) in answers.iter_mut().zip(experiments) {
+                let Part { driven, response, direct, acted, .. } = &mut answer.part;
+                for (column, by) in driven.iter_mut().zip(&moves) {
+                    column.moved(*by, &mut answer.residuals, response);
+                }
+                if direct.is_some() {
+                    *direct = Direct::of(self, experiment, &structures, &out.point, acted)?;
+                }
+            }
+        }
+        for answer in answers {
+            Self::add_initial(answer, structures.len(), &mut out)?;
         }
         Ok(out)
     }
 
-    fn evaluate_one(
+    fn answer(
         &self,
         experiment: &Experiment,
+        shelf: &mut Shelf,
         structures: &[Structure],
         point: &Point,
+        linear: &[usize],
         out: &mut Evaluation,
-    ) -> Result<()> {
+    ) -> Result<Answer> {
         let record = &experiment.record;
         let acted = (self.inputs.iter().zip(&point.inputs))
             .map(|(&input, &value)| self.acted(record, input, value))
@@ -87,12 +133,12 @@ impl FreeModel {
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
         let mut buffers = Buffers::default();
-        let mut drivers: Vec<Option<Kernel>> = (0..record.len()).map(|_| None).collect();
         let mut operators = Vec::with_capacity(n);
-        let mut sum = SumOfProducts::new(m);
+        let mut sum = SumOfProducts::with_length(FACTORS * m);
         for (i, structure) in structures.iter().enumerate() {
             matrix[i][i][0] += 1.0;
             let mut row = Vec::with_capacity(structure.terms.len());
+            let mut drives = false;
             for (k, term) in structure.terms.iter().enumerate() {
                 let eta = structure.order - term.order;
                 let held = experiment.instants.get(term.signal).is_some_and(|instant| instant.held);
@@ -108,22 +154,23 @@ impl FreeModel {
                     // Reported like a step too far, so that the search shortens it.
                     return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
                 }
+                let operator = shelf.operator((i, k), eta, self.turns(i, k), experiment);
                 let c = self.equations[i].terms[k].2.at(&point.coefficients);
-                let (kernel, slope) = kernel_and_slope(eta, m, record.step());
                 if let Some(j) = self.unknown(i, term.signal) {
-                    matrix[i][j].iter_mut().zip(&kernel).for_each(|(a, v)| *a -= c * v);
-                } else {
-                    let driver = drivers[term.signal].get_or_insert_with(|| {
-                        Kernel::new(self.law_of(term.signal).map_or(record.signal(term.signal), |d| &acted[d].0))
-                    });
-                    sum.add(c, &Kernel::new(&kernel), driver);
+                    matrix[i][j].iter_mut().zip(&operator.kernel).for_each(|(a, v)| *a -= c * v);
+                } else if c != 0.0 {
+                    drives = true;
+                    sum.add(c, &operator.spectrum(false), &shelf.driver(self, experiment, term.signal, &acted));
                 }
-                row.push((c, kernel, slope));
+                row.push(operator);
             }
-            sum.take(&mut rhs[i], &mut buffers);
+            if drives {
+                sum.take(&mut rhs[i], &mut buffers);
+            }
             operators.push(row);
         }
-        let mut response = Solver::new(&matrix)?.solve(&rhs)?;
+        let mut solver = Solver::new(&matrix)?;
+        let response = solver.solve(&rhs)?;
         let mut residuals = experiment.measured();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
         let mut sampled = experiment.sampled(&response);
@@ -142,18 +189,15 @@ impl FreeModel {
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
-
-        // Initial terms: the projection of the residuals on their responses.
-        let mut initial: Vec<Vec<f64>> = vec![Vec::new(); n];
-        let mut basis = Vec::new();
         let mut inverse = None;
-        if out.exponents.iter().any(|list| !list.is_empty()) {
-            let made = inverse_spectra(&matrix)?;
+        let mut free = Vec::new();
+        let mut basis = Vec::new();
+        if out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty() {
+            let made = spectra_of_inverse(&mut solver, n, m)?;
             let mut target = SumOfProducts::with_length(FACTORS * m);
-            let mut terms = Vec::new();
             for (i, list) in out.exponents.iter().enumerate() {
                 for &exponent in list {
-                    let power = Kernel::with_length(&record.initial_term(exponent), FACTORS * m);
+                    let power = shelf.power(experiment, exponent);
                     let means: Vec<Vec<f64>> = made
                         .iter()
                         .map(|row| {
@@ -163,32 +207,53 @@ impl FreeModel {
                             means
                         })
                         .collect();
-                    let mut column = experiment.sampled(&means);
+                    let mut samples = experiment.sampled(&means);
                     if experiment.own.is_some() {
                         let corner = Corners::of_power(experiment, i, exponent);
-                        column.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
+                        samples.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
                     }
-                    terms.push((i, column, means));
+                    dense::extend_orthonormal(&mut basis, samples.clone(), SPANNED);
+                    free.push(Free { equation: i, samples, means });
                 }
             }
             inverse = Some(made);
-            let columns: Vec<Vec<f64>> = terms.iter().map(|t| t.1.clone()).collect();
+        }
+        let mut part =
+            Part { matrix, inverse, operators, response, basis, driven: Vec::new(), acted, direct, early, corners };
+        for &coefficient in linear {
+            let column = self.driven_by(experiment, shelf, &part, point, coefficient)?;
+            part.driven.push(column);
+        }
+        Ok(Answer { part, residuals, free })
+    }
+
+    /// Initial terms: the projection of the residuals on their responses.
+    fn add_initial(answer: Answer, equations: usize, out: &mut Evaluation) -> Result<()> {
+        let Answer { mut part, mut residuals, free } = answer;
+        let mut initial: Vec<Vec<f64>> = vec![Vec::new(); equations];
+        if !free.is_empty() {
+            let (places, columns): (Vec<_>, Vec<_>) =
+                free.into_iter().map(|Free { equation, samples, means }| ((equation, means), samples)).unzip();
             let (values, _) = least_squares::solve(&columns, &residuals, 0)?;
-            for ((i, column, means), x) in terms.iter().zip(&values) {
+            for (((i, means), column), x) in places.iter().zip(&columns).zip(&values) {
                 initial[*i].push(*x);
                 residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
-                for (total, part) in response.iter_mut().zip(means) {
-                    total.iter_mut().zip(part).for_each(|(y, v)| *y += x * v);
+                for (total, more) in part.response.iter_mut().zip(means) {
+                    total.iter_mut().zip(more).for_each(|(y, v)| *y += x * v);
                 }
-            }
-            for column in columns {
-                dense::extend_orthonormal(&mut basis, column, SPANNED);
             }
         }
         out.residuals.extend(residuals);
         out.initial.push(initial);
-        out.parts.push(Part { matrix, inverse, operators, response, basis, acted, direct, early, corners });
+        out.parts.push(part);
         Ok(())
+    }
+
+    /// Whether a free order moves the order by which a term is integrated.
+    fn turns(&self, equation: usize, term: usize) -> bool {
+        let item = &self.equations[equation];
+        let of = |weights: &[f64], k: usize| weights.get(k).copied().unwrap_or(0.0);
+        (0..self.order_bounds.len()).any(|k| of(&item.order.weights, k) != of(&item.terms[term].1.weights, k))
     }
 }
 
@@ -196,7 +261,10 @@ impl FreeModel {
 pub(super) fn inverse_spectra(matrix: &[Vec<Vec<f64>>]) -> Result<Vec<Vec<Kernel>>> {
     let n = matrix.len();
     let m = matrix.first().and_then(|row| row.first()).map_or(0, Vec::len);
-    let mut solver = Solver::new(matrix)?;
+    spectra_of_inverse(&mut Solver::new(matrix)?, n, m)
+}
+
+fn spectra_of_inverse(solver: &mut Solver<'_>, n: usize, m: usize) -> Result<Vec<Vec<Kernel>>> {
     let mut rows: Vec<Vec<Kernel>> = (0..n).map(|_| Vec::with_capacity(n)).collect();
     for j in 0..n {
         let mut unit = vec![vec![0.0; m]; n];

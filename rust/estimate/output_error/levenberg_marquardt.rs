@@ -4,12 +4,15 @@
 //! rejected step costs no Jacobian. A problem says itself how a point moves: in which coordinates, and within which bounds.
 //! What stands on a bound and is pushed out of it is left out of step and gradient, so that the rest moves on.
 //!
+//! Where Gauss–Newton foretells the fall of the cost badly, what it leaves out is learnt ([`super::curvature`]).
+//!
 //! A minimum is where the gradient vanishes, and nothing else is called one: the cosine between the residuals and every
 //! column that is free to move, the relative offset of Dennis & Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
 
+use super::curvature::Curvature;
 use crate::dense;
 use crate::error::{check_length, Error, Result};
-use crate::small::back_substitute;
+use crate::small::{self, back_substitute};
 
 /// Damping of the first step: near Gauss–Newton's, yet safe where a start is some tens of percent off.
 const FIRST_DAMPING: f64 = 1e-3;
@@ -48,6 +51,16 @@ pub trait Problem {
 
     /// The point moved by steps in the parameters' coordinates, within its bounds, and the largest relative move.
     fn moved(&self, point: &Self::Point, steps: &[f64]) -> (Self::Point, f64);
+
+    /// The point to which an evaluation belongs, where it solved for parameters in which the residuals are linear.
+    fn settled(&self, _evaluation: &Self::Evaluation, point: Self::Point) -> Self::Point {
+        point
+    }
+
+    /// Whether every evaluation solves for a parameter: its steps need no damping.
+    fn projected(&self, _parameter: usize) -> bool {
+        false
+    }
 
     /// Derivative of a parameter with respect to the coordinate in which it is stepped.
     fn stretch(&self, _point: &Self::Point, _parameter: usize) -> f64 {
@@ -125,9 +138,12 @@ fn cost(residuals: &[f64]) -> f64 {
     0.5 * residuals.iter().map(|e| e * e).sum::<f64>()
 }
 
-/// The linear problem at a point: R of [J | e] with J in coordinates and unit columns, and what may move.
+/// The linear problem at a point: R of [J | e] with J in coordinates and unit columns, and what may move. What every
+/// evaluation solves for comes first, so that the lower part of R belongs to the rest with that projected out.
 struct Linear {
     r: Vec<f64>,
+    /// The parameter at each place.
+    order: Vec<usize>,
     /// Length of a coordinate's unit in scaled steps, 0 where nothing moves with it.
     scales: Vec<f64>,
     /// Products of the unit columns with the residuals.
@@ -136,33 +152,39 @@ struct Linear {
     room: Vec<(f64, f64)>,
     /// What is left out of the steps.
     held: Vec<bool>,
+    /// How many every evaluation solves for.
+    projected: usize,
     /// Norm of the residuals.
     norm: f64,
 }
 
 impl Linear {
     fn at<P: Problem>(problem: &P, point: &P::Point, jacobian: &[Vec<f64>], residuals: &[f64], corners: bool) -> Self {
+        let (mut order, rest): (Vec<usize>, Vec<usize>) = (0..jacobian.len()).partition(|&i| problem.projected(i));
+        let projected = order.len();
+        order.extend(rest);
         let mut columns = Vec::with_capacity(jacobian.len() + 1);
         let mut scales = Vec::with_capacity(jacobian.len());
-        for (i, column) in jacobian.iter().enumerate() {
+        for &i in &order {
             let factor = problem.stretch(point, i);
-            let norm = column.iter().map(|v| (v * factor) * (v * factor)).sum::<f64>().sqrt();
+            let norm = jacobian[i].iter().map(|v| (v * factor) * (v * factor)).sum::<f64>().sqrt();
             let scale = if norm > 0.0 { factor / norm } else { 0.0 };
-            columns.push(column.iter().map(|v| v * scale).collect::<Vec<f64>>());
+            columns.push(jacobian[i].iter().map(|v| v * scale).collect::<Vec<f64>>());
             scales.push(norm);
         }
         let gradient: Vec<f64> = columns.iter().map(|c| c.iter().zip(residuals).map(|(j, e)| j * e).sum()).collect();
         columns.push(residuals.to_vec());
-        let scaled = |i: usize, (down, up): (f64, f64)| (down * scales[i], up * scales[i]);
-        let room: Vec<(f64, f64)> = (0..scales.len()).map(|i| scaled(i, problem.room(point, i))).collect();
+        let scaled = |(down, up): (f64, f64), scale: f64| (down * scale, up * scale);
+        let room: Vec<(f64, f64)> =
+            order.iter().zip(&scales).map(|(&i, &scale)| scaled(problem.room(point, i), scale)).collect();
         let held = (room.iter().zip(&gradient).enumerate())
-            .map(|(i, (&(down, up), &g))| {
+            .map(|(place, (&(down, up), &g))| {
                 let out = if g > 0.0 { down <= 0.0 } else { up <= 0.0 };
-                out || scales[i] <= 0.0 || (corners && problem.kinked(point, i))
+                out || scales[place] <= 0.0 || (corners && problem.kinked(point, order[place]))
             })
             .collect();
         let norm = residuals.iter().map(|e| e * e).sum::<f64>().sqrt();
-        Self { r: dense::triangular_factor(&columns), scales, gradient, room, held, norm }
+        Self { r: dense::triangular_factor(&columns), order, scales, gradient, room, held, projected, norm }
     }
 
     /// Largest component of the gradient along what is free to move.
@@ -172,11 +194,29 @@ impl Linear {
 
     /// Minimises ‖J s + e‖² + λ‖s‖² over what is free and within its bounds, and the share of the cost that falls.
     fn step(&self, damping: f64) -> (Vec<f64>, f64) {
-        let k = self.scales.len();
+        let step = self.within(|held| Some(damped_step(&self.r, held, self.projected, damping))).unwrap_or_default();
+        let falls = self.falls(&step, 0);
+        (step, falls)
+    }
+
+    /// The same with a learnt curvature, what every evaluation solves for left to it; none where that has no minimum.
+    fn curved_step(&self, damping: f64, curvature: &Curvature) -> Option<(Vec<f64>, f64)> {
+        let step = self.within(|held| self.curved(held, damping, curvature))?;
+        let falls = self.falls(&step, self.projected) - self.bent(&step, curvature);
+        Some((step, falls))
+    }
+
+    /// Share of the cost that a learnt curvature adds along a scaled step.
+    fn bent(&self, step: &[f64], curvature: &Curvature) -> f64 {
+        curvature.along(&self.unscaled(step)) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
+    }
+
+    /// A step of what is free that pushes nothing out of its bounds.
+    fn within(&self, step_of: impl Fn(&[bool]) -> Option<Vec<f64>>) -> Option<Vec<f64>> {
         let mut held = self.held.clone();
         let mut step = loop {
-            let step = damped_step(&self.r, &held, damping);
-            let out = (0..k).find(|&i| {
+            let step = step_of(&held)?;
+            let out = (0..step.len()).find(|&i| {
                 let (down, up) = self.room[i];
                 !held[i] && ((step[i] < 0.0 && down <= 0.0) || (step[i] > 0.0 && up <= 0.0))
             });
@@ -186,21 +226,86 @@ impl Linear {
             }
         };
         step.iter_mut().zip(&self.room).for_each(|(s, &(down, up))| *s = s.max(-down.max(0.0)).min(up.max(0.0)));
-        let moved: f64 =
-            (0..k).map(|i| (i..k).map(|j| self.r[i * (k + 1) + j] * step[j]).sum::<f64>()).map(|v| v * v).sum();
-        let along: f64 = self.gradient.iter().zip(&step).map(|(g, s)| g * s).sum();
-        let falls = (-2.0 * along - moved) / (self.norm * self.norm).max(f64::MIN_POSITIVE);
-        (step, falls)
+        Some(step)
     }
 
-    /// A scaled step in the parameters' coordinates.
+    /// Share of the cost that falls along a step as the columns say, those before `first` projected out.
+    fn falls(&self, step: &[f64], first: usize) -> f64 {
+        let k = step.len();
+        let image = |i: usize| (i..k).map(|j| self.r[i * (k + 1) + j] * step[j]).sum::<f64>();
+        let (moved, along) = (first..k)
+            .map(|i| (image(i), self.r[i * (k + 1) + k]))
+            .fold((0.0, 0.0), |(a, b), (v, e)| (a + v * v, b + v * e));
+        (-2.0 * along - moved) / (self.norm * self.norm).max(f64::MIN_POSITIVE)
+    }
+
+    /// JᵀJ s in coordinates for a step in coordinates, by parameter, what every evaluation solves for projected out.
+    fn columns_along(&self, step: &[f64]) -> Vec<f64> {
+        let k = self.scales.len();
+        let scaled: Vec<f64> = self.order.iter().zip(&self.scales).map(|(&i, scale)| step[i] * scale).collect();
+        let images: Vec<f64> = (0..k)
+            .map(|i| {
+                let image = (i.max(self.projected)..k).map(|j| self.r[i * (k + 1) + j] * scaled[j]).sum::<f64>();
+                if i < self.projected {
+                    0.0
+                } else {
+                    image
+                }
+            })
+            .collect();
+        let mut out = vec![0.0; k];
+        for (place, (&i, scale)) in self.order.iter().zip(&self.scales).enumerate().skip(self.projected) {
+            out[i] = scale * (0..=place).map(|l| self.r[l * (k + 1) + place] * images[l]).sum::<f64>();
+        }
+        out
+    }
+
+    /// Gradient in coordinates, by parameter; 0 of what every evaluation solves for.
+    fn gradient_by_parameter(&self) -> Vec<f64> {
+        let mut out = vec![0.0; self.scales.len()];
+        for (place, &i) in self.order.iter().enumerate().skip(self.projected) {
+            out[i] = self.gradient[place] * self.scales[place];
+        }
+        out
+    }
+
+    /// Minimises the cost with a learnt curvature and damping; none where it is no minimum.
+    fn curved(&self, held: &[bool], damping: f64, curvature: &Curvature) -> Option<Vec<f64>> {
+        let k = held.len();
+        let free: Vec<usize> = (self.projected..k).filter(|&i| !held[i]).collect();
+        let count = free.len();
+        let product = |i: usize, j: usize| {
+            let last = i.min(j);
+            (self.projected..=last).map(|l| self.r[l * (k + 1) + i] * self.r[l * (k + 1) + j]).sum::<f64>()
+        };
+        let mut matrix = vec![0.0; count * count];
+        let mut target = vec![0.0; count];
+        for (a, &i) in free.iter().enumerate() {
+            for (b, &j) in free.iter().enumerate() {
+                let learnt = curvature.at(self.order[i], self.order[j]) / (self.scales[i] * self.scales[j]);
+                matrix[a * count + b] = product(i, j) + learnt + if a == b { damping } else { 0.0 };
+            }
+            target[a] = -(self.projected..=i).map(|l| self.r[l * (k + 1) + i] * self.r[l * (k + 1) + k]).sum::<f64>();
+        }
+        let solved = small::positive_solve(&matrix, &target)?;
+        let mut step = vec![0.0; k];
+        free.iter().zip(solved).for_each(|(&i, s)| step[i] = s);
+        Some(step)
+    }
+
+    /// A scaled step in the parameters' coordinates, by parameter.
     fn unscaled(&self, step: &[f64]) -> Vec<f64> {
-        step.iter().zip(&self.scales).map(|(s, scale)| if *scale > 0.0 { s / scale } else { 0.0 }).collect()
+        let mut out = vec![0.0; step.len()];
+        for ((&i, s), scale) in self.order.iter().zip(step).zip(&self.scales) {
+            out[i] = if *scale > 0.0 { s / scale } else { 0.0 };
+        }
+        out
     }
 }
 
-/// Minimises ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e], with 0 for what is held.
-fn damped_step(r: &[f64], held: &[bool], damping: f64) -> Vec<f64> {
+/// Minimises ‖R s + e‖² + λ‖s‖² for the triangular factor of [J | e], with 0 for what is held; what is projected is hardly
+/// damped.
+fn damped_step(r: &[f64], held: &[bool], projected: usize, damping: f64) -> Vec<f64> {
     let (k, free) = (held.len(), (0..held.len()).filter(|&j| !held[j]).collect::<Vec<_>>());
     if free.is_empty() {
         return vec![0.0; k];
@@ -213,7 +318,7 @@ fn damped_step(r: &[f64], held: &[bool], damping: f64) -> Vec<f64> {
             for (i, value) in column.iter_mut().enumerate().take(j + 1) {
                 *value = r[i * (k + 1) + j];
             }
-            column[k + at] = damping.sqrt();
+            column[k + at] = if j < projected { LEAST_DAMPING } else { damping }.sqrt();
             column
         })
         .collect();
@@ -279,6 +384,7 @@ pub fn minimise<P: Problem>(
     };
     let mut point = start;
     let mut current = problem.evaluate(&point)?;
+    point = problem.settled(&current, point);
     let mut least = cost(problem.residuals(&current));
     let mut jacobian = slopes_at(&point, &current)?;
     let mut evaluations = 1;
@@ -288,8 +394,15 @@ pub fn minimise<P: Problem>(
     // The gradient's cosine at a minimum: its square is a share of the cost.
     let flat = settings.tolerance.max(f64::EPSILON).sqrt();
     let (mut gain, mut hit, mut corners) = (f64::INFINITY, false, false);
+    let mut curvature = Curvature::new(jacobian.len());
+    // The last step in coordinates, and the gradient before it.
+    let mut before: Option<(Vec<f64>, Vec<f64>)> = None;
     'outer: while evaluations < settings.evaluations {
         let linear = Linear::at(problem, &point, &jacobian, problem.residuals(&current), corners);
+        if let Some((taken, gradient)) = before.take() {
+            let change: Vec<f64> = linear.gradient_by_parameter().iter().zip(&gradient).map(|(a, b)| a - b).collect();
+            curvature.learn(&taken, &change, &linear.columns_along(&taken));
+        }
         let slope = linear.slope();
         let level = slope <= flat * linear.norm;
         let (newton, falls) = linear.step(LEAST_DAMPING);
@@ -305,7 +418,13 @@ pub fn minimise<P: Problem>(
         }
         hit = false;
         loop {
-            let (step, falls) = linear.step(damping);
+            let curved = if curvature.used { linear.curved_step(damping, &curvature) } else { None };
+            if curvature.used && curved.is_none() && damping <= LARGEST_DAMPING {
+                damping *= FACTOR;
+                continue;
+            }
+            let first = if curved.is_some() { linear.projected } else { 0 };
+            let (step, falls) = curved.unwrap_or_else(|| linear.step(damping));
             let (next, moved) = problem.moved(&point, &linear.unscaled(&step));
             if moved <= settings.tolerance || damping > LARGEST_DAMPING {
                 // No step lowers the cost any more: at its bottom, for rounding, at a wall or at a corner.
@@ -335,12 +454,16 @@ pub fn minimise<P: Problem>(
                 if reached >= least {
                     return Ok(None);
                 }
-                Ok(Some((slopes_at(&next, &found)?, found, reached)))
+                let settled = problem.settled(&found, next.clone());
+                Ok(Some((slopes_at(&settled, &found)?, found, reached, settled)))
             });
             match tried {
-                Ok(Some((slopes, found, reached))) => {
+                Ok(Some((slopes, found, reached, next))) => {
                     gain = (least - reached) / least.max(f64::MIN_POSITIVE);
                     (point, current, least, jacobian, trusted) = (next, found, reached, slopes, trusts);
+                    let told = linear.falls(&step, first);
+                    curvature.judge(told, told - linear.bent(&step, &curvature), gain);
+                    before = Some((linear.unscaled(&step), linear.gradient_by_parameter()));
                     if gain >= FAIR * falls {
                         damping = (damping / FACTOR).max(LEAST_DAMPING);
                     }

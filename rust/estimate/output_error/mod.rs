@@ -8,15 +8,18 @@
 //! instant feed through. Samples that were not read weigh nothing; samples at times of their own are compared there.
 
 mod corners;
+mod curvature;
 pub mod experiment;
 mod feedthrough;
 pub mod fit;
 mod free_run;
 pub mod input;
 pub mod levenberg_marquardt;
+mod linear;
 pub mod model;
 pub mod poles;
 mod sensitivities;
+mod shelf;
 
 pub use experiment::{Experiment, Instant, OwnTimes};
 pub use fit::{fit, fit_steady, Fit};

@@ -3,19 +3,28 @@
 use super::experiment::Experiment;
 use super::feedthrough::add_slope;
 use super::free_run::{inverse_spectra, Evaluation, Part, FACTORS};
+use super::linear::project_out;
 use super::model::{FreeModel, Point};
+use super::shelf::Shelf;
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel, SumOfProducts};
 
 impl FreeModel {
     /// Derivatives of the residuals at an evaluated point with respect to orders, coefficients (plain coordinates),
-    /// then inputs' numbers, initial terms projected out.
-    pub(super) fn jacobian(&self, experiments: &[Experiment], point: &Point, at: &Evaluation) -> Result<Vec<Vec<f64>>> {
+    /// then inputs' numbers, initial terms projected out; those of linear coefficients are there already.
+    pub(super) fn jacobian(
+        &self,
+        experiments: &[Experiment],
+        shelves: &mut [Shelf],
+        linear: &[usize],
+        at: &Evaluation,
+    ) -> Result<Vec<Vec<f64>>> {
+        let point = &at.point;
         let count = point.orders.len() + point.coefficients.len() + point.inputs.len();
         let mut jacobian = vec![Vec::with_capacity(at.residuals.len()); count];
-        for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
-            self.sensitivities(experiment, part, point, &at.initial[index], &mut jacobian)?;
+        for (index, ((experiment, part), shelf)) in experiments.iter().zip(&at.parts).zip(shelves).enumerate() {
+            self.sensitivities(experiment, shelf, part, point, &at.initial[index], linear, &mut jacobian)?;
         }
         if jacobian.iter().flatten().any(|v| !v.is_finite()) {
             return Err(Error::Diverged { what: "sensitivity of the free run".into(), index: 0 });
@@ -24,12 +33,15 @@ impl FreeModel {
     }
 
     /// One experiment's rows of the Jacobian: A⁻¹(∂b − ∂A y) as products of three spectra.
+    #[allow(clippy::too_many_arguments)]
     fn sensitivities(
         &self,
         experiment: &Experiment,
+        shelf: &mut Shelf,
         part: &Part,
         point: &Point,
         initial: &[Vec<f64>],
+        linear: &[usize],
         jacobian: &mut [Vec<f64>],
     ) -> Result<()> {
         let record = &experiment.record;
@@ -46,49 +58,55 @@ impl FreeModel {
                 &made
             }
         };
-        let responses: Vec<Kernel> = part.response.iter().map(|means| spectrum(means)).collect();
-        let mut drivers: Vec<Option<Kernel>> = (0..record.len()).map(|_| None).collect();
-        let mut spectra: Vec<Vec<(Option<Kernel>, Option<Kernel>)>> =
-            part.operators.iter().map(|row| row.iter().map(|_| (None, None)).collect()).collect();
+        let mut responses: Vec<Option<Kernel>> = part.response.iter().map(|_| None).collect();
         let mut rights: Vec<SumOfProducts> = (0..n).map(|_| SumOfProducts::with_length(total)).collect();
         let mut target = SumOfProducts::with_length(total);
         let mut buffers = Buffers::default();
         for (parameter, out) in jacobian.iter_mut().enumerate() {
+            let place = parameter.checked_sub(orders.len()).and_then(|c| linear.iter().position(|&j| j == c));
+            if let Some(driven) = place.and_then(|k| part.driven.get(k)) {
+                let mut column = driven.samples.clone();
+                project_out(&part.basis, &mut column);
+                out.extend(column.iter().map(|v| -v));
+                continue;
+            }
             let mut moves = vec![false; n];
             for (i, equation) in self.equations.iter().enumerate() {
                 rights[i].clear();
                 for (k, (signal, order, monomial)) in equation.terms.iter().enumerate() {
-                    let (c, kernel, slope) = &part.operators[i][k];
-                    let (kept, kept_slope) = &mut spectra[i][k];
+                    let operator = &part.operators[i][k];
+                    let c = monomial.at(coefficients);
                     if parameter >= numbers {
                         // A number of an input moves only what it drives: kernel and coefficient stay, the driver is its slope.
                         let input = parameter - numbers;
-                        if self.inputs[input].signal == *signal && *c != 0.0 {
+                        if self.inputs[input].signal == *signal && c != 0.0 {
                             moves[i] = true;
-                            let slope = spectrum(&part.acted[input].1);
-                            rights[i].add(*c, kept.get_or_insert_with(|| spectrum(kernel)), &slope);
+                            rights[i].add(c, &operator.spectrum(false), &spectrum(&part.acted[input].1));
                         }
                         continue;
                     }
-                    let (weight, operator) = if parameter < orders.len() {
+                    let turns = parameter < orders.len();
+                    let weight = if turns {
                         let d_eta = equation.order.weights.get(parameter).unwrap_or(&0.0)
                             - order.weights.get(parameter).unwrap_or(&0.0);
-                        (c * d_eta, (kept_slope, slope))
+                        c * d_eta
                     } else {
-                        (monomial.slope(coefficients, parameter - orders.len()), (kept, kernel))
+                        monomial.slope(coefficients, parameter - orders.len())
                     };
                     if weight == 0.0 {
                         continue;
                     }
                     moves[i] = true;
-                    let operator = operator.0.get_or_insert_with(|| spectrum(operator.1));
-                    let driver = match self.unknown(i, *signal) {
-                        Some(j) => &responses[j],
-                        None => drivers[*signal].get_or_insert_with(|| {
-                            spectrum(self.law_of(*signal).map_or(record.signal(*signal), |d| &part.acted[d].0))
-                        }),
-                    };
-                    rights[i].add(weight, operator, driver);
+                    let operator = operator.spectrum(turns);
+                    match self.unknown(i, *signal) {
+                        Some(j) => {
+                            let response = responses[j].get_or_insert_with(|| spectrum(&part.response[j]));
+                            rights[i].add(weight, &operator, response);
+                        }
+                        None => {
+                            rights[i].add(weight, &operator, &shelf.driver(self, experiment, *signal, &part.acted));
+                        }
+                    }
                 }
                 if parameter < orders.len() {
                     if let Some(moved) = initial_slope(self, i, parameter, orders, &initial[i], record)? {
@@ -120,10 +138,7 @@ impl FreeModel {
             if let Some(corners) = &part.corners {
                 corners.add_slope(self, experiment, part.direct.as_ref(), point, parameter, &mut column);
             }
-            for direction in &part.basis {
-                let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
-                column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
-            }
+            project_out(&part.basis, &mut column);
             // Residuals fall where the response rises.
             out.extend(column.iter().map(|v| -v));
         }

@@ -1,0 +1,153 @@
+//! Coefficients in which the residuals are linear: those of what drives, once everything else is given.
+//!
+//! They are solved for at every point of the search (variable projection, Golub & Pereyra, doi:10.1137/0710036), so that
+//! only own terms, orders and inputs' numbers are searched: no sign to guess, no valley between what drives alike.
+
+use super::experiment::Experiment;
+use super::feedthrough::add_slope;
+use super::free_run::{Part, FACTORS};
+use super::model::{Coordinate, FreeModel, Point};
+use super::shelf::Shelf;
+use crate::dense;
+use crate::error::{Error, Result};
+use crate::series::{Buffers, SumOfProducts};
+use crate::small::back_substitute;
+
+/// What is not told from the rest by this share of its column stays where it was: there rounding is as large.
+const UNTOLD: f64 = 1e-7;
+
+/// What a coefficient of 1 more does to an experiment.
+pub(super) struct Driven {
+    /// To its weighted samples.
+    pub(super) samples: Vec<f64>,
+    /// To the pulse means of each output; empty once it was moved.
+    means: Vec<Vec<f64>>,
+}
+
+impl Driven {
+    /// Moves the coefficient: residuals and pulse means follow.
+    pub(super) fn moved(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
+        if by != 0.0 {
+            residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);
+            for (total, more) in response.iter_mut().zip(&self.means) {
+                total.iter_mut().zip(more).for_each(|(y, v)| *y += by * v);
+            }
+        }
+        self.means = Vec::new();
+    }
+}
+
+impl FreeModel {
+    /// Coefficients that stand alone, once, and before nothing but what drives from outside.
+    pub(super) fn linear(&self) -> Vec<usize> {
+        let stands = |j: usize| {
+            let mut found = false;
+            for (i, equation) in self.equations.iter().enumerate() {
+                for (signal, _, monomial) in &equation.terms {
+                    if monomial.powers.iter().any(|&(k, _)| k == j) {
+                        if monomial.powers != [(j, 1)] || self.unknown(i, *signal).is_some() {
+                            return false;
+                        }
+                        found = true;
+                    }
+                }
+            }
+            found
+        };
+        let moves = |j: usize| matches!(self.coordinates[j], Coordinate::Plain | Coordinate::Logarithm);
+        (0..self.coordinates.len()).filter(|&j| moves(j) && stands(j)).collect()
+    }
+
+    /// What one more of a coefficient does that stands before what drives.
+    pub(super) fn driven_by(
+        &self,
+        experiment: &Experiment,
+        shelf: &mut Shelf,
+        part: &Part,
+        point: &Point,
+        coefficient: usize,
+    ) -> Result<Driven> {
+        let (m, n) = (experiment.record.m(), self.equations.len());
+        let total = FACTORS * m;
+        let mut rights: Vec<Option<SumOfProducts>> = (0..n).map(|_| None).collect();
+        for (i, equation) in self.equations.iter().enumerate() {
+            for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
+                let weight = monomial.slope(&point.coefficients, coefficient);
+                if weight != 0.0 {
+                    let driver = shelf.driver(self, experiment, *signal, &part.acted);
+                    let right = rights[i].get_or_insert_with(|| SumOfProducts::with_length(total));
+                    right.add(weight, &part.operators[i][k].spectrum(false), &driver);
+                }
+            }
+        }
+        let mut target = SumOfProducts::with_length(total);
+        let mut buffers = Buffers::default();
+        let means: Vec<Vec<f64>> = (part.inverse.iter().flatten())
+            .map(|row| {
+                for (right, inverse) in rights.iter().zip(row) {
+                    right.iter().for_each(|right| target.add_product(right, inverse));
+                }
+                let mut means = vec![0.0; m];
+                target.take(&mut means, &mut buffers);
+                means
+            })
+            .collect();
+        let parameter = point.orders.len() + coefficient;
+        let mut samples = experiment.sampled(&means);
+        part.early.correct_slope(self, experiment, point, parameter, &mut samples)?;
+        if let Some(direct) = &part.direct {
+            add_slope(self, experiment, direct, point, parameter, &mut samples);
+        }
+        if let Some(corners) = &part.corners {
+            corners.add_slope(self, experiment, part.direct.as_ref(), point, parameter, &mut samples);
+        }
+        match samples.iter().position(|v| !v.is_finite()) {
+            Some(index) => Err(Error::Diverged { what: "free run".into(), index }),
+            None => Ok(Driven { samples, means }),
+        }
+    }
+}
+
+/// How far linear coefficients move to where the residuals of all experiments are least, each experiment's initial terms
+/// projected out.
+pub(super) fn best_moves(sides: &[(&[f64], &[Driven], &[Vec<f64>])]) -> Result<Vec<f64>> {
+    let count = sides.first().map_or(0, |(_, driven, _)| driven.len());
+    let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];
+    for (residuals, driven, basis) in sides {
+        for (column, part) in columns.iter_mut().zip(driven.iter().map(|d| &d.samples[..]).chain([*residuals])) {
+            let first = column.len();
+            column.extend_from_slice(part);
+            project_out(basis, &mut column[first..]);
+        }
+    }
+    let mut scales = Vec::with_capacity(count);
+    for (place, column) in columns.iter_mut().enumerate() {
+        let norm = column.iter().map(|v| v * v).sum::<f64>().sqrt();
+        if place < count {
+            let scale = if norm > 0.0 && norm.is_finite() { 1.0 / norm } else { 0.0 };
+            column.iter_mut().for_each(|v| *v *= scale);
+            scales.push(scale);
+        }
+        let rows = column.len();
+        column.resize(rows + count, 0.0);
+        if place < count {
+            column[rows + place] = UNTOLD;
+        }
+    }
+    let r = dense::triangular_factor(&columns);
+    let stride = count + 1;
+    let rhs: Vec<f64> = (0..count).map(|i| r[i * stride + count]).collect();
+    let moves: Vec<f64> = back_substitute(&r, stride, &rhs).iter().zip(&scales).map(|(s, scale)| s * scale).collect();
+    match moves.iter().position(|v| !v.is_finite()) {
+        Some(index) => Err(Error::Diverged { what: "linear coefficient".into(), index }),
+        None => Ok(moves),
+    }
+}
+
+/// Takes what lies along an orthonormal basis out of a column.
+pub(super) fn project_out(basis: &[Vec<f64>], column: &mut [f64]) {
+    for direction in basis {
+        let along: f64 = direction.iter().zip(column.iter()).map(|(q, v)| q * v).sum();
+        column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
+    }
+}
