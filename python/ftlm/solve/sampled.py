@@ -21,6 +21,7 @@ from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Offset, SensorFilter, Structure, offset_exponents
 from ftlm.solve.friction import begun, motion_with_friction
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
+from ftlm.solve.limit import Limit, extrapolated
 from ftlm.solve.motion import decided, misfit, missed, needed
 from ftlm.solve.records import MAX_M, Record, acting, equation_tuple, record, sensor_series
 
@@ -56,7 +57,7 @@ class Sampled:
     refinement
         Pulses a sample interval on the finest grid that was used.
     change
-        What halving the step last moved, as a share of each output's largest value; infinite before there were two.
+        What halving the step moves, as a share of each output's largest value; infinite before there were three grids.
     """
 
     outputs: Floats
@@ -104,28 +105,32 @@ def refined(
     elif initial is None:
         model = started(model, run)
     times = run.time if on_grid and has_own_times(run, model.structure) else own_times(model, run)
-    coarse, known = _tried(model, run, every, initial, times)
-    terms = known
-    best, change = coarse, np.full(len(model.outputs), np.inf)
-    extrapolated: Floats | None = None
+    limit, rows = Limit(), list[list[Floats]]()
+    terms: Terms = {}
+    best: Floats = np.zeros(0)
+    change: Floats = np.zeros(0)
     lost = 0
-    while 2 * every * own <= largest_m and lost < 2:
-        every *= 2
-        fine, found = _tried(model, run, every, initial, times, last=lost == 1)
+    while True:
+        last = 2 * every * own > largest_m
+        samples, terms = _tried(model, run, every, initial, times, last=lost == 1)
+        finite = bool(np.all(np.isfinite(samples)))
+        limit.add(samples)
+        column, change = limit.best
+        best = limit.rows[-1][column]
+        flat: Floats = np.array([v for powers in terms.values() for v in powers.values()])
+        rows = [extrapolated(flat, rows[-1] if len(limit.rows[-1]) > 1 else [])]
         # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
-        lost = 0 if np.all(np.isfinite(fine)) else lost + 1
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            both = bool(np.all(np.isfinite(coarse)))
-            best = (4.0 * fine - coarse) / 3.0 if both else fine
-            terms = _limit(known, found) if both else found
-            if extrapolated is not None:
-                size = np.max(np.abs(best), axis=1)
-                moved = np.max(np.abs(best - extrapolated), axis=1)
-                change = np.where(moved == 0.0, 0.0, moved / size)
-        extrapolated, coarse, known = best, fine, found
-        if np.all(change <= tolerance):
+        lost = 0 if finite or every == FIRST_REFINEMENT else lost + 1
+        if last or lost == 2 or np.all(change <= tolerance):
             break
-    return Sampled(best, terms, every, change)
+        every *= 2
+    return Sampled(best, _like(terms, rows[-1][column]), every, change)
+
+
+def _like(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
+    """Initial terms of these outputs and exponents with other values."""
+    left = iter(values.tolist())
+    return {o: {e: next(left) for e in powers} for o, powers in terms.items()}
 
 
 def own_times(model: Solved, run: Run) -> Floats | None:
@@ -151,11 +156,6 @@ def started(model: Solved, run: Run) -> Solved:
     sizes = np.nanstd(measured, axis=1).tolist()
     excess = misfit([*missed(measured, few)], [*missed(measured, many)], sizes)
     return long if needed(model.structure, excess, more) else short
-
-
-def _limit(coarse: Terms, fine: Terms) -> dict[str, dict[float, float]]:
-    """Initial terms in the limit of the step, which two grids tell (Richardson)."""
-    return {o: {e: (4.0 * v - coarse[o][e]) / 3.0 for e, v in terms.items()} for o, terms in fine.items()}
 
 
 def _tried(
@@ -381,8 +381,10 @@ def _at_instants(
     if at is not None:
         values = at.values(name)
         return _core.read_at(rec.of(name)[None], at.places)[0] if values is None else values
-    delay, filtered = structure.delay.get(name, 0.0), rec.sensor is not None
+    delay = structure.delay.get(name, 0.0)
+    filtered = rec.sensor is not None and not structure.measured_through(name)
     if not delay and not filtered:
+        # Between two pulses there may be a corner, which their mean rounds off.
         return acting(run, structure, name)[name]
     means = rec.of(name)
     if filtered or run.intersample.get(name) != "zoh":
