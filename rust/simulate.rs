@@ -104,8 +104,11 @@ impl<'a> System<'a> {
 
     /// Columns of the inverse of the matrix: `[j][i]` is what a unit pulse in the error of equation i does to output j.
     pub(crate) fn inverse(&self) -> Result<Vec<Vec<Vec<f64>>>> {
+        self.inverse_by(&mut series::Solver::new(&self.matrix)?)
+    }
+
+    fn inverse_by(&self, solver: &mut series::Solver<'_>) -> Result<Vec<Vec<Vec<f64>>>> {
         let n = self.matrix.len();
-        let mut solver = series::Solver::new(&self.matrix)?;
         let mut out = vec![Vec::with_capacity(n); n];
         for i in 0..n {
             let mut unit = vec![vec![0.0; self.record.m()]; n];
@@ -121,18 +124,22 @@ impl<'a> System<'a> {
 
     /// What a unit of each initial term, an equation and an exponent, does to every output while nothing else drives.
     pub(crate) fn units(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
+        self.units_by(&mut series::Solver::new(&self.matrix)?, units)
+    }
+
+    fn units_by(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
         let (m, n) = (self.record.m(), self.matrix.len());
         if units.is_empty() {
             return Ok(Vec::new());
         }
-        let inverse = self.inverse()?;
+        let inverse = self.inverse_by(solver)?;
         if inverse.iter().flatten().any(|series| grows(series)) {
             return units
                 .iter()
                 .map(|&(i, exponent)| {
                     let mut rhs = vec![vec![0.0; m]; n];
                     rhs[i] = self.record.initial_term(exponent);
-                    self.solve(&rhs)
+                    solver.solve(&rhs)
                 })
                 .collect();
         }
@@ -250,18 +257,38 @@ pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f6
 /// # }
 /// ```
 pub fn unit_responses(equations: &[Equation], record: &Record, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
-    let n = equations.len();
-    let mut initial = vec![Vec::new(); n];
+    checked(equations, record, &as_terms(equations.len(), units)?)?.units(units)
+}
+
+/// The free run at rest ([`respond`]) and [`unit_responses`], whose divisions share their transforms.
+///
+/// # Errors
+/// As [`unit_responses`].
+#[allow(clippy::type_complexity)]
+pub fn respond_and_units(
+    equations: &[Equation],
+    record: &Record,
+    units: &[(usize, f64)],
+) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
+    let system = checked(equations, record, &as_terms(equations.len(), units)?)?;
+    let mut solver = series::Solver::new(&system.matrix)?;
+    let driven = solver.solve(&system.rhs)?;
+    Ok((driven, system.units_by(&mut solver, units)?))
+}
+
+/// Units as initial terms, by equation.
+fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f64)>>> {
+    let mut initial = vec![Vec::new(); equations];
     for &(i, exponent) in units {
         initial
             .get_mut(i)
             .ok_or_else(|| Error::Structure {
                 what: format!("an initial term of equation {i}"),
-                remedy: format!("there are {n}, from 0"),
+                remedy: format!("there are {equations}, from 0"),
             })?
             .push((exponent, 1.0));
     }
-    checked(equations, record, &initial)?.units(units)
+    Ok(initial)
 }
 
 /// Whether the second half of a series exceeds its first by so much that a transform would swamp the latter.

@@ -180,7 +180,6 @@ def sampled(
     At the instants of the grid, or at times of their own [s].
     """
     rec = record(run, model.structure, (run.length - 1) * every, filtered=model.structure.behind_filter)
-    still = replace(rec, means=np.zeros_like(rec.means))
     at = None if times is None else Instants.of(run, rec, model.structure, times)
     if initial is not None:
         kept = {o: dict(initial.get(o, {})) for o in model.outputs}
@@ -194,12 +193,16 @@ def sampled(
         for power in initial_exponents(e, rec.initial, rec.offset, rec.states)
     ]
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
-    driven = _read(model, run, rec, every, _responses(model, rec, none), none, at)
-    if not names or not np.all(np.isfinite(driven)):
+    if not names:
+        return _read(model, run, rec, every, _responses(model, rec, none), none, at), none
+    free, units = _free_and_units(model, rec, names)
+    driven = _read(model, run, rec, every, free, none, at)
+    if not np.all(np.isfinite(driven)):
         return driven, none
+    still = replace(rec, means=np.zeros_like(rec.means))
     columns = [
         _read(model, None, still, every, means, {**none, output: {power: 1.0}}, at)
-        for (output, power), means in zip(names, _unit_responses(model, still, names), strict=True)
+        for (output, power), means in zip(names, units, strict=True)
     ]
     return _fitted(model, measured_samples(model, run, every, rec), driven, names, columns)
 
@@ -254,23 +257,29 @@ def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
     return np.concatenate([_core.respond(rec.core(), [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
 
 
-def _unit_responses(model: Solved, still: Record, names: Sequence[tuple[str, float]]) -> list[Floats]:
-    """Pulse means of all outputs for a unit of each initial term (output, power), at rest but for it."""
-    equations = [equation_tuple(e, still.signals) for e in model.equations]
-    inputs, outputs, core = list(still.inputs), model.outputs, still.core()
+def _free_and_units(model: Solved, rec: Record, names: Sequence[tuple[str, float]]) -> tuple[Floats, list[Floats]]:
+    """Pulse means of all outputs, before the sensor filter: of the run at rest, and for a unit of each initial term.
+
+    A unit (output, power) acts while nothing else drives.
+    """
+    equations = [equation_tuple(e, rec.signals) for e in model.equations]
+    inputs, outputs, core = list(rec.inputs), model.outputs, rec.core()
     if model.structure.coupling == "simulated":
-        units = [(outputs.index(output), power) for output, power in names]
-        rows = _core.unit_responses(core, equations, inputs, units)
-        return list(rows.reshape(len(names), len(outputs), still.m))
+        asked = [(outputs.index(output), power) for output, power in names]
+        free, rows = _core.respond_and_units(core, equations, inputs, asked)
+        return free, list(rows.reshape(len(names), len(outputs), rec.m))
     # Each equation alone: an initial term moves its own output.
-    out = [np.zeros((len(outputs), still.m)) for _ in names]
+    free, units = np.zeros((len(outputs), rec.m)), [np.zeros((len(outputs), rec.m)) for _ in names]
     for i, (output, item) in enumerate(zip(outputs, equations, strict=True)):
         own = [k for k, name in enumerate(names) if name[0] == output]
-        if own:
-            rows = _core.unit_responses(core, [item], inputs, [(0, names[k][1]) for k in own])
-            for k, row in zip(own, rows, strict=True):
-                out[k][i] = row
-    return out
+        if not own:
+            free[i] = _core.respond(core, [item], inputs, [[]])[0]
+            continue
+        alone, rows = _core.respond_and_units(core, [item], inputs, [(0, names[k][1]) for k in own])
+        free[i] = alone[0]
+        for k, row in zip(own, rows, strict=True):
+            units[k][i] = row
+    return free, units
 
 
 def _read(
