@@ -45,7 +45,37 @@ pub fn fast_length(n: usize) -> usize {
     }
 }
 
-/// The plan of a length, made once per process; [`fast_length`] gives good ones.
+/// Longest transform whose plan is kept for good; a plan holds some 20 bytes a point.
+const KEPT: usize = 1 << 15;
+/// Longer ones are forgotten, when a plan is made, that were not among so many asked for last: a run on ever finer grids
+/// would leave the plans of all of them behind. What is forgotten too early costs a transform or two once more.
+const RECENT: u64 = 32;
+
+/// Plans by length, each with when it was last asked for.
+#[derive(Default)]
+struct Plans {
+    asked: u64,
+    made: HashMap<usize, (Plan, u64)>,
+}
+
+impl Plans {
+    fn of(&mut self, len: usize) -> Plan {
+        self.asked += 1;
+        let now = self.asked;
+        if let Some((plan, last)) = self.made.get_mut(&len) {
+            *last = now;
+            return plan.clone();
+        }
+        self.made.retain(|&len, (_, last)| len <= KEPT || now - *last <= RECENT);
+        let mut planner = RealFftPlanner::<f64>::new();
+        let plan = Plan { len, forward: planner.plan_fft_forward(len), inverse: planner.plan_fft_inverse(len) };
+        self.made.insert(len, (plan.clone(), now));
+        plan
+    }
+}
+
+/// The plan of a length, shared by all that ask for it; [`fast_length`] gives good ones. Long ones are made anew where
+/// nobody has asked for them lately.
 ///
 /// ```
 /// use ftlm::fft::{plan, Complex, Workspace};
@@ -56,17 +86,10 @@ pub fn fast_length(n: usize) -> usize {
 /// ```
 #[must_use]
 pub fn plan(len: usize) -> Plan {
-    static PLANS: OnceLock<Mutex<HashMap<usize, Plan>>> = OnceLock::new();
-    let table = PLANS.get_or_init(|| Mutex::new(HashMap::new()));
+    static PLANS: OnceLock<Mutex<Plans>> = OnceLock::new();
+    let table = PLANS.get_or_init(Mutex::default);
     // A poisoned table only means that another thread died between two inserts; its content is whole.
-    let mut table = table.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-    table
-        .entry(len)
-        .or_insert_with(|| {
-            let mut planner = RealFftPlanner::<f64>::new();
-            Plan { len, forward: planner.plan_fft_forward(len), inverse: planner.plan_fft_inverse(len) }
-        })
-        .clone()
+    table.lock().unwrap_or_else(std::sync::PoisonError::into_inner).of(len)
 }
 
 /// Squared magnitudes of a signal's transform, from frequency 0 to Nyquist's, zero-padded to a fast length.
@@ -158,5 +181,29 @@ impl Workspace {
             self.scratch.resize(len, Bin::new(0.0, 0.0));
         }
         &mut self.scratch[..len]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_plans_are_forgotten_that_nobody_asks_for() {
+        let mut plans = Plans::default();
+        let (short, long) = (64, 2 * KEPT);
+        plans.of(long);
+        plans.of(short);
+        for len in (1..RECENT as usize).map(|k| 2 * k) {
+            plans.of(short.max(len));
+        }
+        assert!(plans.made.contains_key(&long), "asked for lately");
+        plans.of(6 * KEPT);
+        assert!(!plans.made.contains_key(&long));
+        assert!(plans.made.contains_key(&short) && plans.made.contains_key(&(6 * KEPT)));
+        // Made anew, it is the same.
+        let mut spectrum = vec![Bin::new(0.0, 0.0); long / 2 + 1];
+        plans.of(long).forward(&mut vec![1.0; long], &mut spectrum, &mut Workspace::new());
+        assert!((spectrum[0].re - long as f64).abs() < 1e-6 && spectrum[1].norm() < 1e-6);
     }
 }
