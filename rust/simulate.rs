@@ -56,6 +56,9 @@ impl<'a> System<'a> {
         }
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
+        // Terms often share an order: each kernel is made once.
+        let mut kernels: Vec<(f64, Vec<f64>)> = Vec::new();
+        let step = record.step();
         for (i, equation) in equations.iter().enumerate() {
             let structure = &equation.structure;
             structure.check(record.len(), |_| true)?;
@@ -63,15 +66,28 @@ impl<'a> System<'a> {
             matrix[i][i][0] += 1.0;
             for (k, (term, &c)) in structure.terms.iter().zip(&equation.coefficients).enumerate() {
                 let eta = structure.integration(k);
-                match outputs.iter().position(|&o| o == term.signal) {
-                    Some(j) => {
-                        let kernel = kernel(eta, m, record.step());
-                        matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v);
-                    }
+                let unknown = outputs.iter().position(|&o| o == term.signal);
+                if unknown.is_none() {
+                    let signal = record.signal(term.signal);
                     // What stands still drives nothing.
-                    None if record.signal(term.signal).iter().all(|v| *v == 0.0) => {}
+                    if signal.iter().all(|v| *v == 0.0) {
+                        continue;
+                    }
+                    if eta == 0.0 {
+                        rhs[i].iter_mut().zip(signal).for_each(|(b, v)| *b += c * v);
+                        continue;
+                    }
+                }
+                let place = kernels.iter().position(|(known, _)| known.to_bits() == eta.to_bits());
+                let place = place.unwrap_or_else(|| {
+                    kernels.push((eta, kernel(eta, m, step)));
+                    kernels.len() - 1
+                });
+                let kernel = &kernels[place].1;
+                match unknown {
+                    Some(j) => matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v),
                     None => {
-                        let integral = record.integral(term.signal, eta);
+                        let integral = series::multiply(kernel, record.signal(term.signal), m);
                         rhs[i].iter_mut().zip(integral).for_each(|(b, v)| *b += c * v);
                     }
                 }

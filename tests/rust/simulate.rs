@@ -8,8 +8,7 @@ use ftlm::regressors::Record;
 use ftlm::series;
 use ftlm::simulate::{
     equation_error, explicit_euler, nyquist_margin, respond, respond_and_units, respond_with_initial, trace_errors,
-    unit_responses,
-    OutputFilter,
+    unit_responses, OutputFilter,
 };
 use proptest::prelude::*;
 

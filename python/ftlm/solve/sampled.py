@@ -294,7 +294,9 @@ def _read(
     names, structure = model.outputs, model.structure
     coupled = structure.coupling == "simulated"
     count = rec.m // every + 1 if at is None else at.times.size
-    system, drive, now = np.eye(len(names)), np.zeros_like(means), np.zeros((len(names), count))
+    system, now = np.eye(len(names)), np.zeros((len(names), count))
+    # Made where something feeds through: it is as long as the grid.
+    drive: Floats | None = None
     start = np.zeros(len(names))
     for i, item in enumerate(model.equations):
         start[i] = terms[item.output].get(0.0, 0.0)
@@ -310,19 +312,23 @@ def _read(
             if coupled and term.signal in names:
                 system[i, names.index(term.signal)] -= factor
             elif run is not None:
+                drive = np.zeros_like(means) if drive is None else drive
                 drive[i] += factor * rec.of(term.signal)
                 now[i] += factor * _at_instants(run, rec, structure, term.signal, every, at)
     through = np.linalg.inv(system)
-    drive, now, start = through @ drive, through @ now, through @ start
+    drive, now, start = None if drive is None else through @ drive, through @ now, through @ start
     with np.errstate(invalid="ignore", over="ignore"):
-        rest = means - drive
+        rest = means if drive is None else means - drive
         gain = np.ones(len(names))
         series = sensor_series(structure, rec.m, rec.step) if rec.sensor is None else None
         if series is not None and structure.sensor_filter is not None:
+            rest = means.copy() if drive is None else rest
             for i, name in enumerate(names):
                 if structure.measured_through(name) and np.all(np.isfinite(means[i])):
                     gain[i] = high_frequency_gain(structure.sensor_filter)
-                    rest[i] = _core.series_multiply(series, means[i], rec.m) - gain[i] * drive[i]
+                    rest[i] = _core.series_multiply(series, means[i], rec.m)
+                    if drive is not None:
+                        rest[i] -= gain[i] * drive[i]
         if at is not None:
             kinks = through @ _kinks(model, run, at, terms)
             kinks[gain != 1.0] = 0.0
