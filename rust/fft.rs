@@ -46,10 +46,12 @@ pub fn fast_length(n: usize) -> usize {
 }
 
 /// Longest transform whose plan is kept for good; a plan holds some 20 bytes a point.
-const KEPT: usize = 1 << 15;
-/// Longer ones are forgotten, when a plan is made, that were not among so many asked for last: a run on ever finer grids
-/// would leave the plans of all of them behind. What is forgotten too early costs a transform or two once more.
-const RECENT: u64 = 32;
+const KEPT: usize = 1 << 17;
+/// Points of all longer ones together beyond which those asked for longest ago are forgotten: a run on ever finer grids
+/// would leave the plans of all of them behind. What is forgotten too early costs two transforms once more.
+const POINTS: usize = 1 << 22;
+/// Those among so many asked for last are in use: one evaluation of a large problem holds more points than these.
+const IN_USE: u64 = 32;
 
 /// Plans by length, each with when it was last asked for.
 #[derive(Default)]
@@ -66,16 +68,33 @@ impl Plans {
             *last = now;
             return plan.clone();
         }
-        self.made.retain(|&len, (_, last)| len <= KEPT || now - *last <= RECENT);
+        if len > KEPT {
+            self.make_room(POINTS.saturating_sub(len));
+        }
         let mut planner = RealFftPlanner::<f64>::new();
         let plan = Plan { len, forward: planner.plan_fft_forward(len), inverse: planner.plan_fft_inverse(len) };
         self.made.insert(len, (plan.clone(), now));
         plan
     }
+
+    /// Forgets long plans, the one asked for longest ago first, until no more points than these are left.
+    fn make_room(&mut self, points: usize) {
+        let mut long: Vec<(u64, usize)> =
+            self.made.iter().map(|(&len, &(_, last))| (last, len)).filter(|&(_, len)| len > KEPT).collect();
+        long.sort_unstable();
+        let mut held: usize = long.iter().map(|&(_, len)| len).sum();
+        for (last, len) in long {
+            if held <= points || self.asked - last <= IN_USE {
+                break;
+            }
+            held -= len;
+            self.made.remove(&len);
+        }
+    }
 }
 
-/// The plan of a length, shared by all that ask for it; [`fast_length`] gives good ones. Long ones are made anew where
-/// nobody has asked for them lately.
+/// The plan of a length, shared by all that ask for it; [`fast_length`] gives good ones. Of long ones only the last are
+/// kept.
 ///
 /// ```
 /// use ftlm::fft::{plan, Complex, Workspace};
@@ -191,19 +210,22 @@ mod tests {
     #[test]
     fn long_plans_are_forgotten_that_nobody_asks_for() {
         let mut plans = Plans::default();
-        let (short, long) = (64, 2 * KEPT);
-        plans.of(long);
+        let (short, long, next) = (64, POINTS / 2, POINTS / 2 + 2);
         plans.of(short);
-        for len in (1..RECENT as usize).map(|k| 2 * k) {
-            plans.of(short.max(len));
+        plans.of(long);
+        plans.of(next);
+        assert!(plans.made.contains_key(&long), "in use");
+        for _ in 0..=IN_USE {
+            plans.of(short);
         }
-        assert!(plans.made.contains_key(&long), "asked for lately");
-        plans.of(6 * KEPT);
-        assert!(!plans.made.contains_key(&long));
-        assert!(plans.made.contains_key(&short) && plans.made.contains_key(&(6 * KEPT)));
+        plans.of(next + 2);
+        assert!(!plans.made.contains_key(&long) && !plans.made.contains_key(&next));
+        assert!(plans.made.contains_key(&short) && plans.made.contains_key(&(next + 2)));
         // Made anew, it is the same.
         let mut spectrum = vec![Bin::new(0.0, 0.0); long / 2 + 1];
         plans.of(long).forward(&mut vec![1.0; long], &mut spectrum, &mut Workspace::new());
-        assert!((spectrum[0].re - long as f64).abs() < 1e-6 && spectrum[1].norm() < 1e-6);
+        #[allow(clippy::cast_precision_loss)]
+        let sum = long as f64;
+        assert!((spectrum[0].re - sum).abs() < 1e-6 && spectrum[1].norm() < 1e-6);
     }
 }

@@ -63,9 +63,15 @@ def test_what_does_not_move_has_stood_still():
     assert told([np.zeros((1, 3))] * 3)[1] == 0.0
 
 
-@pytest.mark.parametrize(
-    "words", ["D^2 y = -40 y - 1.5 D y + 30 u", "D y = -30 y + 25 u", "D^3 y = -40 y - 60 D y + u"]
-)
+#: The last row of each companion matrix, and what the input drives.
+WHOLE = {
+    "D^2 y = -40 y - 1.5 D y + 30 u": ([-40, -1.5], 30),
+    "D y = -30 y + 25 u": ([-30], 25),
+    "D^3 y = -40 y - 60 D y + u": ([-40, -60, 0], 1),
+}
+
+
+@pytest.mark.parametrize("words", WHOLE)
 @pytest.mark.parametrize("kind", ["zoh", "foh"])
 def test_fewer_grids_are_as_close_to_state_space_as_was_asked(words, kind):
     # The oracle shares no code: SciPy's matrix exponential, exact for inputs that hold or are linear in between.
