@@ -67,10 +67,9 @@ def triangle(parts: Sequence[Sequence[Floats]]) -> Floats:
 
     A rotation of the rows leaves every inner product as it is, and with it every least squares among the columns.
     """
-    turned = []
-    for part in parts:
-        for start in range(0, part[0].size, ROWS):
-            turned.append(np.linalg.qr(np.stack([c[start : start + ROWS] for c in part], axis=1), mode="r"))
+    tables = [np.stack(part, axis=1) for part in parts]
+    blocks = [b for table in tables for b in np.array_split(table, max(len(table) // ROWS, 1))]
+    turned = [np.linalg.qr(block, mode="r") for block in blocks]
     return np.asarray(np.linalg.qr(np.concatenate(turned), mode="r"))
 
 
