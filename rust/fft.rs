@@ -45,7 +45,56 @@ pub fn fast_length(n: usize) -> usize {
     }
 }
 
-/// The plan of a length, made once per process; [`fast_length`] gives good ones.
+/// Longest transform whose plan is kept for good; a plan holds some 20 bytes a point.
+const KEPT: usize = 1 << 17;
+/// Points of all longer ones together beyond which those asked for longest ago are forgotten: a run on ever finer grids
+/// would leave the plans of all of them behind. What is forgotten too early costs two transforms once more.
+const POINTS: usize = 1 << 22;
+/// Those among so many asked for last are in use: one evaluation of a large problem holds more points than these.
+const IN_USE: u64 = 32;
+
+/// Plans by length, each with when it was last asked for.
+#[derive(Default)]
+struct Plans {
+    asked: u64,
+    made: HashMap<usize, (Plan, u64)>,
+}
+
+impl Plans {
+    fn of(&mut self, len: usize) -> Plan {
+        self.asked += 1;
+        let now = self.asked;
+        if let Some((plan, last)) = self.made.get_mut(&len) {
+            *last = now;
+            return plan.clone();
+        }
+        if len > KEPT {
+            self.make_room(POINTS.saturating_sub(len));
+        }
+        let mut planner = RealFftPlanner::<f64>::new();
+        let plan = Plan { len, forward: planner.plan_fft_forward(len), inverse: planner.plan_fft_inverse(len) };
+        self.made.insert(len, (plan.clone(), now));
+        plan
+    }
+
+    /// Forgets long plans, the one asked for longest ago first, until no more points than these are left.
+    fn make_room(&mut self, points: usize) {
+        let mut long: Vec<(u64, usize)> =
+            self.made.iter().map(|(&len, &(_, last))| (last, len)).filter(|&(_, len)| len > KEPT).collect();
+        long.sort_unstable();
+        let mut held: usize = long.iter().map(|&(_, len)| len).sum();
+        for (last, len) in long {
+            if held <= points || self.asked - last <= IN_USE {
+                break;
+            }
+            held -= len;
+            self.made.remove(&len);
+        }
+    }
+}
+
+/// The plan of a length, shared by all that ask for it; [`fast_length`] gives good ones. Of long ones only the last are
+/// kept.
 ///
 /// ```
 /// use ftlm::fft::{plan, Complex, Workspace};
@@ -56,17 +105,10 @@ pub fn fast_length(n: usize) -> usize {
 /// ```
 #[must_use]
 pub fn plan(len: usize) -> Plan {
-    static PLANS: OnceLock<Mutex<HashMap<usize, Plan>>> = OnceLock::new();
-    let table = PLANS.get_or_init(|| Mutex::new(HashMap::new()));
+    static PLANS: OnceLock<Mutex<Plans>> = OnceLock::new();
+    let table = PLANS.get_or_init(Mutex::default);
     // A poisoned table only means that another thread died between two inserts; its content is whole.
-    let mut table = table.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-    table
-        .entry(len)
-        .or_insert_with(|| {
-            let mut planner = RealFftPlanner::<f64>::new();
-            Plan { len, forward: planner.plan_fft_forward(len), inverse: planner.plan_fft_inverse(len) }
-        })
-        .clone()
+    table.lock().unwrap_or_else(std::sync::PoisonError::into_inner).of(len)
 }
 
 /// Squared magnitudes of a signal's transform, from frequency 0 to Nyquist's, zero-padded to a fast length.
@@ -158,5 +200,32 @@ impl Workspace {
             self.scratch.resize(len, Bin::new(0.0, 0.0));
         }
         &mut self.scratch[..len]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_plans_are_forgotten_that_nobody_asks_for() {
+        let mut plans = Plans::default();
+        let (short, long, next) = (64, POINTS / 2, POINTS / 2 + 2);
+        plans.of(short);
+        plans.of(long);
+        plans.of(next);
+        assert!(plans.made.contains_key(&long), "in use");
+        for _ in 0..=IN_USE {
+            plans.of(short);
+        }
+        plans.of(next + 2);
+        assert!(!plans.made.contains_key(&long) && !plans.made.contains_key(&next));
+        assert!(plans.made.contains_key(&short) && plans.made.contains_key(&(next + 2)));
+        // Made anew, it is the same.
+        let mut spectrum = vec![Bin::new(0.0, 0.0); long / 2 + 1];
+        plans.of(long).forward(&mut vec![1.0; long], &mut spectrum, &mut Workspace::new());
+        #[allow(clippy::cast_precision_loss)]
+        let sum = long as f64;
+        assert!((spectrum[0].re - sum).abs() < 1e-6 && spectrum[1].norm() < 1e-6);
     }
 }

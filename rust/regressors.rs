@@ -150,6 +150,9 @@ impl Record {
     /// ```
     #[must_use]
     pub fn integral(&self, signal: usize, eta: f64) -> Vec<f64> {
+        if eta == 0.0 {
+            return self.signals[signal].clone();
+        }
         series::multiply(&kernel(eta, self.m(), self.step), &self.signals[signal], self.m())
     }
 

@@ -56,6 +56,9 @@ impl<'a> System<'a> {
         }
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
+        // Terms often share an order: each kernel is made once.
+        let mut kernels: Vec<(f64, Vec<f64>)> = Vec::new();
+        let step = record.step();
         for (i, equation) in equations.iter().enumerate() {
             let structure = &equation.structure;
             structure.check(record.len(), |_| true)?;
@@ -63,15 +66,28 @@ impl<'a> System<'a> {
             matrix[i][i][0] += 1.0;
             for (k, (term, &c)) in structure.terms.iter().zip(&equation.coefficients).enumerate() {
                 let eta = structure.integration(k);
-                match outputs.iter().position(|&o| o == term.signal) {
-                    Some(j) => {
-                        let kernel = kernel(eta, m, record.step());
-                        matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v);
-                    }
+                let unknown = outputs.iter().position(|&o| o == term.signal);
+                if unknown.is_none() {
+                    let signal = record.signal(term.signal);
                     // What stands still drives nothing.
-                    None if record.signal(term.signal).iter().all(|v| *v == 0.0) => {}
+                    if signal.iter().all(|v| *v == 0.0) {
+                        continue;
+                    }
+                    if eta == 0.0 {
+                        rhs[i].iter_mut().zip(signal).for_each(|(b, v)| *b += c * v);
+                        continue;
+                    }
+                }
+                let place = kernels.iter().position(|(known, _)| known.to_bits() == eta.to_bits());
+                let place = place.unwrap_or_else(|| {
+                    kernels.push((eta, kernel(eta, m, step)));
+                    kernels.len() - 1
+                });
+                let kernel = &kernels[place].1;
+                match unknown {
+                    Some(j) => matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v),
                     None => {
-                        let integral = record.integral(term.signal, eta);
+                        let integral = series::multiply(kernel, record.signal(term.signal), m);
                         rhs[i].iter_mut().zip(integral).for_each(|(b, v)| *b += c * v);
                     }
                 }
@@ -104,8 +120,11 @@ impl<'a> System<'a> {
 
     /// Columns of the inverse of the matrix: `[j][i]` is what a unit pulse in the error of equation i does to output j.
     pub(crate) fn inverse(&self) -> Result<Vec<Vec<Vec<f64>>>> {
+        self.inverse_by(&mut series::Solver::new(&self.matrix)?)
+    }
+
+    fn inverse_by(&self, solver: &mut series::Solver<'_>) -> Result<Vec<Vec<Vec<f64>>>> {
         let n = self.matrix.len();
-        let mut solver = series::Solver::new(&self.matrix)?;
         let mut out = vec![Vec::with_capacity(n); n];
         for i in 0..n {
             let mut unit = vec![vec![0.0; self.record.m()]; n];
@@ -121,18 +140,22 @@ impl<'a> System<'a> {
 
     /// What a unit of each initial term, an equation and an exponent, does to every output while nothing else drives.
     pub(crate) fn units(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
+        self.units_by(&mut series::Solver::new(&self.matrix)?, units)
+    }
+
+    fn units_by(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
         let (m, n) = (self.record.m(), self.matrix.len());
         if units.is_empty() {
             return Ok(Vec::new());
         }
-        let inverse = self.inverse()?;
+        let inverse = self.inverse_by(solver)?;
         if inverse.iter().flatten().any(|series| grows(series)) {
             return units
                 .iter()
                 .map(|&(i, exponent)| {
                     let mut rhs = vec![vec![0.0; m]; n];
                     rhs[i] = self.record.initial_term(exponent);
-                    self.solve(&rhs)
+                    solver.solve(&rhs)
                 })
                 .collect();
         }
@@ -250,18 +273,38 @@ pub fn inverse(equations: &[Equation], record: &Record) -> Result<Vec<Vec<Vec<f6
 /// # }
 /// ```
 pub fn unit_responses(equations: &[Equation], record: &Record, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
-    let n = equations.len();
-    let mut initial = vec![Vec::new(); n];
+    checked(equations, record, &as_terms(equations.len(), units)?)?.units(units)
+}
+
+/// The free run at rest ([`respond`]) and [`unit_responses`], whose divisions share their transforms.
+///
+/// # Errors
+/// As [`unit_responses`].
+#[allow(clippy::type_complexity)]
+pub fn respond_and_units(
+    equations: &[Equation],
+    record: &Record,
+    units: &[(usize, f64)],
+) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
+    let system = checked(equations, record, &as_terms(equations.len(), units)?)?;
+    let mut solver = series::Solver::new(&system.matrix)?;
+    let driven = solver.solve(&system.rhs)?;
+    Ok((driven, system.units_by(&mut solver, units)?))
+}
+
+/// Units as initial terms, by equation.
+fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f64)>>> {
+    let mut initial = vec![Vec::new(); equations];
     for &(i, exponent) in units {
         initial
             .get_mut(i)
             .ok_or_else(|| Error::Structure {
                 what: format!("an initial term of equation {i}"),
-                remedy: format!("there are {n}, from 0"),
+                remedy: format!("there are {equations}, from 0"),
             })?
             .push((exponent, 1.0));
     }
-    checked(equations, record, &initial)?.units(units)
+    Ok(initial)
 }
 
 /// Whether the second half of a series exceeds its first by so much that a transform would swamp the latter.

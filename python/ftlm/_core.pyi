@@ -50,6 +50,7 @@ __all__ = [
     "pulse_means",
     "read_at",
     "respond",
+    "respond_and_units",
     "respond_with_initial",
     "search",
     "search_join",
@@ -58,7 +59,6 @@ __all__ = [
     "series_divide",
     "series_multiply",
     "trace_errors",
-    "unit_responses",
 ]
 
 _Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
@@ -260,9 +260,9 @@ def respond(
     inputs: Sequence[bool],
     terms: Sequence[Sequence[tuple[float, float]]],
 ) -> _Matrix: ...
-def unit_responses(
+def respond_and_units(
     run: _Record, model: Sequence[_Equation], inputs: Sequence[bool], units: Sequence[tuple[int, float]]
-) -> _Matrix: ...
+) -> tuple[_Matrix, _Matrix]: ...
 def respond_with_initial(
     run: _Record,
     model: Sequence[_Equation],

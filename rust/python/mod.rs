@@ -33,7 +33,7 @@ mod _core {
     #[pymodule_export]
     use super::simulate::{
         corners, correlation, equation_error, explicit_euler, metrics, nyquist_margin, read_at, respond,
-        respond_with_initial, trace_errors, unit_responses,
+        respond_and_units, respond_with_initial, trace_errors,
     };
 
     #[pymodule_export]

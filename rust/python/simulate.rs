@@ -27,17 +27,18 @@ pub fn respond<'py>(
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn unit_responses<'py>(
+#[allow(clippy::type_complexity)]
+pub fn respond_and_units<'py>(
     py: Python<'py>,
     run: RecordArg<'py>,
     model: Vec<EquationArg>,
     inputs: Vec<bool>,
     units: Vec<(usize, f64)>,
-) -> PyResult<Bound<'py, PyArray2<f64>>> {
+) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>)> {
     let record = record(&run)?;
     let equations = equations(model, record.len(), &inputs)?;
-    let outputs = detached(py, || simulate::unit_responses(&equations, &record, &units))?;
-    stacked(py, &outputs.concat())
+    let (driven, units) = detached(py, || simulate::respond_and_units(&equations, &record, &units))?;
+    Ok((stacked(py, &driven)?, stacked(py, &units.concat())?))
 }
 
 #[pyfunction]

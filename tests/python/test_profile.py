@@ -335,6 +335,29 @@ def test_a_lower_optimum_on_the_way_is_gone_on_from(bent: ftlm.Run) -> None:
         np.testing.assert_allclose((own.low, own.high), shifted, rtol=2e-3)
 
 
+def test_a_budget_holds_for_every_optimum_on_the_way(bent: ftlm.Run) -> None:
+    u = bent["u"]
+    plain = quadratic(record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9), "D^2 y = c D y + a y + b u")
+    valley = valley_of(plain)
+    names = list(plain.joint_values)
+    orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
+    beside = valley.grid.descend(Attempt(orders, coefficients, "beside", {}, delays), 1, plain=True)
+    apart = replace(valley, best=beside)
+    free = profiled(apart, names, 0.95)
+    # It went on from a lower optimum; what it took until there counts.
+    assert free.lower is not None
+    assert free.evaluations > sum(i.evaluations for i in free.intervals.values())
+    # As many as all ends are begun with: the way down leaves too few of them for the ends around the lower optimum.
+    least = profiling.LEAST_SHARE * 2 * len(names)
+    scarce = profiled(apart, names, 0.95, most=least)
+    assert 0 < scarce.evaluations <= least
+    assert scarce.lower is not None
+    assert scarce.left == tuple(names)
+    assert profiled(valley, names, 0.95, most=least).left == ()
+    # The first way down is the last that is followed, whatever the threads.
+    assert profiled(apart, names, 0.95, threads=3).evaluations == free.evaluations
+
+
 def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monkeypatch: pytest.MonkeyPatch) -> None:
     u = bent["u"]
     run = record(fast_pole(-0.8, -4.0, 4.0, u), u, 0.05, 9)

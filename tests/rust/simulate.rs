@@ -7,8 +7,8 @@ use ftlm::kernels::block_pulse_kernel;
 use ftlm::regressors::Record;
 use ftlm::series;
 use ftlm::simulate::{
-    equation_error, explicit_euler, nyquist_margin, respond, respond_with_initial, trace_errors, unit_responses,
-    OutputFilter,
+    equation_error, explicit_euler, nyquist_margin, respond, respond_and_units, respond_with_initial, trace_errors,
+    unit_responses, OutputFilter,
 };
 use proptest::prelude::*;
 
@@ -464,6 +464,8 @@ fn units_of_initial_terms_answer_as_free_runs_of_nothing_else() {
                 Record::new(0.01, vec![vec![0.3; 500], vec![0.1; 500], vec![1.0; 500]], filter.clone()).unwrap();
             let still = Record::new(0.01, vec![vec![0.0; 500]; 3], filter).unwrap();
             let found = unit_responses(&model, &driven, &units).unwrap();
+            let both = respond_and_units(&model, &driven, &units).unwrap();
+            assert_eq!(both, (respond(&model, &driven, &[]).unwrap(), found.clone()));
             for (&(i, exponent), outputs) in units.iter().zip(&found) {
                 let mut initial = vec![vec![], vec![]];
                 initial[i].push((exponent, 1.0));

@@ -22,6 +22,8 @@ ROUNDING = 3e-5
 BEND = 1.345
 #: Share of true models that a test is allowed to refuse.
 LEVEL = 0.01
+#: Rows that are turned at a time: they stay in a processor's cache.
+ROWS = 1000
 #: Half-widths of a 95 % and of a 99 % interval in standard deviations.
 NORMAL_95 = 1.959963984540054
 NORMAL_99 = NormalDist().inv_cdf(1 - LEVEL / 2)
@@ -58,6 +60,17 @@ def orthonormal(columns: Floats, least: float) -> Floats:
     directions, spread, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
     kept: Floats = directions[:, spread > least * spread[0]]
     return kept
+
+
+def triangle(parts: Sequence[Sequence[Floats]]) -> Floats:
+    """Columns, given in parts one below the other, turned so that all rows but as many as they are hold 0.
+
+    A rotation of the rows leaves every inner product as it is, and with it every least squares among the columns.
+    """
+    tables = [np.stack(part, axis=1) for part in parts]
+    blocks = [b for table in tables for b in np.array_split(table, max(len(table) // ROWS, 1))]
+    turned = [np.linalg.qr(block, mode="r") for block in blocks]
+    return np.asarray(np.linalg.qr(np.concatenate(turned), mode="r"))
 
 
 def huber_excess(few: Floats, many: Floats) -> float:

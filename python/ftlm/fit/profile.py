@@ -68,6 +68,7 @@ class _LowerError(Exception):
     def __init__(self, attempt: Attempt) -> None:
         super().__init__()
         self.attempt = attempt
+        self.evaluations = int(attempt.outcome["evaluations"])
 
 
 @dataclass(frozen=True)
@@ -172,23 +173,29 @@ class Valley:
                 break
             if stop is not None and stop.is_set():
                 raise KeyboardInterrupt
+            origin = within
             while True:
                 lap = max(min(LAP, allowed - evaluations), 0)
-                there, following = self.refitted(i, start + side * way, within, lap) if lap > 0 else None, math.inf
+                try:
+                    there, following = self.refitted(i, start + side * way, origin, lap) if lap > 0 else None, math.inf
+                except _LowerError as lower:
+                    lower.evaluations += evaluations
+                    raise
                 took = lap if there is None else int(there.outcome["evaluations"])
                 evaluations += took
                 if lap == LAP or took < lap:
                     break
-                # Cut short, a refit tells nothing.
+                # Cut short, a refit tells nothing, and goes on from where it was.
+                origin = there or origin
                 allowed = yield evaluations
-            rise = math.inf
+            rise, near = math.inf, False
             if there is not None:
                 rise = self.rise(i, 2.0 * float(there.outcome["cost"]))
                 points.append((start + side * way + float(self.shift[i]), rise**2))
                 slope = side * _slope(there, i) / (float(self.units[i]) * rise) if rise > 0 else 0.0
                 following = way + (width - rise) / slope if slope > 0 else math.inf
-                near = abs(rise / width - 1.0) <= NEAR and abs(following - way) <= FOUND * way
-                if near and inside < following <= farthest:
+                near = abs(rise / width - 1.0) <= NEAR
+                if near and abs(following - way) <= FOUND * way and inside < following <= farthest:
                     return End(start + side * following, points, evaluations)
             if there is None or rise > width:
                 if way >= outside:
@@ -202,13 +209,19 @@ class Valley:
                     outside = math.inf
                 if way >= farthest:
                     break
-            if math.isinf(outside):
+            closed = math.isfinite(outside)
+            size = max(min(outside, abs(start + side * inside)), FINEST * outside) if closed else 0.0
+            narrow = closed and outside - inside <= FOUND * size
+            if near and not narrow and inside < following < min(outside, farthest):
+                # Newton's next step is worth more there than one of a size given beforehand.
+                way = following
+            elif not closed:
                 gain, reached = rise - reached, rise
                 if gain <= LEVEL_OFF * gained and rise + gain < (1.0 - BELOW) * width and way > GROWTH * first:
                     break
                 gained = gain
                 way = min(max(following, LEAST_GROWTH * way), GROWTH * way, farthest)
-            elif outside - inside <= FOUND * max(min(outside, abs(start + side * inside)), FINEST * outside):
+            elif narrow:
                 way = outside
             else:
                 margin = 0.05 * (outside - inside)
@@ -309,11 +322,14 @@ class Profiles:
         Values of everything free at an optimum that is lower than the fit's; None where there is none worth a fit.
     left
         Names of numbers whose profile would have taken more free runs than were allowed.
+    evaluations
+        Free runs that all of it took.
     """
 
     intervals: dict[str, ProfileInterval]
     lower: Floats | None = None
     left: tuple[str, ...] = ()
+    evaluations: int = 0
 
 
 def profiled(
@@ -336,23 +352,23 @@ def profiled(
     threads, progress
         Threads, and what is called with (ends found, ends in all).
     most
-        Free runs for all ends together; None for as many as they need. They are dealt out evenly, and what an end does
-        not need goes to those that are not found yet.
+        Free runs for all ends together, those from lower optima on the way included; None for as many as they need.
+        They are dealt out evenly, and what an end does not need goes to those that are not found yet.
 
     Raises
     ------
     KeyboardInterrupt
         Ctrl-C, within one refit.
     """
-    start = valley
+    start, spent = valley, 0
     for _ in range(DESCENTS):
-        ends = _ends(valley, names, level, threads, progress, most)
+        ends, took = _ends(valley, names, level, threads, progress, None if most is None else most - spent)
+        spent += took
         below = [e.attempt for e in ends.values() if isinstance(e, _LowerError)]
         if not below:
             break
-        least = min(below, key=lambda a: float(a.outcome["cost"]))
         # What was the limit for step 0 of another optimum is none of this one.
-        valley = Valley.at(valley.grid, least.values, np.zeros_like(valley.shift))
+        valley = Valley.at(valley.grid, below[0].values, np.zeros_like(valley.shift))
     fall = 2.0 * (float(start.best.outcome["cost"]) - float(valley.best.outcome["cost"]))
     known = valley.units[np.isfinite(valley.units)]
     lower = valley.best.values if known.size and fall > WORTH * float(np.median(known)) else None
@@ -369,14 +385,17 @@ def profiled(
         low, high = (min(max(v, first), last) if math.isfinite(v) else v for v in (low, high))
         points = tuple(sorted([*both[0].points, *both[1].points]))
         found[name] = ProfileInterval(low, high, level, points, sum(e.evaluations for e in both))
-    return Profiles(found, lower, left)
+    return Profiles(found, lower, left, spent)
 
 
 def _ends(
     valley: Valley, names: Sequence[str], level: float, threads: int, progress: Callable[[int, int], None] | None,
     most: int | None,
-) -> dict[tuple[str, float], End | _LowerError | None]:  # fmt: skip
-    """Both ends of every number that the runs see, or the lower optimum that the way there led to."""
+) -> tuple[dict[tuple[str, float], End | _LowerError | None], int]:  # fmt: skip
+    """Both ends of every number that the runs see, and the free runs that they took.
+
+    The first of them whose way leads to a lower optimum is the last: all others would be ends around another one.
+    """
     width, stop = half_width(level), threading.Event()
     asked = [(n, side) for n in names if valley.seen(valley.names.index(n)) for side in (-1.0, 1.0)]
     searches = {one: valley.end(valley.names.index(one[0]), one[1], width, stop) for one in asked}
@@ -403,20 +422,25 @@ def _ends(
                     break
                 # In whole rounds, so that what an end may take does not depend on the number of threads.
                 allowed = [took[o] + share for o in left]
-                for one, found in zip(left, pool.map(followed, left, allowed), strict=True):
+                asked_now = [pool.submit(followed, one, most_now) for one, most_now in zip(left, allowed, strict=True)]
+                for one, future in zip(left, asked_now, strict=True):
+                    found = future.result()
                     if isinstance(found, int):
                         took[one] = found
-                    else:
-                        out[one] = found
-                        took[one] = found.evaluations if isinstance(found, End) else took[one]
-                        if progress is not None:
-                            progress(sum(e is not None for e in out.values()), len(asked))
+                        continue
+                    out[one], took[one] = found, found.evaluations
+                    if isinstance(found, _LowerError):
+                        stop.set()
+                        pool.shutdown(cancel_futures=True)
+                        return out, sum(took.values())
+                    if progress is not None:
+                        progress(sum(e is not None for e in out.values()), len(asked))
                 left = [o for o in left if out[o] is None]
         except BaseException:
             stop.set()
             pool.shutdown(cancel_futures=True)
             raise
-    return out
+    return out, sum(took.values())
 
 
 def bent_numbers(valley: Valley, level: float) -> list[str]:

@@ -42,6 +42,7 @@ def with_intervals(
     if intervals == "quadratic" or (intervals == "auto" and joint.samples < 2 * fitted):
         return joint, []
     warnings: list[str] = []
+    spent = 0
     for turn in range(REFITS + 1):
         try:
             valley = Valley.of(joint, problem, runs)
@@ -49,12 +50,14 @@ def with_intervals(
             # No finite free run where the weights of the last descent are taken anew: what is known stays.
             return joint, warnings
         names = valley.names if intervals == "profile" else bent_numbers(valley, PRINTED)
-        allowed, least = UNASKED // (joint.samples * joint.refinement), FEWEST * 2 * len(names)
+        pulses, least = joint.samples * joint.refinement, FEWEST * 2 * len(names)
+        allowed = (UNASKED - spent) // pulses
         if intervals == "auto" and least > STRETCH * allowed:
             found = Profiles({}, None, tuple(names))
             break
         most = None if intervals == "profile" else max(allowed, least)
         found = profiled(valley, names, PRINTED, threads=threads, progress=progress, most=most)
+        spent += found.evaluations * pulses
         if found.lower is None or turn == REFITS:
             break
         if not is_lower(valley.grid, joint.on_grid, found.lower):

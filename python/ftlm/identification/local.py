@@ -85,9 +85,15 @@ def at_point(
     orders, coefficients, inputs = problem.split([values[n] for n in problem.names])
     start = Attempt(orders, coefficients, "given", {}, inputs)
     grid = Grid(problem, runs, [1.0] * len(structure.outputs), every=every)
-    levels = grid.levels(grid.descend(start, 1, plain=True))
-    grid = replace(grid, weights=[1.0 / max(level, 1e-300) for level in levels.values()])
-    return grid, grid.descend(start, 1, plain=True)
+    here = grid.descend(start, 1, plain=True)
+    weights = [1.0 / max(level, 1e-300) for level in grid.levels(here).values()]
+    grid = replace(grid, weights=weights)
+    if len(weights) > 1:
+        # Initial terms bring all outputs closest together, so that they follow the weights.
+        return grid, grid.descend(here, 1, plain=True)
+    scaled = {n: weights[0] * np.asarray(here.outcome[n]) for n in ("residuals", "jacobian")}
+    cost = weights[0] ** 2 * float(here.outcome["cost"])
+    return grid, replace(here, outcome={**here.outcome, **scaled, "cost": cost})
 
 
 def offset_test(

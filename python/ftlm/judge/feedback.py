@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.statistics import chi_squared, orthonormal
+from ftlm.base.statistics import chi_squared, orthonormal, triangle
 from ftlm.judge.metrics import finite
 
 #: Future samples of the input that are looked at: an answer within a few samples hides among many.
@@ -93,60 +93,94 @@ def feedback_test(
     direct
         Whether the model has direct feed-through from this input, so that its value of the same sample is no answer.
     """
-    at_once = _statistic(white, signal, others, 1 if direct else 0)
-    if at_once is None:
+    table = Regressors.of(white, signal, others)
+    at_once = None if table is None else table.statistic(1 if direct else 0)
+    if table is None or at_once is None:
         return FeedbackTest(0.0, np.inf, instant=False, decided=False)
-    later = at_once if direct else _statistic(white, signal, others, 1)
+    later = at_once if direct else table.statistic(1)
     if later is not None and later[0] > later[1]:
         return FeedbackTest(*later, instant=False)
     return FeedbackTest(*at_once, instant=at_once[0] > at_once[1])
 
 
-def _statistic(
-    white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]], first: int
-) -> tuple[float, float] | None:
-    """What inputs from ``first`` samples ahead on explain, and its limit, of the horizon that explains most."""
-    before, ahead, residuals, rows = [], [], [], 0
-    sizes = [e.size for e in white if e.size > DENSE + AHEAD[-1]]
-    reach = min(sizes, default=0) // 2
-    for run, (every, driving) in enumerate(zip(white, signal, strict=True)):
-        e, u = every[: MOST_ROWS - rows], driving[: MOST_ROWS - rows]
-        inner = slice(DENSE, e.size - AHEAD[-1])
-        if e.size <= max(DENSE + AHEAD[-1], reach):
-            continue
-        columns = past_columns(u, 1 - first, reach)
-        for other in others:
-            columns += past_columns(other[run][: e.size], 1, reach, dense=10, wider=2.0)
-        before.append([*(c[inner] for c in columns), np.ones(e.size - AHEAD[-1] - DENSE)])
-        ahead.append([u[DENSE + k : e.size - AHEAD[-1] + k] for k in range(first, AHEAD[-1] + 1)])
-        residuals.append(e[inner])
-        rows += e.size
-        if rows >= MOST_ROWS:
-            break
-    if not residuals:
-        return None
-    past, future = (np.concatenate([np.stack(part, axis=1) for part in parts]) for parts in (before, ahead))
-    target = np.concatenate(residuals)
-    if target.size < 2 * (past.shape[1] + future.shape[1]):
-        return None
-    basis = orthonormal(past, SPANNED)
-    left = target - basis @ (basis.T @ target)
-    own = np.linalg.norm(future, axis=0)
-    future = future - basis @ (basis.T @ future)
-    future = future - basis @ (basis.T @ future)
-    new = np.linalg.norm(future, axis=0) > SPANNED * np.where(own > 0, own, 1.0)
-    worst: tuple[float, float] | None = None
-    for horizon in AHEAD:
-        kept = future[:, : horizon + 1 - first][:, new[: horizon + 1 - first]]
-        if not kept.size:
-            continue
-        seen = orthonormal(kept, SPANNED)
-        explained, total = float(np.sum((seen.T @ left) ** 2)), float(left @ left)
-        degrees = target.size - basis.shape[1] - seen.shape[1]
-        rest = (total - explained) / degrees
-        if not rest > 0:
-            continue
-        found = explained / rest, chi_squared(seen.shape[1], LEVEL / len(AHEAD))
-        if worst is None or found[0] / found[1] > worst[0] / worst[1]:
-            worst = found
-    return worst
+@dataclass(frozen=True)
+class Regressors:
+    """Residuals beside what may explain them, turned so that all rows but as many as there are columns are 0.
+
+    A rotation of the rows leaves every inner product as it is, and with it every least squares.
+
+    Parameters
+    ----------
+    past
+        Earlier samples of the input and of the others, and a constant.
+    now
+        The input's sample of the same row, less its first of that run, as those of the past are.
+    future
+        The input's sample of the same row, then those after it.
+    residuals
+        What is to be explained.
+    rows
+        How many rows there were.
+    """
+
+    past: Floats
+    now: Floats
+    future: Floats
+    residuals: Floats
+    rows: int
+
+    @classmethod
+    def of(
+        cls, white: Sequence[Floats], signal: Sequence[Floats], others: Sequence[Sequence[Floats]]
+    ) -> Regressors | None:
+        """Of residuals and inputs, a run each; None where every run is too short."""
+        parts, rows, width = [], 0, 0
+        sizes = [e.size for e in white if e.size > DENSE + AHEAD[-1]]
+        reach = min(sizes, default=0) // 2
+        for run, (every, driving) in enumerate(zip(white, signal, strict=True)):
+            e, u = every[: MOST_ROWS - rows], driving[: MOST_ROWS - rows]
+            inner = slice(DENSE, e.size - AHEAD[-1])
+            if e.size <= max(DENSE + AHEAD[-1], reach):
+                continue
+            now, *columns = past_columns(u, 0, reach)
+            for other in others:
+                columns += past_columns(other[run][: e.size], 1, reach, dense=10, wider=2.0)
+            columns += [np.ones(e.size), now]
+            width = len(columns) - 1
+            later = [u[DENSE + k : e.size - AHEAD[-1] + k] for k in range(AHEAD[-1] + 1)]
+            parts.append([*(c[inner] for c in columns), *later, e[inner]])
+            rows += e.size
+            if rows >= MOST_ROWS:
+                break
+        if not parts:
+            return None
+        turned = triangle(parts)
+        count = sum(part[-1].size for part in parts)
+        return cls(turned[:, :width], turned[:, width], turned[:, width + 1 : -1], turned[:, -1], count)
+
+    def statistic(self, first: int) -> tuple[float, float] | None:
+        """What the input from ``first`` samples ahead on, 0 or 1, explains, and its limit, of the better horizon."""
+        past = np.column_stack([self.past, self.now]) if first else self.past
+        future = self.future[:, first:]
+        if self.rows < 2 * (past.shape[1] + future.shape[1]):
+            return None
+        basis = orthonormal(past, SPANNED)
+        left = self.residuals - basis @ (basis.T @ self.residuals)
+        own = np.linalg.norm(future, axis=0)
+        future = future - basis @ (basis.T @ future)
+        future = future - basis @ (basis.T @ future)
+        new = np.linalg.norm(future, axis=0) > SPANNED * np.where(own > 0, own, 1.0)
+        worst: tuple[float, float] | None = None
+        for horizon in AHEAD:
+            kept = future[:, : horizon + 1 - first][:, new[: horizon + 1 - first]]
+            if not kept.size:
+                continue
+            seen = orthonormal(kept, SPANNED)
+            explained, total = float(np.sum((seen.T @ left) ** 2)), float(left @ left)
+            rest = (total - explained) / (self.rows - basis.shape[1] - seen.shape[1])
+            if not rest > 0:
+                continue
+            found = explained / rest, chi_squared(seen.shape[1], LEVEL / len(AHEAD))
+            if worst is None or found[0] / found[1] > worst[0] / worst[1]:
+                worst = found
+        return worst

@@ -69,9 +69,9 @@ def simulate(
     """Point samples of a model's outputs on a run's inputs, at the run's instants.
 
     The grid is the record's own, refined under the inputs' inter-sample behaviour (a held command stays exact) and
-    extrapolated in the step (second order), until halving the step moves no output by more than ``tolerance`` of its
-    largest value. A sample belongs to its instant after the input of its row has acted: a term of the equation's own
-    order (direct feed-through) shows at once, everything else is continuous there.
+    extrapolated in the step (its powers 2, 3 and 4), until halving the step moves no output by more than ``tolerance``
+    of its largest value. A sample belongs to its instant after the input of its row has acted: a term of the equation's
+    own order (direct feed-through) shows at once, everything else is continuous there.
 
     Parameters
     ----------

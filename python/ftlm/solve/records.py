@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
@@ -31,6 +32,8 @@ MAX_M = 1 << 24
 #: A signal that stays below this loses digits of its squares to the end of the range of numbers.
 SMALLEST = 1e-140
 COULOMB = "coulomb_"
+#: Series of sensor filters that are kept: those of the grids at hand.
+KEPT_SERIES = 4
 #: Initial terms as the core takes them.
 InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int] | tuple[bool, list[float], int, int]
 
@@ -209,7 +212,15 @@ def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
     """Return the structure's sensor filter as a series, or None."""
     sensor = structure.sensor_filter
-    return None if sensor is None else _core.filter_series(list(sensor.numerator), list(sensor.denominator), m, step)
+    return None if sensor is None else _series(sensor.numerator, sensor.denominator, m, step)
+
+
+@lru_cache(maxsize=KEPT_SERIES)
+def _series(
+    numerator: tuple[tuple[float, float], ...], denominator: tuple[tuple[float, float], ...], m: int, step: float
+) -> Floats:
+    """The series of a filter on m pulses; every signal and every run of one step passes the same one."""
+    return locked(_core.filter_series(list(numerator), list(denominator), m, step))
 
 
 def _check_known(run: Run, structure: Structure) -> None:

@@ -21,6 +21,7 @@ from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Offset, SensorFilter, Structure, offset_exponents
 from ftlm.solve.friction import begun, motion_with_friction
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
+from ftlm.solve.limit import Limit, extrapolated
 from ftlm.solve.motion import decided, misfit, missed, needed
 from ftlm.solve.records import MAX_M, Record, acting, equation_tuple, record, sensor_series
 
@@ -56,7 +57,7 @@ class Sampled:
     refinement
         Pulses a sample interval on the finest grid that was used.
     change
-        What halving the step last moved, as a share of each output's largest value; infinite before there were two.
+        What halving the step moves, as a share of each output's largest value; infinite before there were three grids.
     """
 
     outputs: Floats
@@ -104,28 +105,32 @@ def refined(
     elif initial is None:
         model = started(model, run)
     times = run.time if on_grid and has_own_times(run, model.structure) else own_times(model, run)
-    coarse, known = _tried(model, run, every, initial, times)
-    terms = known
-    best, change = coarse, np.full(len(model.outputs), np.inf)
-    extrapolated: Floats | None = None
+    limit, rows = Limit(), list[list[Floats]]()
+    terms: Terms = {}
+    best: Floats = np.zeros(0)
+    change: Floats = np.zeros(0)
     lost = 0
-    while 2 * every * own <= largest_m and lost < 2:
-        every *= 2
-        fine, found = _tried(model, run, every, initial, times, last=lost == 1)
+    while True:
+        last = 2 * every * own > largest_m
+        samples, terms = _tried(model, run, every, initial, times, last=lost == 1)
+        finite = bool(np.all(np.isfinite(samples)))
+        limit.add(samples)
+        column, change = limit.best
+        best = limit.rows[-1][column]
+        flat: Floats = np.array([v for powers in terms.values() for v in powers.values()])
+        rows = [extrapolated(flat, rows[-1] if len(limit.rows[-1]) > 1 else [])]
         # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
-        lost = 0 if np.all(np.isfinite(fine)) else lost + 1
-        with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            both = bool(np.all(np.isfinite(coarse)))
-            best = (4.0 * fine - coarse) / 3.0 if both else fine
-            terms = _limit(known, found) if both else found
-            if extrapolated is not None:
-                size = np.max(np.abs(best), axis=1)
-                moved = np.max(np.abs(best - extrapolated), axis=1)
-                change = np.where(moved == 0.0, 0.0, moved / size)
-        extrapolated, coarse, known = best, fine, found
-        if np.all(change <= tolerance):
+        lost = 0 if finite or every == FIRST_REFINEMENT else lost + 1
+        if last or lost == 2 or np.all(change <= tolerance):
             break
-    return Sampled(best, terms, every, change)
+        every *= 2
+    return Sampled(best, _like(terms, rows[-1][column]), every, change)
+
+
+def _like(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
+    """Initial terms of these outputs and exponents with other values."""
+    left = iter(values.tolist())
+    return {o: {e: next(left) for e in powers} for o, powers in terms.items()}
 
 
 def own_times(model: Solved, run: Run) -> Floats | None:
@@ -153,11 +158,6 @@ def started(model: Solved, run: Run) -> Solved:
     return long if needed(model.structure, excess, more) else short
 
 
-def _limit(coarse: Terms, fine: Terms) -> dict[str, dict[float, float]]:
-    """Initial terms in the limit of the step, which two grids tell (Richardson)."""
-    return {o: {e: (4.0 * v - coarse[o][e]) / 3.0 for e, v in terms.items()} for o, terms in fine.items()}
-
-
 def _tried(
     model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
@@ -180,7 +180,6 @@ def sampled(
     At the instants of the grid, or at times of their own [s].
     """
     rec = record(run, model.structure, (run.length - 1) * every, filtered=model.structure.behind_filter)
-    still = replace(rec, means=np.zeros_like(rec.means))
     at = None if times is None else Instants.of(run, rec, model.structure, times)
     if initial is not None:
         kept = {o: dict(initial.get(o, {})) for o in model.outputs}
@@ -194,12 +193,16 @@ def sampled(
         for power in initial_exponents(e, rec.initial, rec.offset, rec.states)
     ]
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
-    driven = _read(model, run, rec, every, _responses(model, rec, none), none, at)
-    if not names or not np.all(np.isfinite(driven)):
+    if not names:
+        return _read(model, run, rec, every, _responses(model, rec, none), none, at), none
+    free, units = _free_and_units(model, rec, names)
+    driven = _read(model, run, rec, every, free, none, at)
+    if not np.all(np.isfinite(driven)):
         return driven, none
+    still = replace(rec, means=np.zeros_like(rec.means))
     columns = [
         _read(model, None, still, every, means, {**none, output: {power: 1.0}}, at)
-        for (output, power), means in zip(names, _unit_responses(model, still, names), strict=True)
+        for (output, power), means in zip(names, units, strict=True)
     ]
     return _fitted(model, measured_samples(model, run, every, rec), driven, names, columns)
 
@@ -254,23 +257,29 @@ def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
     return np.concatenate([_core.respond(rec.core(), [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
 
 
-def _unit_responses(model: Solved, still: Record, names: Sequence[tuple[str, float]]) -> list[Floats]:
-    """Pulse means of all outputs for a unit of each initial term (output, power), at rest but for it."""
-    equations = [equation_tuple(e, still.signals) for e in model.equations]
-    inputs, outputs, core = list(still.inputs), model.outputs, still.core()
+def _free_and_units(model: Solved, rec: Record, names: Sequence[tuple[str, float]]) -> tuple[Floats, list[Floats]]:
+    """Pulse means of all outputs, before the sensor filter: of the run at rest, and for a unit of each initial term.
+
+    A unit (output, power) acts while nothing else drives.
+    """
+    equations = [equation_tuple(e, rec.signals) for e in model.equations]
+    inputs, outputs, core = list(rec.inputs), model.outputs, rec.core()
     if model.structure.coupling == "simulated":
-        units = [(outputs.index(output), power) for output, power in names]
-        rows = _core.unit_responses(core, equations, inputs, units)
-        return list(rows.reshape(len(names), len(outputs), still.m))
+        asked = [(outputs.index(output), power) for output, power in names]
+        free, rows = _core.respond_and_units(core, equations, inputs, asked)
+        return free, list(rows.reshape(len(names), len(outputs), rec.m))
     # Each equation alone: an initial term moves its own output.
-    out = [np.zeros((len(outputs), still.m)) for _ in names]
+    free, units = np.zeros((len(outputs), rec.m)), [np.zeros((len(outputs), rec.m)) for _ in names]
     for i, (output, item) in enumerate(zip(outputs, equations, strict=True)):
         own = [k for k, name in enumerate(names) if name[0] == output]
-        if own:
-            rows = _core.unit_responses(core, [item], inputs, [(0, names[k][1]) for k in own])
-            for k, row in zip(own, rows, strict=True):
-                out[k][i] = row
-    return out
+        if not own:
+            free[i] = _core.respond(core, [item], inputs, [[]])[0]
+            continue
+        alone, rows = _core.respond_and_units(core, [item], inputs, [(0, names[k][1]) for k in own])
+        free[i] = alone[0]
+        for k, row in zip(own, rows, strict=True):
+            units[k][i] = row
+    return free, units
 
 
 def _read(
@@ -285,7 +294,9 @@ def _read(
     names, structure = model.outputs, model.structure
     coupled = structure.coupling == "simulated"
     count = rec.m // every + 1 if at is None else at.times.size
-    system, drive, now = np.eye(len(names)), np.zeros_like(means), np.zeros((len(names), count))
+    system, now = np.eye(len(names)), np.zeros((len(names), count))
+    # Made where something feeds through: it is as long as the grid.
+    drive: Floats | None = None
     start = np.zeros(len(names))
     for i, item in enumerate(model.equations):
         start[i] = terms[item.output].get(0.0, 0.0)
@@ -301,19 +312,23 @@ def _read(
             if coupled and term.signal in names:
                 system[i, names.index(term.signal)] -= factor
             elif run is not None:
+                drive = np.zeros_like(means) if drive is None else drive
                 drive[i] += factor * rec.of(term.signal)
                 now[i] += factor * _at_instants(run, rec, structure, term.signal, every, at)
     through = np.linalg.inv(system)
-    drive, now, start = through @ drive, through @ now, through @ start
+    drive, now, start = None if drive is None else through @ drive, through @ now, through @ start
     with np.errstate(invalid="ignore", over="ignore"):
-        rest = means - drive
+        rest = means if drive is None else means - drive
         gain = np.ones(len(names))
         series = sensor_series(structure, rec.m, rec.step) if rec.sensor is None else None
         if series is not None and structure.sensor_filter is not None:
+            rest = means.copy() if drive is None else rest
             for i, name in enumerate(names):
                 if structure.measured_through(name) and np.all(np.isfinite(means[i])):
                     gain[i] = high_frequency_gain(structure.sensor_filter)
-                    rest[i] = _core.series_multiply(series, means[i], rec.m) - gain[i] * drive[i]
+                    rest[i] = _core.series_multiply(series, means[i], rec.m)
+                    if drive is not None:
+                        rest[i] -= gain[i] * drive[i]
         if at is not None:
             kinks = through @ _kinks(model, run, at, terms)
             kinks[gain != 1.0] = 0.0
@@ -381,8 +396,10 @@ def _at_instants(
     if at is not None:
         values = at.values(name)
         return _core.read_at(rec.of(name)[None], at.places)[0] if values is None else values
-    delay, filtered = structure.delay.get(name, 0.0), rec.sensor is not None
+    delay = structure.delay.get(name, 0.0)
+    filtered = rec.sensor is not None and not structure.measured_through(name)
     if not delay and not filtered:
+        # Between two pulses there may be a corner, which their mean rounds off.
         return acting(run, structure, name)[name]
     means = rec.of(name)
     if filtered or run.intersample.get(name) != "zoh":

@@ -1,0 +1,125 @@
+"""The limit for step 0: against powers of the step, kinks, grids without numbers, and state space behind a filter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lsim
+
+import ftlm
+from ftlm.base.statistics import triangle
+from ftlm.solve.limit import Limit, extrapolated
+from ftlm.solve.sampled import FIRST_REFINEMENT, refined, sampled
+
+TRUTH = np.random.default_rng(0).standard_normal((1, 200))
+SHAPES = list(np.random.default_rng(1).standard_normal((3, 1, 200)))
+
+
+def grids(powers: tuple[float, ...], count: int) -> list[np.ndarray]:
+    """A truth with an error of these powers of the step."""
+    steps = 0.5 ** np.arange(count)
+    return [TRUTH + sum(s * h**p for s, p in zip(SHAPES, powers, strict=False)) for h in steps]
+
+
+def told(samples: list[np.ndarray]) -> tuple[np.ndarray, float]:
+    limit = Limit()
+    for each in samples:
+        limit.add(each)
+    column, change = limit.best
+    return limit.rows[-1][column], float(np.max(change))
+
+
+def test_three_powers_of_the_step_are_taken_away():
+    rows: list[np.ndarray] = []
+    for samples in grids((2, 3, 4), 4):
+        rows = extrapolated(samples, rows)
+    np.testing.assert_allclose(rows[3], TRUTH, atol=1e-14)
+    np.testing.assert_allclose(extrapolated(*[grids((2,), 2)[1], [grids((2,), 2)[0]]])[1], TRUTH, atol=1e-14)
+
+
+@pytest.mark.parametrize("powers", [(2, 3, 4), (2, 2.4), (1.5,), (1,), (2, 3, 3.5), (0.5,)])
+def test_the_change_bounds_the_error_whatever_its_powers(powers):
+    # A kink leaves powers between those that are taken away.
+    for count in range(3, 9):
+        found, change = told(grids(powers, count))
+        error = float(np.max(np.abs(found - TRUTH)) / np.max(np.abs(found)))
+        assert error <= 2.5 * change + 1e-14
+
+
+def test_two_grids_tell_no_change_and_three_do():
+    assert told(grids((2, 3), 1))[1] == told(grids((2, 3), 2))[1] == np.inf
+    assert told(grids((2, 3), 3))[1] < 1.0
+
+
+def test_a_grid_without_numbers_tells_nothing():
+    lost = np.full_like(TRUTH, np.nan)
+    found, change = told([lost, *grids((2, 3, 4), 5)])
+    after = told(grids((2, 3, 4), 5))
+    assert (change, found.tolist()) == (after[1], after[0].tolist())
+    assert np.isnan(told([*grids((2,), 3), lost])[0]).all()
+
+
+def test_what_does_not_move_has_stood_still():
+    assert told([np.zeros((1, 3))] * 3)[1] == 0.0
+
+
+#: The last row of each companion matrix, and what the input drives.
+WHOLE = {
+    "D^2 y = -40 y - 1.5 D y + 30 u": ([-40, -1.5], 30),
+    "D y = -30 y + 25 u": ([-30], 25),
+    "D^3 y = -40 y - 60 D y + u": ([-40, -60, 0], 1),
+}
+
+
+@pytest.mark.parametrize("words", WHOLE)
+@pytest.mark.parametrize("kind", ["zoh", "foh"])
+def test_fewer_grids_are_as_close_to_state_space_as_was_asked(words, kind):
+    # The oracle shares no code: SciPy's matrix exponential, exact for inputs that hold or are linear in between.
+    rng = np.random.default_rng(3)
+    u = np.cumsum(rng.standard_normal(400)) * 0.1
+    last, driven = WHOLE[words]
+    n = len(last)
+    a, b = np.vstack([np.eye(n)[1:], last]), np.zeros((n, 1))
+    b[-1] = driven
+    t = np.arange(u.size) * 0.02
+    exact = lsim((a, b, np.eye(n)[:1], [[0.0]]), u, t, interp=kind == "foh")[1]
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * u}, intersample={"u": kind})
+    model = ftlm.Model(ftlm.equation(words))
+    free = refined(model, run, {}, tolerance=1e-6)
+    assert np.max(np.abs(free.outputs[0] - exact)) <= 1e-6 * np.max(np.abs(exact))
+    # One power alone would have taken more pulses to be as close.
+    two = [sampled(model, run, every, {})[0][0] for every in (free.refinement, free.refinement // 2)]
+    once = (4.0 * two[0] - two[1]) / 3.0
+    assert free.refinement <= 16 * FIRST_REFINEMENT
+    assert np.max(np.abs(free.outputs[0] - exact)) <= np.max(np.abs(once - exact)) + 1e-9
+
+
+def test_a_filtered_signal_with_corners_feeds_through_as_it_was_read():
+    # D y = -2 y + D w + 3 u, w and y read through the filter, u not: y = w + z, D z = -2 z - 2 w + 3 F u.
+    rng = np.random.default_rng(5)
+    w, u = (np.concatenate([[0.0], np.cumsum(rng.standard_normal(300))]) for _ in range(2))
+    step, t = 0.02, np.arange(301) * 0.02
+    omega = 2.0 * np.pi * 2.0
+    a = np.array([[0.0, 1.0, 0.0], [-(omega**2), -1.8 * omega, 0.0], [3.0, 0.0, -2.0]])
+    b = np.array([[0.0, 0.0], [0.0, omega**2], [-2.0, 0.0]])
+    exact = w + lsim((a, b, [[0.0, 0.0, 1.0]], [[0.0, 0.0]]), np.stack([w, u], axis=1), t, interp=True)[1]
+    structure = ftlm.equation(
+        "D y = -2 y + D w + 3 u", sensor_filter=ftlm.SensorFilter.low_pass(("w", "y")), initial="rest"
+    )
+    run = ftlm.Run.from_arrays(
+        step=step, inputs={"u": u, "w": w}, outputs={"y": 0 * u}, intersample={"u": "foh", "w": "foh"}
+    )
+    # A mean across a corner is off by a share of the step, which no power of it takes away.
+    assert structure.behind_filter
+    found = refined(ftlm.Model(structure), run, {}, tolerance=1e-7)
+    assert np.max(np.abs(found.outputs[0] - exact)) <= 1e-6 * np.max(np.abs(exact))
+    assert found.refinement <= 32
+
+
+def test_rows_are_turned_into_a_triangle():
+    rng = np.random.default_rng(1)
+    parts = [[rng.standard_normal(rows) for _ in range(5)] for rows in (2300, 7)]
+    table = np.concatenate([np.stack(p, axis=1) for p in parts])
+    found = triangle(parts)
+    assert found.shape == (5, 5)
+    np.testing.assert_allclose(found.T @ found, table.T @ table, rtol=1e-12, atol=1e-9)
