@@ -175,7 +175,11 @@ def interrupted(monkeypatch, number, raises, line):
 
 
 def check_lines(monkeypatch, number, raises, every):
-    kept = signal.signal(signal.SIGINT, signal.default_int_handler)
+    def stopped(number, frame):
+        raise SystemExit(128 + number)
+
+    # What a signal does once the motors are off is the program's affair: here it raises, so that it can be counted.
+    kept = [signal.signal(n, signal.default_int_handler if n == signal.SIGINT else stopped) for n in SIGNALS]
     try:
         count, found = interrupted(monkeypatch, number, raises, 0)
         assert isinstance(found, EndError) if raises else found is None
@@ -186,7 +190,9 @@ def check_lines(monkeypatch, number, raises, every):
             ending = KeyboardInterrupt if number == signal.SIGINT else SystemExit
             assert isinstance(found, (EndError, ending) if raises else ending), line
     finally:
-        signal.signal(signal.SIGINT, kept)
+        for n, handler in zip(SIGNALS, kept, strict=True):
+            signal.signal(n, handler)
+    return len(range(1, count + 1, every))
 
 
 @pytest.mark.parametrize("raises", [False, True])
