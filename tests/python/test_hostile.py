@@ -297,6 +297,12 @@ def test_more_points_than_memory_holds_are_refused():
             _core.filter_series([(1.0, 0.0)], [(1.0, 0.0), (1.0, 1.0)], m, 0.1)
 
 
+def test_an_order_that_is_no_number_does_not_turn_for_ever():
+    for terms in ([(1.679, 1.526), (-1.0, np.inf)], [(np.nan, 0.5)]):
+        with pytest.raises(ftlm.DataError, match="own terms"):
+            _core.grows(1.135, terms)
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # The command line
 

@@ -41,12 +41,18 @@ class Signals:
             signal.signal(number, self._came)
 
     def restore(self) -> None:
-        """Puts the handlers of before back, Ctrl-C's last: until then none can cut this short."""
+        """Puts the handlers of before back, all of them: a signal that comes meanwhile waits, where the system can."""
         if not self._before or threading.current_thread() is not threading.main_thread():
             return
-        for number in sorted(self._before, key=lambda n: n == signal.SIGINT):
-            signal.signal(number, self._before[number])
-        self._before = {}
+        mask = getattr(signal, "pthread_sigmask", None)
+        kept = None if mask is None else mask(signal.SIG_BLOCK, self._before)
+        try:
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
+            self._before = {}
+        finally:
+            if mask is not None:
+                mask(signal.SIG_SETMASK, kept)
 
     def deliver(self) -> None:
         """Raises what a signal that waited would have raised."""
