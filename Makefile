@@ -5,7 +5,7 @@ PYTHON ?= python3
 CORE := $(shell find rust -name '*.rs') Cargo.toml Cargo.lock pyproject.toml
 export RUSTDOCFLAGS := -D warnings
 
-.PHONY: demo test test-slow test-rust test-python lint docs bench fuzz wheel wheel-test sdist-test clean
+.PHONY: demo test test-slow attack test-rust test-python lint docs bench fuzz wheel wheel-test sdist-test clean
 
 demo: $(VENV)/.built
 	$(BIN)/ftlm demo -o demo --force
@@ -41,6 +41,10 @@ test-python: $(VENV)/.built
 
 test-slow: $(VENV)/.built
 	$(BIN)/python -m pytest -m slow --timeout 7200
+
+# Attacks from outside, for minutes, in a temporary folder; a table of what was tried and what broke.
+attack: $(VENV)/.built
+	$(BIN)/python tests/attack.py
 
 # Pages in docs/_build/html; a warning is an error.
 docs: $(VENV)/.built

@@ -7,7 +7,7 @@ use pyo3::types::PyDict;
 use super::arrays::{initial, record, records, rows, stacked, structure, vector, InitialArg, RecordArg, StructureArg};
 use super::errors::{attached, detached};
 use crate::equation::{AffineOrder, Initial};
-use crate::error::Error;
+use crate::error::{check_finite, Error};
 use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::estimate::streaming::Streaming as StreamingFit;
@@ -268,7 +268,11 @@ pub fn output_error<'py>(
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn grows(py: Python<'_>, alpha: f64, own_terms: Vec<(f64, f64)>) -> PyResult<bool> {
-    detached(py, || Ok(joint::poles::grows(alpha, &own_terms)))
+    detached(py, || {
+        check_finite("alpha", &[alpha])?;
+        own_terms.iter().try_for_each(|&(c, order)| check_finite("own terms", &[c, order]))?;
+        Ok(joint::poles::grows(alpha, &own_terms))
+    })
 }
 
 /// Recursion (44) on a stream of samples; see the module `estimate::streaming` of the core.

@@ -47,6 +47,13 @@ mod _core {
 
     #[pymodule_init]
     fn init(module: &Bound<'_, PyModule>) -> PyResult<()> {
+        // NumPy's interface and the one that counts borrows are found when they are first used, and would panic where a
+        // Ctrl-C arrives just then.
+        module.py().import("numpy")?;
+        super::errors::attached(|| {
+            drop(numpy::PyArrayMethods::readonly(&numpy::PyArray1::<f64>::zeros(module.py(), 0, false)));
+            Ok(())
+        })?;
         module.add("__version__", env!("CARGO_PKG_VERSION"))?;
         module.add("SIMD", simd())
     }

@@ -5,6 +5,7 @@ use pyo3::prelude::*;
 
 use super::arrays::{columns, matrix, rows, stacked, vector};
 use super::errors::detached;
+use super::search::watch::leavable;
 use crate::equation::Filter;
 use crate::error::{check_dense, check_finite, check_length, check_points, check_step, Error};
 use crate::fractional::{self, Derivative, IntegralRule};
@@ -112,8 +113,8 @@ pub fn series_multiply<'py>(
     naive: bool,
 ) -> PyResult<Array<'py>> {
     let (a, b) = (vector("a", &a)?, vector("b", &b)?);
-    let product = detached(py, || {
-        check_points("m", m)?;
+    check_points("m", m)?;
+    let product = leavable(py, m, move |_| {
         Ok(if naive { series::multiply_naive(&a, &b, m) } else { series::multiply(&a, &b, m) })
     })?;
     Ok(PyArray1::from_vec(py, product))
@@ -128,7 +129,7 @@ pub fn series_divide<'py>(
     naive: bool,
 ) -> PyResult<Array<'py>> {
     let (n, d) = (vector("numerator", &numerator)?, vector("divisor", &divisor)?);
-    let quotient = detached(py, || {
+    let quotient = leavable(py, n.len(), move |_| {
         check_length("divisor", n.len(), d.len())?;
         if naive {
             series::divide_naive(&n, &d)
@@ -154,7 +155,14 @@ pub fn fractional_integral<'py>(
         other => return Err(choice("rule", other, "block-pulse, trapezoidal, grunwald-letnikov").into()),
     };
     let all = rows(&x);
-    let out = detached(py, || all.iter().map(|row| fractional::fractional_integral(row, order, step, rule)).collect())?;
+    let points = all.iter().map(Vec::len).sum();
+    let out = leavable(py, points, move |control| {
+        let integral = |row: &Vec<f64>| {
+            control.check_stop()?;
+            fractional::fractional_integral(row, order, step, rule)
+        };
+        all.iter().map(integral).collect()
+    })?;
     reshaped(py, out, columns(&x))
 }
 
@@ -174,12 +182,14 @@ pub fn fractional_derivative<'py>(
         other => return Err(choice("definition", other, "grunwald-letnikov, riemann-liouville, caputo").into()),
     };
     let (all, starts) = (rows(&x), rows(&initial));
-    let out = detached(py, || {
+    let points = all.iter().map(Vec::len).sum();
+    let out = leavable(py, points, move |control| {
         check_length("initial", all.len(), starts.len())?;
-        all.iter()
-            .zip(&starts)
-            .map(|(row, start)| fractional::fractional_derivative(row, order, step, definition, start))
-            .collect()
+        let derivative = |(row, start): (&Vec<f64>, &Vec<f64>)| {
+            control.check_stop()?;
+            fractional::fractional_derivative(row, order, step, definition, start)
+        };
+        all.iter().zip(&starts).map(derivative).collect()
     })?;
     reshaped(py, out, columns(&x))
 }

@@ -279,7 +279,10 @@ impl VirtualArm {
                 let v = guard.inner.read(&reading, late);
                 let volts = guard.inner.command([command[0], command[1]]);
                 let [i1, i2] = guard.inner.written();
-                self.rows.push([i1, i2, v[0], v[1], v[2], v[3], v[4], v[5], late]);
+                // A reading that is no number is a fault, which says so, and no measurement.
+                if v.iter().all(|x| x.is_finite()) {
+                    self.rows.push([i1, i2, v[0], v[1], v[2], v[3], v[4], v[5], late]);
+                }
                 Ok(volts)
             })?;
             self.write(output, volts)?;

@@ -131,6 +131,26 @@ pub enum Fault {
         /// Reading \[V\].
         volts: f64,
     },
+    /// A gauge that does not follow its motor.
+    #[error("strain gauge {stage} has stood at {volts:.4} V for {seconds:.2} s although the current changed by {current:.2} A or more; it is dead, and would not see the link bend: check its amplifier and cable")]
+    DeadGauge {
+        /// Which link.
+        stage: usize,
+        /// Reading \[V\].
+        volts: f64,
+        /// How long \[s\].
+        seconds: f64,
+        /// Change of the current which it must follow \[A\].
+        current: f64,
+    },
+    /// A current sense that reads no number.
+    #[error("the current sense of motor {stage} reads {volts} V; check the board's analog inputs")]
+    Sense {
+        /// Which motor.
+        stage: usize,
+        /// Reading \[V\].
+        volts: f64,
+    },
     /// A link bent too far.
     #[error("link {stage} is bent by {degrees:.2} degrees, more than the limit of {limit:.2}; use a smaller amplitude or avoid its resonance")]
     Deflection {
@@ -179,6 +199,7 @@ pub struct Guard {
     zero: [i32; 2],
     previous: Option<[i32; 2]>,
     still: [f64; 2],
+    gauges: [Gauge; 2],
     written: [f64; 2],
     heat: [f64; 2],
     missed: u32,
@@ -231,6 +252,7 @@ impl Guard {
             zero: [0; 2],
             previous: None,
             still: [0.0; 2],
+            gauges: [Gauge::default(); 2],
             written: [0.0; 2],
             heat: [0.0; 2],
             missed: 0,
@@ -296,6 +318,7 @@ impl Guard {
                 self.fail(Fault::Deflection { stage: j + 1, degrees, limit });
             }
             self.follow(j, reading.counts[j]);
+            self.bends(j, reading.analog[j]);
         }
         self.previous = Some(reading.counts);
         self.deadline(late);
@@ -351,6 +374,10 @@ impl Guard {
             if volts.is_nan() || volts.abs() >= self.settings.saturation {
                 self.fail(Fault::Saturated { stage: j + 1, volts });
             }
+            let volts = reading.analog[2 + j];
+            if !volts.is_finite() {
+                self.fail(Fault::Sense { stage: j + 1, volts });
+            }
         }
     }
 
@@ -375,6 +402,21 @@ impl Guard {
         }
     }
 
+    /// Noise alone moves a gauge that lives; without any, a changed torque does.
+    fn bends(&mut self, j: usize, volts: f64) {
+        let (s, gauge) = (&self.settings, &mut self.gauges[j]);
+        #[allow(clippy::float_cmp)]
+        if gauge.volts != volts {
+            *gauge = Gauge { volts, written: self.written[j], still: 0.0 };
+        } else if (self.written[j] - gauge.written).abs() >= s.moving_current {
+            gauge.still += s.step;
+            if gauge.still > s.standstill {
+                let (seconds, current) = (gauge.still, s.moving_current);
+                self.fail(Fault::DeadGauge { stage: j + 1, volts, seconds, current });
+            }
+        }
+    }
+
     fn deadline(&mut self, late: f64) {
         let s = &self.settings;
         if late > s.step {
@@ -389,6 +431,14 @@ impl Guard {
             self.fail(Fault::Missed { count: self.missed });
         }
     }
+}
+
+/// What a strain gauge read last, the current written when it began to, and for how long a changed one has not moved it.
+#[derive(Debug, Clone, Copy, Default)]
+struct Gauge {
+    volts: f64,
+    written: f64,
+    still: f64,
 }
 
 /// A second-order low-pass in the bilinear transform, as a real-time model runs it.

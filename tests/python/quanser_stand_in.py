@@ -71,7 +71,7 @@ class Board:
         self.enables = {0: 1, 1: 1, 4: 0}
         self.analog_state, self.tristate = {}, set()
         self.timeout = self.last_reload = None
-        self.expired = False
+        self.expired, self.before = False, None
         self.task = None
         self.sample = 0
         self.process = None
@@ -85,6 +85,10 @@ class Board:
     def enabled(self):
         """Whether the amplifiers give current."""
         return self.enables == {0: 0, 1: 0, 4: 1}
+
+    def sleep(self, seconds):
+        """Passes time on the virtual clock."""
+        self.time += seconds
 
     def note(self, what):
         """Notes something that the real package would not bear."""
@@ -101,7 +105,7 @@ class Board:
         enumerations = types.ModuleType("quanser.hardware.enumerations")
         board = self
 
-        class BoundHIL(HIL):
+        class BoundHIL({2022: HIL2022, 2025: HIL2025}[self.form]):
             """A handle on this board."""
 
             _board = board
@@ -147,6 +151,7 @@ class HIL:
         if board.timeout and not board.expired and board.time - board.last_reload > board.timeout:
             board.expired = True
             if len(board.tristate) == 8 and set(board.analog_state) == {0, 1}:
+                board.before = (board.volts, dict(board.enables))
                 board.volts = (board.analog_state[0], board.analog_state[1])
                 board.enables = {0: 1, 1: 1, 4: 0}
                 board.log.append(("expired", board.sample, board.volts))
@@ -170,7 +175,7 @@ class HIL:
     # The listed calls ----------------------------------------------------------------------------------------------
 
     def open(self, card_type, card_identifier):
-        board = self._enter("open")
+        board = self._enter("open", locked=False)
         if card_type != "q8_usb":
             raise HILError(-179)
         if not isinstance(card_identifier, str):
@@ -264,8 +269,17 @@ class HIL:
         board = self._enter("task_stop", locked=False)
         if task is not board.task:
             raise HILError(-130)
-        board.task = None
+        board.arm = None
         board.log.append(("task_stop", board.sample, None))
+
+    def task_delete(self, task):
+        board = self._enter("task_delete", locked=False)
+        if task is not board.task:
+            raise HILError(-130)
+        if board.arm is not None and "task_stop" not in board.refuse:
+            board.note("task_delete: the task runs")
+        board.task = None
+        board.log.append(("task_delete", board.sample, None))
 
     def task_read(self, task, count, analog, counts, digital, other):
         board = self._enter("task_read")
@@ -369,18 +383,25 @@ class HIL:
         if not board.expired:
             raise HILError(-599)
         board.expired, board.timeout = False, None
+        if board.before is not None:
+            # The vendor's page: the hardware is restored to its state prior to the expiry, if possible.
+            board.volts, board.enables = board.before
+            board.before = None
+            board.log.append(("cleared", board.sample, board.volts))
         if board.page is not None:
             board.page.set("expired", 0)
 
-    def get_string_property(self, *arguments):
-        board = self._enter("get_string_property")
-        if len(arguments) != (2 if board.form == 2025 else 3):
-            raise TypeError(f"{len(arguments)} arguments")
-        if board.form == 2025:
-            _code, size = arguments
-            return "Q8-USB"[:size]
-        code, buffer, size = arguments
-        if not isinstance(code, int) or not isinstance(buffer, np.ndarray) or len(buffer) != size:
-            board.note("get_string_property: 2022 form")
-        buffer[:6] = np.frombuffer(b"Q8-USB", dtype=np.int8)
-        return None
+
+class HIL2025(HIL):
+    """The package of 2025 returns texts."""
+
+    def get_string_property(self, code, size):
+        self._enter("get_string_property")
+        return "Q8-USB"[:size]
+
+
+class HIL2022(HIL):
+    """The package of 2022 fills a buffer, and overruns one of its own where a name is longer than a character."""
+
+    def get_string_property(self, code, buffer, size):
+        raise SystemError("the process would have been aborted")

@@ -318,11 +318,12 @@ I = "foh"
 
 
 def test_columns_file(tmp_path):
-    path, toml = write(tmp_path, "t,u,y\n" + rows()), write(tmp_path, TOML, "arm.toml")
+    lines = [f"{line},{line.split(',')[2]}\n" for line in rows().splitlines()]
+    path, toml = write(tmp_path, "t,u,y,v\n" + "".join(lines)), write(tmp_path, TOML, "arm.toml")
     run = load(path, columns=toml)
     assert (run.signals, run.units, run.intersample) == (("I", "theta"), {"I": "", "theta": "rad"}, {"I": "foh"})
     assert load(path, columns=toml, step=5.0, intersample={"I": "zoh"}).step == 5.0
-    more = load(path, columns=toml, inputs={"I": "y", "w": "u"}, units={"theta": "mrad", "w": "A"})
+    more = load(path, columns=toml, inputs={"I": "v", "w": "u"}, units={"theta": "mrad", "w": "A"})
     assert more.inputs == ("I", "w")
     np.testing.assert_array_equal(more["I"], 0.1 * np.arange(12))
     assert more["theta"][10] == pytest.approx(1e-3)

@@ -43,7 +43,7 @@ fn every_entry_goes_through_a_wrapper() {
     for file in ["estimate.rs", "operators.rs", "simulate.rs", "virtual_arm.rs"].into_iter().chain(searches) {
         let text = std::fs::read_to_string(folder.join(file)).unwrap();
         for (name, body) in entries(&text) {
-            let ways = ["detached(py", "attached(", "transformed(py", "watched(py", "saved(py"];
+            let ways = ["detached(py", "attached(", "transformed(py", "watched(py", "saved(py", "leavable(py"];
             assert!(ways.iter().any(|way| body.contains(way)), "{file}: {name} computes outside the wrappers");
             count += 1;
         }

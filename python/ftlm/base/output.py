@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import stat
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,10 +57,23 @@ def check_new(path: str | os.PathLike[str], *, force: bool, words: Words = PLAIN
     file = Path(path)
     if words.folder and file.is_dir():
         raise DataError(f"{words.shown(file)} is a folder; {words.folder}")
+    there = _status(file)
     # A dangling link is a file that someone meant to be there.
-    if not force and os.path.lexists(file):
+    if there is not None and not force:
         raise DataError(f"{words.shown(file)} exists; choose another name, or overwrite it with {words.overwrite}")
+    if there is not None and not stat.S_ISREG(there.st_mode) and not stat.S_ISDIR(there.st_mode):
+        # A device of the system would be gone, and what stands behind a link is not what was asked for.
+        kind = "a link" if stat.S_ISLNK(there.st_mode) else "a device, pipe or socket"
+        raise DataError(f"{words.shown(file)} is {kind}, no regular file, and is not overwritten; choose another name")
     return file
+
+
+def _status(file: Path) -> os.stat_result | None:
+    """What has that name, itself and not what it leads to; None where nothing has."""
+    try:
+        return file.lstat()
+    except (OSError, ValueError):
+        return None
 
 
 def check_free(*paths: str | os.PathLike[str] | None, force: bool, words: Words = PLAIN) -> None:
@@ -100,14 +114,25 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
     try:
         # In its folder, since no rename crosses disks; short, so that long names have room.
         beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}")
-        # Never through a link that another program left, and with the permissions that a new file has here.
-        descriptor = os.open(beside, _NEW, 0o666)
+        there = _status(file)
+        # Never through a link that another program left. The permissions are those that a new file has here, or those
+        # of the file that is overwritten, from the first byte on.
+        descriptor = os.open(beside, _NEW, 0o666 if there is None else stat.S_IMODE(there.st_mode) & 0o777)
         try:
             with os.fdopen(descriptor, "wb") as stream:
                 stream.write(content)
                 stream.flush()
+                if there is not None and hasattr(os, "fchmod"):
+                    os.fchmod(stream.fileno(), stat.S_IMODE(there.st_mode) & 0o777)
                 os.fsync(stream.fileno())
-            os.replace(beside, file)
+            if force or not _named(beside, file):
+                os.replace(beside, file)
+        except FileExistsError:
+            with contextlib.suppress(OSError):
+                beside.unlink()
+            # Somebody made it between the check and now.
+            check_new(file, force=False, words=words)
+            raise
         except BaseException:
             with contextlib.suppress(OSError):
                 beside.unlink()
@@ -123,3 +148,19 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
         finally:
             os.close(descriptor)
     return file
+
+
+def _named(beside: Path, file: Path) -> bool:
+    """Give a file a second name that nobody has, and take the first away; refuse one that was taken meanwhile.
+
+    Where the file system has no links it is false, and an empty file of that name waits for the file's renaming.
+    """
+    try:
+        os.link(beside, file, follow_symlinks=False)
+    except FileExistsError:
+        raise
+    except (OSError, NotImplementedError):
+        os.close(os.open(file, _NEW, 0o666))
+        return False
+    beside.unlink()
+    return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
 import json
@@ -66,6 +67,17 @@ def command(work: Callable[..., None]) -> Callable[..., None]:
         except FtlmError as error:
             print(f"ftlm: {in_options(str(error))}", file=sys.stderr)
             raise typer.Exit(exit_code(error)) from None
+        except OSError as error:
+            # Of what is printed, or of a working folder that is gone; files have sentences of their own.
+            what = "" if error.filename is None else f" {error.filename!r}"
+            print(
+                f"ftlm: the system refuses{what}: {error.strerror or error}; what was written to files is there, check "
+                "where the output goes and the working folder",
+                file=sys.stderr,
+            )
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(EXIT_DATA) from None
 
     # What typer reads.
     run.__annotations__ = {option.name: option.annotation for option in options}

@@ -112,7 +112,8 @@ def record(
             )  # fmt: skip
     except (KeyboardInterrupt, SystemExit) as ended:
         what = experiment.stopped_by(ended)
-        print(f"ftlm: {what}; the motors are at 0 V, what was recorded is in {out}", file=sys.stderr)
+        motors = "; ".join(getattr(ended, "__notes__", [])) or "the motors are at 0 V"
+        print(f"ftlm: {what}; {motors}; what was recorded is in {out}", file=sys.stderr)
         code = ended.code if isinstance(ended, SystemExit) else 130
         raise typer.Exit(code if isinstance(code, int) else 1) from None
     if stream is not None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import io
 import math
 import os
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -35,11 +37,22 @@ def write_parquet(run: Measured, path: str | os.PathLike[str], *, force: bool) -
         parquet = importlib.import_module("pyarrow.parquet")
     except ImportError:
         raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'") from None
-    table = pyarrow.table(_columns(run)).replace_schema_metadata({"ftlm-run": Header.of(run).text()})
+    columns, header = _columns(run), Header.of(run).text()
+    check = f"{run.length} {digest(columns, header)}"
+    table = pyarrow.table(columns).replace_schema_metadata({"ftlm-run": header, "ftlm-check": check})
     content = io.BytesIO()
-    # Checksums, so that a flipped byte is no other answer.
+    # Checksums of pages, and one of all rows: the footer, which says how many there are, has none of its own.
     parquet.write_table(table, content, write_page_checksum=True)
     write_atomically(target, content.getvalue(), force=force, words=RUN)
+
+
+def digest(columns: Mapping[str, Floats], header: str) -> str:
+    """Checksum of a run's columns in their order and of its header; `files/reader.py` computes it as well."""
+    made = hashlib.sha256(header.encode())
+    for name, values in columns.items():
+        made.update(f"\0{name}\0{len(values)}\0".encode())
+        made.update(np.ascontiguousarray(values, dtype="<f8").tobytes())
+    return made.hexdigest()
 
 
 def _columns(run: Measured) -> dict[str, Floats]:

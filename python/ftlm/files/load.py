@@ -116,6 +116,7 @@ def load(
         _take_header(wanted, header)
         chosen = chosen if missing is not None or not header.missing else "weight"
     pool = Pool(tables)
+    _check_apart(wanted, pool)
     if not wanted.outputs:
         raise DataError(
             f"no output is named; name the signals with inputs={{name: column}} and outputs={{name: column}}, "
@@ -152,6 +153,22 @@ def load(
         stated = header.step if clock is not None and clock.name == CSV_TIME else None
         asked = replace(asked, known_step=stated, facts=(*header.warnings, *said), about=header.about)
     return built(asked)
+
+
+def _check_apart(wanted: _Wanted, pool: Pool) -> None:
+    """Refuse one column as an input and as an output: the model that explains it says nothing."""
+    driven = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in wanted.inputs.items()}
+    twice = [
+        (driven[id(column)], name)
+        for name, spec in wanted.outputs.items()
+        if id(column := pool.find(spec, f"signal {name!r}")) in driven
+    ]
+    if twice and twice[0][0][0] != twice[0][1]:
+        (name, spec), other = twice[0]
+        raise DataError(
+            f"column {spec!r} is the input {name!r} and the output {other!r} ({len(twice)} such columns in all); name "
+            "another column for one of them"
+        )
 
 
 def _header_of(clock: Column) -> str:
@@ -253,7 +270,8 @@ def _columns_file(columns: object) -> Mapping[str, object]:
             raise DataError(f"{source} is too large for a columns file; pass the TOML file that names the columns")
         try:
             told = tomllib.loads(path.read_bytes().decode("utf-8-sig").replace("\r\n", "\n"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        except (OSError, ValueError, RecursionError) as error:
+            # A ValueError also for a number of thousands of digits.
             raise DataError(
                 f"{source} is not a TOML file ({error}); write a time key and tables [inputs], [outputs] and [units] "
                 "of name = column"

@@ -11,6 +11,7 @@ it also says ``"text": true`` (columns, not matrices) and, for a run that ftlm w
 
 from __future__ import annotations
 
+import hashlib
 import importlib
 import json
 import math
@@ -137,6 +138,7 @@ def read_parquet(path: str) -> tuple[dict[str, Any], list[Any]]:
     if told is not None:
         header["ftlm-run"] = told.decode("utf-8", errors="replace")
     arrays = []
+    made = hashlib.sha256(told or b"")
     for name, column in zip(table.column_names, table.columns, strict=True):
         kind = column.type
         if not (types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind)):
@@ -146,6 +148,15 @@ def read_parquet(path: str) -> tuple[dict[str, Any], list[Any]]:
         single = "single" if types.is_float32(kind) else "double"
         header["arrays"].append({"name": name, "rows": len(values), "columns": 1, "type": single})
         arrays.append(numpy.asarray(values, dtype=numpy.float64))
+        made.update(f"\0{name}\0{len(values)}\0".encode())
+        made.update(numpy.ascontiguousarray(arrays[-1], dtype="<f8").tobytes())
+    # Runs of ftlm say how many rows they have, and what all of them come to.
+    check = (table.schema.metadata or {}).get(b"ftlm-check")
+    if check is not None and check != f"{table.num_rows} {made.hexdigest()}".encode():
+        said = check.split(b" ")[0].decode("utf-8", errors="replace")[:20]
+        raise UnreadableError(
+            f"the file is damaged: {table.num_rows} rows were read where it says {said}, or their checksum is another"
+        )
     return header, arrays
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import re
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,7 +81,7 @@ def _parse_text(path: Path, stream: BinaryIO) -> FileTable:
         cells = _split([line for _, line in kept], separator, path, kept[0][0])
         if not started:
             width = len(cells[0])
-            names = _names(cells[0], path, kept[0][0])
+            names = _names(cells[0], path, kept[0][0], own=header is not None)
             if names is not None:
                 kept, cells = kept[1:], cells[1:]
         wrong = [index for index, row in enumerate(cells) if len(row) != width]
@@ -89,7 +90,9 @@ def _parse_text(path: Path, stream: BinaryIO) -> FileTable:
                 ragged_line, ragged_width = kept[wrong[0]][0], len(cells[wrong[0]])
             ragged += len(wrong)
         if not ragged and cells:
-            blocks.append(_numbers(cells, [index for index, _ in kept], rows, troubles))
+            # Python's numbers may have underscores between their digits, those of files have not.
+            plain = not any("_" in line for _, line in kept)
+            blocks.append(_numbers(cells, [index for index, _ in kept], rows, troubles, plain=plain))
         rows += len(cells)
     if width == 0:
         raise DataError(f"{path.name}: the file is empty, 0 rows; choose a file that holds a record")
@@ -175,8 +178,8 @@ def _split(lines: list[str], separator: str | None, path: Path, number: int) -> 
     return rows
 
 
-def _names(cells: list[str], path: Path, number: int) -> list[str] | None:
-    """Return the names when this is a header, None when it is a row."""
+def _names(cells: list[str], path: Path, number: int, *, own: bool) -> list[str] | None:
+    """Return the names when this is a header, None when it is a row; a file of ftlm's `own` has one."""
     stripped = [cell.strip() for cell in cells]
     words = [cell for cell in stripped if cell and not _is_number(cell)]
     if not words:
@@ -184,34 +187,43 @@ def _names(cells: list[str], path: Path, number: int) -> list[str] | None:
     commas = [cell for cell in words if _DECIMAL_COMMA.fullmatch(cell)]
     if commas:
         raise DataError(f"{path.name}: line {number}: {commas[0]!r} has a decimal comma; {_DECIMAL_WAY_OUT}")
-    if any(_is_number(cell) for cell in stripped):
+    if not own and any(_is_number(cell) for cell in stripped):
         raise DataError(
             f"{path.name}: line {number} mixes words and numbers ({words[0][:40]!r} is not a number, {len(words)} in "
             "all), so it is neither a header nor a row; correct that cell, or give the columns names"
         )
-    for index, name in enumerate(stripped):
-        if name and name in stripped[:index]:
+    times = Counter(stripped)
+    for name in stripped:
+        if name and times[name] > 1:
             raise DataError(
-                f"{path.name}: line {number}: the column name {name!r} is there {stripped.count(name)} times; "
-                "rename all but one"
+                f"{path.name}: line {number}: the column name {name!r} is there {times[name]} times; rename all but one"
             )
     return stripped
 
 
 def _is_number(cell: str) -> bool:
     try:
-        float(cell)
+        _number(cell)
     except ValueError:
         return False
     return True
 
 
+def _number(cell: str) -> float:
+    if "_" in cell:
+        raise ValueError(cell)
+    return float(cell)
+
+
 def _numbers(
-    cells: list[list[str]], lines: list[int], rows_before: int, troubles: dict[int, _Trouble]
+    cells: list[list[str]], lines: list[int], rows_before: int, troubles: dict[int, _Trouble], *, plain: bool
 ) -> npt.NDArray[np.float64]:
     width = len(cells[0])
+    number = float if plain else _number
     try:
-        flat = np.fromiter(map(float, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width)
+        flat = np.fromiter(
+            map(number, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width
+        )
     except ValueError:
         pass
     else:
@@ -220,12 +232,12 @@ def _numbers(
     for index in range(width):
         column = [row[index] for row in cells]
         try:
-            values[:, index] = list(map(float, column))
+            values[:, index] = list(map(number, column))
         except ValueError:
             bad = [row for row, cell in enumerate(column) if not _is_number(cell)]
             blank = all(not column[row].strip() for row in bad)
             if blank:
-                values[:, index] = [float(cell) if cell.strip() else np.nan for cell in column]
+                values[:, index] = [number(cell) if cell.strip() else np.nan for cell in column]
             known = troubles.get(index)
             if known is None:
                 troubles[index] = _Trouble(lines[bad[0]], rows_before + bad[0], column[bad[0]], len(bad), blank)

@@ -13,7 +13,7 @@ import numpy as np
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError, ModelError
 from ftlm.files.load import column_names, load
-from ftlm.rig.rig import CURRENT_LIMIT
+from ftlm.rig.rig import CURRENT_LIMIT, LONGEST
 
 SHAPES = ("square", "sine", "chirp", "multisine", "prbs", "doublet", "csv")
 INPUTS = ("I1", "I2")
@@ -100,6 +100,8 @@ class Excitation:
         period = usual if self.period is None else self.period
         if not (isinstance(period, (int, float)) and math.isfinite(period) and period * rate >= 2):
             raise ModelError(f"period = {self.period!r} s is not a time of at least two samples ({2 / rate:g} s)")
+        if self.shape == "multisine" and period > LONGEST:
+            raise ModelError(f"period = {period:g} s of a multisine is longer than the longest run, {LONGEST:g} s")
         return float(period)
 
     def _shapes(self, t: Floats, rate: float, duration: float) -> Floats:

@@ -113,6 +113,9 @@ def record(
         A file that cannot be read, or that is there already; nothing has moved.
     RigFault
         The rig stopped the run. The cause is in words; what was recorded is in `run` and in the file.
+    BaseException
+        Ctrl-C, SIGTERM, or what `progress` raised, after the way out and when what was recorded is in the file; its
+        notes say what went wrong on the way out.
     """
     excitation = Excitation(input, amplitude, period, band, ramp, seed, file)
     _check_times(duration, limit, rate, seed)
@@ -148,10 +151,10 @@ def record(
         about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.trouble}
     try:
         run = recorder.finish(name, about, faults, 1.0 / rate)
+        return saved(run, target, recorder.partial, force=force, ended=ended, faults=faults)
     except BaseException:
         recorder.partial.close()
         raise
-    return saved(run, target, recorder.partial, force=force, ended=ended, faults=faults)
 
 
 def _drive(link: Rig, recorder: _Recorder, commands: Floats, block: int) -> tuple[BaseException | None, list[str]]:
@@ -167,9 +170,13 @@ def _drive(link: Rig, recorder: _Recorder, commands: Floats, block: int) -> tupl
     except (KeyboardInterrupt, SystemExit) as error:
         ended = error
         faults.append(stopped_by(error))
-    except BaseException:
-        recorder.partial.remove()
-        raise
+    except BaseException as error:
+        # Of the program, such as one in `progress`: it is raised when what was recorded is in its file.
+        ended = error
+        faults.append(f"stopped by an error of the program ({type(error).__name__}: {error})")
+    if ended is not None and not isinstance(ended, RigFault):
+        for trouble in link.troubles:
+            ended.add_note(trouble)
     return ended, faults + [t for t in link.troubles if t not in faults]
 
 
@@ -257,7 +264,8 @@ def _check_target(target: Path, *, force: bool) -> None:
         raise DataError(f"{str(target)!r}: parquet needs pyarrow; run: pip install 'ftlm[parquet]'")
     check_free(target, force=force, words=RUN)
     left = partial_of(target)
-    if left.exists() and not force:
+    # A dangling link would have the rows written where it leads.
+    if os.path.lexists(left) and not force:
         raise DataError(
             f"{str(left)!r} holds what was recorded by a program that did not end; load it, rename or remove it, or "
             "overwrite it with force=True (--force)"

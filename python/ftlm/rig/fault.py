@@ -16,6 +16,15 @@ def check_rate(rate: float) -> None:
         raise ModelError(f"rate = {rate!r} Hz cannot be done by this board; use {low:g} to {high:g} Hz")
 
 
+def check_watchdog(rate: float, seconds: float) -> None:
+    """Refuse a watchdog that would expire between one sample and the next, each of which reloads it."""
+    if seconds * rate < 2.0:
+        raise ModelError(
+            f"watchdog = {seconds:g} s is shorter than two samples at {rate:g} Hz and would expire between them; use "
+            f"at least {2.0 / rate:g} s, or a higher rate"
+        )
+
+
 def unset(*, analog: bool, digital: bool) -> str | None:
     """What keeps the watchdog from stopping the motors, given which of its expiration states are set."""
     if not analog:

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Callable
 from importlib import import_module
+from inspect import signature
 from types import ModuleType
 from typing import Any
 
@@ -18,7 +19,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import RigFault
-from ftlm.rig.fault import EXPIRED, check_rate, unset
+from ftlm.rig.fault import EXPIRED, check_rate, check_watchdog, unset
 from ftlm.rig.rig import COLUMNS
 
 #: Up to here the board's normal update rate does [Hz]; above, the fast one.
@@ -60,7 +61,12 @@ NO_PACKAGE = (
 def _driver() -> ModuleType:
     try:
         return import_module("quanser.hardware")
-    except ImportError:
+    except ImportError as error:
+        if error.name is not None and error.name.split(".")[0] != "quanser":
+            raise RigFault(
+                f"the vendor's Python package is installed, but {error.name}, which it needs, is not; run: pip install "
+                f"{error.name.split('.')[0]}"
+            ) from None
         raise RigFault(NO_PACKAGE) from None
     except OSError as error:
         raise _no_library(error) from None
@@ -98,19 +104,27 @@ class QuanserBoard:
         Identifier, such as ``"0"`` or ``"0@tcpip://host:port"``.
     clock
         Seconds, to see delays with.
+    sleep
+        Waits seconds, for the watchdog.
     """
 
     name = "Q8-USB"
     hardware = True
 
-    def __init__(self, card: str = "0", *, clock: Callable[[], float] = time.perf_counter) -> None:
+    def __init__(
+        self, card: str = "0", *, clock: Callable[[], float] = time.perf_counter,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:  # fmt: skip
         self.card = card
         self._clock = clock
+        self._sleep = sleep
         self._hil: Any = None
         self._error: type[Exception] = Exception
         self._module: ModuleType | None = None
         self._task: Any = None
         self._watched = False
+        self._lapsed = False
+        self._seconds = 0.0
         self._analog_safe = False
         self._digital_safe = False
         self._analog = np.zeros(len(ANALOG_IN), dtype=np.float64)
@@ -150,6 +164,11 @@ class QuanserBoard:
             except self._error as error:
                 if getattr(error, "error_code", None) != NOTHING_TO_CLEAR:
                     raise
+            else:
+                # Clearing an expiry brings back what was put out before it.
+                self._write((0.0, 0.0))
+                hil.write_digital(ENABLES, len(ENABLES), OFF)
+            self._lapsed = False
             hil.set_card_specific_options(f"update_rate={speed};decimation=1", OPTIONS_SIZE)
             hil.set_analog_input_ranges(ANALOG_IN, len(ANALOG_IN), low_in, -low_in)
             hil.set_analog_output_ranges(ANALOG_OUT, len(ANALOG_OUT), low_out, -low_out)
@@ -183,8 +202,10 @@ class QuanserBoard:
         missing = self.unsafe()
         if missing is not None:
             raise RigFault(f"Q8-USB: {missing}")
+        check_watchdog(self._rate, seconds)
         with self._spoken("starting the watchdog") as hil:
-            hil.watchdog_start(float(seconds))
+            self._seconds = float(seconds)
+            hil.watchdog_start(self._seconds)
             self._watched = True
 
     def start(self, rate: float) -> None:
@@ -198,14 +219,14 @@ class QuanserBoard:
         if self._hil is None:
             return
         with self._spoken("switching the amplifiers") as hil:
-            self._allowed(lambda: hil.write_digital(ENABLES, len(ENABLES), ON if on else OFF), forgive=not on)
+            self._allowed(lambda: hil.write_digital(ENABLES, len(ENABLES), ON if on else OFF), done=not on)
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Puts volts out; where the watchdog has locked the board, 0 V unlocks it first."""
+        """Puts volts out; where the watchdog has locked the board, 0 V is out already."""
         if self._hil is None:
             return
         with self._spoken("writing"):
-            self._allowed(lambda: self._write(volts), forgive=volts == (0.0, 0.0))
+            self._allowed(lambda: self._write(volts), done=volts == (0.0, 0.0))
 
     def rest(self, guard: _core.Guard, samples: int) -> None:
         """Samples with 0 V out."""
@@ -225,7 +246,9 @@ class QuanserBoard:
                 return
             values = guard.read(self._analog.tolist(), self._counts.tolist(), self._digital.tolist(), late)
             volts = guard.command(command)
-            self._rows.append([*guard.written, *values, late])
+            # A reading that is no number is a fault, which says so, and no measurement.
+            if all(map(math.isfinite, values)):
+                self._rows.append([*guard.written, *values, late])
             self._put(guard, (volts[0], volts[1]))
             if guard.fault is not None:
                 return
@@ -236,15 +259,27 @@ class QuanserBoard:
         return np.array(rows, dtype=np.float64).reshape(-1, len(COLUMNS) + 1)
 
     def stop(self) -> None:
-        """Stops the task."""
+        """Stops the task and gives it back."""
         if self._hil is not None and self._task is not None:
             task, self._task = self._task, None
             with self._spoken("stopping the task") as hil:
-                hil.task_stop(task)
+                try:
+                    hil.task_stop(task)
+                finally:
+                    hil.task_delete(task)
+
+    def let_expire(self) -> bool:
+        """Waits half as long again as the watchdog does, and asks the board."""
+        if self._hil is None or self._lapsed:
+            return True
+        if not self._watched:
+            return False
+        self._sleep(1.5 * self._seconds + 0.05)
+        return self._expired()
 
     def stop_watchdog(self) -> None:
-        """Stops the watchdog."""
-        if self._hil is not None and self._watched:
+        """Stops the watchdog; one that has expired is left as it is, since what it put out is to stay."""
+        if self._hil is not None and self._watched and not self._lapsed:
             self._watched = False
             with self._spoken("stopping the watchdog") as hil:
                 hil.watchdog_stop()
@@ -281,6 +316,7 @@ class QuanserBoard:
     def _put(self, guard: _core.Guard, volts: tuple[float, float]) -> None:
         with self._spoken("writing", guard=guard) as hil:
             if not hil.watchdog_reload():
+                self._lapsed = True
                 guard.fail(EXPIRED)
                 return
             self._write(volts)
@@ -289,22 +325,26 @@ class QuanserBoard:
         self._volts[:] = volts
         self._hil.write_analog(ANALOG_OUT, len(ANALOG_OUT), self._volts)
 
-    def _allowed(self, act: Callable[[], None], *, forgive: bool) -> None:
-        """Acts; after an expiry the board refuses access until it is cleared, which is done for what is safe."""
+    def _allowed(self, act: Callable[[], None], *, done: bool) -> None:
+        """Acts, unless the watchdog has expired and has `done` it.
+
+        The lock stays: clearing it brings back what was put out before.
+        """
         try:
             act()
         except self._error:
-            if not forgive:
+            if not (done and self._expired()):
                 raise
-            self._hil.watchdog_clear()
-            act()
 
     def _expired(self) -> bool:
         """Whether the watchdog has expired; False where the board does not say."""
+        if not self._watched:
+            return False
         try:
-            return self._watched and not self._hil.watchdog_reload()
+            self._lapsed = self._lapsed or not self._hil.watchdog_reload()
         except self._error:
             return False
+        return self._lapsed
 
     def _spoken(self, what: str, hil: Any = None, guard: _core.Guard | None = None) -> _Spoken:
         return _Spoken(self, what, self._hil if hil is None else hil, guard)
@@ -354,10 +394,7 @@ class _Spoken:
 
 
 def string_property(hil: Any, code: Any, size: int = 64) -> str:
-    """A text that the board knows, by the package's 2025 form (returns it) or its 2022 form (fills a buffer)."""
-    try:
-        return str(hil.get_string_property(code, size))
-    except TypeError:
-        buffer = np.zeros(size, dtype=np.int8)
-        hil.get_string_property(code, buffer, size)
-        return bytes(buffer.astype(np.uint8)).split(b"\0")[0].decode("utf-8", errors="replace")
+    """A text that the board knows; empty with the package of 2022, whose call writes past its own buffer."""
+    if len(signature(hil.get_string_property).parameters) != 2:
+        return ""
+    return str(hil.get_string_property(code, size))

@@ -39,6 +39,8 @@ class Partial:
     def __init__(self, target: Path | None, name: str, step: float, about: dict[str, Any]) -> None:
         self.path = None if target is None else partial_of(target)
         self._step, self._rows = step, 0
+        #: Rows that are on disk, whole.
+        self.kept = 0
         self._descriptor: int | None = None
         if self.path is None:
             return
@@ -48,8 +50,10 @@ class Partial:
             about | {"faults": ["the recording did not end"]},
         )  # fmt: skip
         lines = f"{CSV_MARK}{header.text()}\n{','.join([CSV_TIME, *COLUMNS])}\n"
-        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | getattr(os, "O_BINARY", 0)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         try:
+            # Whoever overwrites a link means the link, not what it leads to.
+            self.path.unlink(missing_ok=True)
             self._descriptor = os.open(self.path, flags, 0o666)
             self._append(lines.encode())
         except OSError as error:
@@ -76,6 +80,7 @@ class Partial:
         self._rows += len(rows)
         try:
             self._append(text.encode())
+            self.kept += len(rows)
         except OSError as error:
             raise RigFault(f"the recording cannot be written to disk ({error.strerror or error}); make space") from None
 
@@ -122,9 +127,10 @@ def saved(
                 place += f" and are in {target}"
             except DataError as error:
                 partial.close()
-                fault = RigFault(f"{error}; what was recorded is in {partial.path}")
+                place += f"; {partial.kept} of them are in {partial.path}"
+                fault = RigFault(f"{error}; {place}")
                 if ended is not None:
-                    fault = RigFault(f"{'; '.join(faults)}; {place}, in {partial.path}")
+                    fault = RigFault(f"{'; '.join(faults)}; {place}")
                 fault.run = run
                 raise fault from None
     else:

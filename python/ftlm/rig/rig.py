@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import math
-import signal
-import threading
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
-from types import FrameType
 from typing import Any, Literal, Protocol
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError, ModelError, RigFault
+from ftlm.rig.signals import Signals
 
 #: Deflection per volt of strain gauge [rad/V]; the sign is reversed.
 STRAIN_SCALE = (0.013636, 0.018694)
@@ -32,6 +30,11 @@ REST = 0.2
 LONGEST = 600.0
 #: Range of the watchdog's time [s]. 0 would switch it off; a second is already a long time for a motor.
 WATCHDOG_RANGE = (0.01, 1.0)
+#: Said where nothing that was tried can be known to have stopped the motors.
+LIVE = (
+    "the motors may still be under current: neither 0 V nor switched-off amplifiers nor the watchdog's expiry could be "
+    "confirmed; cut the arm's power by hand (emergency stop). The watchdog was left running and the board open"
+)
 #: What a row of a run holds.
 COLUMNS = ("I1", "I2", "theta11", "theta12", "theta21", "theta22", "I1_measured", "I2_measured")
 
@@ -133,6 +136,9 @@ class Board(Protocol):
     def stop(self) -> None:
         """Stops the task."""
 
+    def let_expire(self) -> bool:
+        """Waits without a heartbeat until the watchdog has put 0 V out; whether it is known to have."""
+
     def stop_watchdog(self) -> None:
         """Stops the watchdog."""
 
@@ -143,27 +149,53 @@ class Board(Protocol):
 def shut_down(board: Board) -> list[str]:
     """Every step of the way out, each tried whatever became of the one before; what went wrong, in words.
 
-    A step that is interrupted (a second Ctrl-C) is done again.
+    A step that is interrupted (a second Ctrl-C) is done again. Where 0 V could not be written or the amplifiers could
+    not be disabled, the watchdog is let expire, which does both. Where none of the three is certain, the watchdog is
+    left running and the board open: stopping the one or closing the other could leave the motors under current.
     """
-    steps: tuple[tuple[str, Callable[[], None]], ...] = (
-        ("writing 0 V", lambda: board.write((0.0, 0.0))),
-        ("disabling the amplifiers", lambda: board.enable(False)),
-        ("stopping the task", board.stop),
-        ("stopping the watchdog", board.stop_watchdog),
-        ("closing the board", board.close),
-    )
-    troubles = []
-    for name, step in steps:
-        for again in (True, False):
-            try:
-                step()
-            except (KeyboardInterrupt, SystemExit):
-                if again:
-                    continue
-            except BaseException as error:
-                troubles.append(f"{name} failed: {error}")
-            break
+    troubles: list[str] = []
+    zero = _tried("writing 0 V", lambda: board.write((0.0, 0.0)), troubles)
+    off = _tried("disabling the amplifiers", lambda: board.enable(False), troubles)
+    _tried("stopping the task", board.stop, troubles)
+    # A board of one's own may have no watchdog that can be waited for.
+    let_expire = getattr(board, "let_expire", None)
+    expired = False
+    if not (zero and off) and let_expire is not None:
+        seen: list[bool] = []
+        _tried("waiting for the watchdog", lambda: seen.append(let_expire()), troubles)
+        expired = any(seen)
+        if expired:
+            troubles.append("the watchdog was let expire instead, which puts 0 V out")
+    if not (zero or off or expired):
+        troubles.append(LIVE)
+        return troubles
+    _tried("stopping the watchdog", board.stop_watchdog, troubles)
+    _tried("closing the board", board.close, troubles)
     return troubles
+
+
+def _tried(name: str, step: Callable[[], None], troubles: list[str]) -> bool:
+    """Whether a step was done; one that is interrupted is done again, and what fails is told."""
+    for _ in (1, 2):
+        try:
+            step()
+        except (KeyboardInterrupt, SystemExit) as error:
+            why: BaseException | str = str(error) or "interrupted twice"
+        except BaseException as error:
+            why = error
+            break
+        else:
+            return True
+    troubles.append(f"{name} failed: {why}")
+    return False
+
+
+def _way_out(board: Board, signals: Signals) -> list[str]:
+    """The way out, and then the handlers of before; nothing that it refers to keeps the rig alive."""
+    try:
+        return shut_down(board)
+    finally:
+        signals.restore()
 
 
 class Rig:
@@ -209,19 +241,14 @@ class Rig:
         self.guard = self.limits.guard(1.0 / rate, sensor_filter)
         self.troubles: list[str] = []
         self._samples = 0
+        self._signals = Signals(WAY_OUT)
         self._finalizer: weakref.finalize[Any, Any] | None = None
-        self._handlers: dict[int, Any] = {}
 
     def __enter__(self) -> Rig:
         board = self.board
-        self._finalizer = weakref.finalize(self, shut_down, board)
-        if threading.current_thread() is threading.main_thread():
-            # A closed terminal ends a program too.
-            for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
-                number = getattr(signal, name, None)
-                if number is not None:
-                    self._handlers[number] = signal.signal(number, _terminated)
         try:
+            self._finalizer = weakref.finalize(self, _way_out, board, self._signals)
+            self._signals.install()
             board.open()
             board.configure(self.rate)
             board.set_expiration()
@@ -235,23 +262,21 @@ class Rig:
             board.rest(self.guard, max(2, round(REST * self.rate)))
             self._check()
             board.enable(True)
+            return self
         except BaseException:
             self._leave()
             raise
-        return self
 
-    def __exit__(self, *_: object) -> Literal[False]:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> Literal[False]:
         self._leave()
+        if kind is None:
+            # Who asked to stop while the motors were being stopped gets what they asked for.
+            self._signals.deliver()
         return False
 
     def _leave(self) -> None:
-        try:
-            if self._finalizer is not None:
-                self.troubles += self._finalizer() or []
-        finally:
-            while self._handlers:
-                number, handler = self._handlers.popitem()
-                signal.signal(number, handler)
+        if self._finalizer is not None:
+            self.troubles += self._finalizer() or []
 
     def _check(self) -> None:
         fault = self.guard.fault
@@ -288,5 +313,5 @@ class Rig:
         return self.board.take()
 
 
-def _terminated(number: int, frame: FrameType | None) -> None:
-    raise SystemExit(128 + number)
+#: Nothing cuts these short: a signal that comes while one of them is at work waits for its end.
+WAY_OUT = frozenset(f.__code__ for f in (Rig.__exit__, Rig._leave, _way_out, shut_down))

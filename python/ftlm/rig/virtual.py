@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
+import time
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,7 +14,7 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import RigFault
 from ftlm.rig import watchdog
-from ftlm.rig.fault import EXPIRED, check_rate, unset
+from ftlm.rig.fault import EXPIRED, check_rate, check_watchdog, unset
 from ftlm.rig.parameters import SETS, ArmParameters
 
 #: What can be made to go wrong: name, and what its number means.
@@ -62,6 +63,7 @@ class VirtualBoard:
         self._page: watchdog.Page | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._arm: _core.VirtualArm | None = None
+        self._seconds = 0.0
         self._beat = 0
         self._started = False
         self._random = np.random.default_rng(self.seed)
@@ -100,10 +102,13 @@ class VirtualBoard:
     def start_watchdog(self, seconds: float) -> None:
         """Starts the process that watches."""
         page = self._access()
+        if self.paced:
+            check_watchdog(self._rate, seconds)
         try:
             self._process = watchdog.start(page, keep=self.page is not None)
         except OSError as error:
             raise RigFault(f"virtual rig: {error}; check the Python installation") from None
+        self._seconds = seconds
         page.set("timeout", seconds if self.paced else max(seconds, _FAST_WATCHDOG))
 
     def start(self, rate: float) -> None:
@@ -121,8 +126,8 @@ class VirtualBoard:
         self._access().set("enabled", 1)
 
     def write(self, volts: tuple[float, float]) -> None:
-        """Puts volts out; 0 V always, also when the watchdog has put it out already."""
-        if volts == (0.0, 0.0) and self._page is not None and self._page.expired:
+        """Puts volts out; 0 V always, whatever became of the watchdog."""
+        if volts == (0.0, 0.0) and self._page is not None and (self._page.expired or self._unwatched()):
             self._page.put(self._beat, 0.0, 0.0)
             return
         self._put(*volts)
@@ -144,6 +149,21 @@ class VirtualBoard:
     def stop(self) -> None:
         """Stops sampling."""
         self._started = False
+
+    def let_expire(self) -> bool:
+        """Waits for the watchdog, which has the time that was asked for, also where the run is as fast as possible."""
+        page, process = self._page, self._process
+        if page is None:
+            return True
+        if process is None:
+            return False
+        page.set("timeout", self._seconds)
+        until = time.monotonic() + self._seconds + 5.0
+        while not page.expired or page.volts != (0.0, 0.0):
+            if process.poll() is not None or time.monotonic() > until:
+                return False
+            time.sleep(0.001)
+        return True
 
     def stop_watchdog(self) -> None:
         """Stops the process that watches."""
@@ -174,6 +194,10 @@ class VirtualBoard:
             raise RigFault(EXPIRED)
         return self._page
 
+    def _unwatched(self) -> bool:
+        """Whether the watchdog's process was started and is gone."""
+        return self._process is not None and self._process.poll() is not None
+
     def _stepped(self) -> _core.VirtualArm:
         if self._arm is None:
             raise RigFault("virtual rig: the board is not configured")
@@ -182,6 +206,11 @@ class VirtualBoard:
     def _put(self, volts1: float, volts2: float) -> tuple[tuple[float, float], bool]:
         """Writes, and says what reaches the motors."""
         page = self._access()
+        if self._unwatched():
+            raise RigFault(
+                "virtual rig: the watchdog's process has died, and nothing would stop the motors should the program "
+                "die too; see what ended it, and start again"
+            )
         self._beat += 1
         page.put(self._beat, volts1, volts2)
         return (volts1, volts2), bool(page.get("enabled"))

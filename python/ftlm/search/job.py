@@ -131,6 +131,11 @@ class Job:
 
 def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: Executor | None = None) -> SearchResult:
     """Search; with a store, as search `number` of it."""
+    if executor is not None and not isinstance(executor, Executor):
+        raise ModelError(
+            f"executor = {executor!r} is no executor of concurrent.futures; pass ProcessPoolExecutor(…) or "
+            "Client(…).get_executor()"
+        )
     if job.structure.has_order_law:
         stage = search_stage(job.stage_work(), store=store, number=number, executor=executor, progress=job.progress)
         return _result(job, *_stage_rows(job.structure, stage), stage["counts"])

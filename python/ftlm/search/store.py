@@ -34,7 +34,7 @@ from ftlm._core import __version__
 from ftlm.base.errors import DataError
 from ftlm.base.output import write_atomically
 from ftlm.search import frames
-from ftlm.search.contents import contents_of
+from ftlm.search.contents import check_store, contents_of
 
 #: Longest time [s] between two writes, each flushed to disk: with the time between checkpoints, under a second is lost.
 INTERVAL = 0.3
@@ -57,13 +57,20 @@ class Store:
         #: By search and first round: what is not written yet, and the failures written last.
         self._waiting: dict[tuple[int, int], frames.Begun] = {}
         self._failures: dict[tuple[int, int], frames.Failures | None] = {}
-        flags = os.O_RDWR | (os.O_CREAT if requests is not None else 0) | getattr(os, "O_BINARY", 0)
+        # A pipe that nobody reads would keep the open waiting.
+        flags = (
+            os.O_RDWR
+            | getattr(os, "O_NONBLOCK", 0)
+            | (os.O_CREAT if requests is not None else 0)
+            | getattr(os, "O_BINARY", 0)
+        )
         try:
             self._handle = os.open(self.path, flags | getattr(os, "O_CLOEXEC", 0), 0o666)
         except (OSError, ValueError) as error:
             why = error.strerror if isinstance(error, OSError) else None
             raise DataError(f"store {self.path} cannot be opened: {why or error}; choose another file") from error
         try:
+            check_store(self.path, self._handle)
             self._lock()
             self._begin(requests, salvage=salvage)
         except BaseException:

@@ -110,9 +110,12 @@ def _result(future: Future[Any], stretch: Stretch) -> tuple[float, Any] | None:
         if stretch.attempts >= ATTEMPTS:
             raise _lost(error) from error
         return None
-    if timed is None:
+    if timed is None and not stretch.sent:
         # The worker has not got what the search is computed from: it goes along the next time.
         stretch.sent = True
+        return None
+    if not isinstance(timed, tuple) or len(timed) != 2:
+        raise _lost(TypeError(f"a task came back with {type(timed).__name__}"))
     return timed
 
 

@@ -5,7 +5,7 @@ mod hooks;
 mod orders;
 mod points;
 mod stage;
-mod watch;
+pub(super) mod watch;
 
 pub use hooks::{panic_on_purpose, portable};
 pub use orders::{lattice_size, search, search_join, search_plan, OrderSearch};

@@ -2,11 +2,12 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{channel, RecvTimeoutError};
+use std::sync::Arc;
 use std::time::Duration;
 
 use pyo3::prelude::*;
 
-use super::super::errors::caught;
+use super::super::errors::{caught, detached};
 use super::arguments::checkpoint_of;
 use crate::error::Error;
 use crate::search::control::Control;
@@ -70,6 +71,43 @@ pub fn saved<T: Send>(
         progress.call1(py, state(&control))?;
     }
     Ok(result)
+}
+
+/// Signals shorter than this take less time than Python's signals are asked for, and no thread.
+const SHORT: usize = 1 << 17;
+
+/// Runs `work` on `points` values so that Ctrl-C returns at once: transforms of millions of points cannot be stopped, so
+/// their thread is left behind. It ends where `work` next looks at whether it was told to stop, and touches no Python.
+pub fn leavable<T: Send + 'static>(
+    py: Python<'_>,
+    points: usize,
+    work: impl FnOnce(&Control) -> Result<T, Error> + Send + 'static,
+) -> PyResult<T> {
+    if points < SHORT {
+        return detached(py, || work(&Control::default()));
+    }
+    py.detach(|| {
+        let control = Arc::new(Control::default());
+        let (send, receive) = channel();
+        let shared = Arc::clone(&control);
+        // One that is left behind has nobody to send to.
+        std::thread::spawn(move || drop(send.send(caught(|| work(&shared)))));
+        loop {
+            match receive.recv_timeout(LOOK) {
+                Ok(result) => return result.map_err(PyErr::from),
+                Err(RecvTimeoutError::Timeout) => {
+                    if let Err(error) = Python::attach(|py| py.check_signals()) {
+                        control.stop.store(true, Ordering::Relaxed);
+                        return Err(error);
+                    }
+                }
+                Err(RecvTimeoutError::Disconnected) => {
+                    let what = "a computing thread ended without a result".into();
+                    return Err(Error::Internal { what }.into());
+                }
+            }
+        }
+    })
 }
 
 /// Candidates done, in all, and left before the end of the record.

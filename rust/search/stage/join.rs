@@ -18,7 +18,7 @@ use crate::search::control::Control;
 use crate::search::lattice::law::LawLattice;
 use crate::search::stage::known::{Class, Entries, Entry};
 use crate::search::stage::orders::{number, Candidates};
-use crate::search::stage::sums::Sums;
+use crate::search::stage::sums::{Sums, LOOK};
 
 /// A row of one half of the join: a choice of its own free orders, and the addend of the other half's.
 #[derive(Debug, Clone, Copy)]
@@ -101,8 +101,8 @@ fn split(lattice: &LawLattice, rows: &[Sums; 2], control: &Control) -> Result<Ve
             break;
         }
         let limit = |size: u128| usize::try_from((least / size).min(MAX_PARTS)).unwrap_or(usize::MAX);
-        let Some(first) = rows[0].image(lattice, &other, limit(size(&own))) else { continue };
-        let Some(second) = rows[1].image(lattice, &own, limit(size(&other))) else { continue };
+        let Some(first) = rows[0].image(lattice, &other, limit(size(&own)), control)? else { continue };
+        let Some(second) = rows[1].image(lattice, &own, limit(size(&other)), control)? else { continue };
         let count = size(&own) * first.len() as u128 + size(&other) * second.len() as u128;
         if count < least {
             (least, best) = (count, own);
@@ -128,7 +128,7 @@ impl Join {
         let own = split(lattice, &rows, control)?;
         let other: Vec<usize> = (0..lattice.axes().len()).filter(|axis| !own.contains(axis)).collect();
         let full = |axes: &[usize], rows: &Sums| {
-            rows.image(lattice, axes, usize::MAX)
+            rows.image(lattice, axes, usize::MAX, control)?
                 .ok_or_else(|| Error::Internal { what: "an image without a limit".into() })
         };
         let addends = [full(&other, &rows[0])?, full(&own, &rows[1])?];
@@ -139,42 +139,37 @@ impl Join {
             let mut half = Half { equations: equations.clone(), combinations: Vec::new(), parts: Vec::new() };
             let mut known: HashMap<Box<[u32]>, u32> = HashMap::new();
             let (mut orders, mut key, mut ids) = (Vec::new(), Vec::new(), Vec::new());
-            let mut failed = None;
             rows[h].each(lattice, axes, &rows[1 - h], |index, sums, theirs| {
-                if control.stopped() {
-                    failed = Some(Error::Interrupted);
-                }
-                let Some(named) = addends[1 - h].find(theirs) else { return };
+                control.check_stop()?;
+                let Some(named) = addends[1 - h].find(theirs) else { return Ok(()) };
                 for (number_of_addend, addend) in addends[h].each().enumerate() {
-                    if failed.is_some() {
-                        return;
+                    if number_of_addend % LOOK == LOOK - 1 {
+                        control.check_stop()?;
                     }
                     if !rows[h].orders(lattice, sums, addend, &mut orders) {
                         continue;
                     }
-                    match combination(lattice, candidates, &mut half, &mut known, &orders, &mut key, &mut ids) {
-                        Ok(combination) => {
-                            let mine = number_of_addend as u64;
-                            let named = u64::from(named);
-                            let bucket = if h == 0 { mine * stride + named } else { named * stride + mine };
-                            half.parts.push(Part { bucket, index, combination });
-                        }
-                        Err(error) => failed = Some(error),
-                    }
+                    let combination =
+                        combination(lattice, candidates, &mut half, &mut known, &orders, &mut key, &mut ids)?;
+                    let (mine, named) = (number_of_addend as u64, u64::from(named));
+                    let bucket = if h == 0 { mine * stride + named } else { named * stride + mine };
+                    half.parts.push(Part { bucket, index, combination });
                 }
-            });
-            if let Some(error) = failed {
-                return Err(error);
-            }
+                Ok(())
+            })?;
+            control.check_stop()?;
             pool.install(|| half.parts.par_sort_unstable_by_key(|part| (part.bucket, part.index)));
             halves.push(half);
         }
         let [first, second] =
             <[Half; 2]>::try_from(halves).map_err(|_| Error::Internal { what: "a join without two halves".into() })?;
         let mut join = Self { halves: [first, second], buckets: Vec::new() };
-        join.meet();
+        join.meet(control)?;
         let mut used: Vec<Vec<bool>> = candidates.iter().map(|c| vec![false; c.len()]).collect();
-        for bucket in &join.buckets {
+        for (i, bucket) in join.buckets.iter().enumerate() {
+            if i % LOOK == 0 {
+                control.check_stop()?;
+            }
             for (half, rows) in join.halves.iter().zip(&bucket.rows) {
                 for part in &half.parts[rows.clone()] {
                     for (e, &id) in half.equations.clone().zip(half.ids(part.combination)) {
@@ -188,13 +183,19 @@ impl Join {
     }
 
     /// Finds the buckets that hold rows of both halves.
-    fn meet(&mut self) {
+    fn meet(&mut self, control: &Control) -> Result<()> {
         let [a, b] = [&self.halves[0].parts, &self.halves[1].parts];
         let end = |parts: &[Part], start: usize| {
             start + parts[start..].iter().take_while(|part| part.bucket == parts[start].bucket).count()
         };
         let (mut i, mut j) = (0, 0);
-        while i < a.len() && j < b.len() {
+        for step in 0usize.. {
+            if i >= a.len() || j >= b.len() {
+                break;
+            }
+            if step % LOOK == 0 {
+                control.check_stop()?;
+            }
             match a[i].bucket.cmp(&b[j].bucket) {
                 std::cmp::Ordering::Less => i += 1,
                 std::cmp::Ordering::Greater => j += 1,
@@ -205,6 +206,7 @@ impl Join {
                 }
             }
         }
+        Ok(())
     }
 
     /// Number of tuples.

@@ -5,10 +5,15 @@ use std::collections::HashMap;
 use std::ops::Range;
 
 use crate::equation::tidy;
+use crate::error::Result;
+use crate::search::control::Control;
 use crate::search::lattice::law::{LawEquation, LawLattice};
 
+/// Rows of a layout between two looks at whether it is to stop.
+pub(super) const LOOK: usize = 4096;
+
 /// Vectors of sums, each once.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct Distinct {
     width: usize,
     count: usize,
@@ -16,7 +21,22 @@ pub(super) struct Distinct {
     ids: HashMap<Box<[i64]>, u32>,
 }
 
+impl Drop for Distinct {
+    /// Millions of keys take longer to give back than Ctrl-C may take, so nobody waits for it.
+    fn drop(&mut self) {
+        if self.count > 8 * LOOK {
+            let ids = std::mem::take(&mut self.ids);
+            // Where no thread can be had they are given back here.
+            drop(std::thread::Builder::new().spawn(move || drop(ids)));
+        }
+    }
+}
+
 impl Distinct {
+    fn of(width: usize) -> Self {
+        Self { width, count: 0, values: Vec::new(), ids: HashMap::new() }
+    }
+
     /// Sums are of multiples of the grain by short weights: a thousandth of it tells them apart and forgives rounding.
     #[allow(clippy::cast_possible_truncation)]
     fn key(sums: &[f64]) -> Box<[i64]> {
@@ -65,35 +85,50 @@ impl Sums {
     }
 
     /// What these free orders add to the laws: distinct sums, or none where there are more than the limit.
-    pub(super) fn image(&self, lattice: &LawLattice, axes: &[usize], limit: usize) -> Option<Distinct> {
+    ///
+    /// # Errors
+    /// [`crate::error::Error::Interrupted`].
+    pub(super) fn image(
+        &self,
+        lattice: &LawLattice,
+        axes: &[usize],
+        limit: usize,
+        control: &Control,
+    ) -> Result<Option<Distinct>> {
         let width = self.constants.len();
-        let mut found = Distinct { width, ..Distinct::default() };
+        let mut found = Distinct::of(width);
         found.insert(&vec![0.0; width]);
         for &axis in axes {
-            let mut next = Distinct { width, ..Distinct::default() };
+            let mut next = Distinct::of(width);
             for sums in found.each() {
-                for value in &lattice.axes()[axis] {
+                for (i, value) in lattice.axes()[axis].iter().enumerate() {
+                    if i % LOOK == 0 {
+                        control.check_stop()?;
+                    }
                     let sums: Vec<f64> = sums.iter().zip(&self.weights[axis]).map(|(s, w)| s + w * value).collect();
                     next.insert(&sums);
                 }
                 if next.len() > limit {
-                    return None;
+                    return Ok(None);
                 }
             }
             found = next;
         }
-        Some(found)
+        Ok(Some(found))
     }
 
     /// Calls `take` for every choice of these free orders with its part of a tuple's index, its sums in these laws
     /// (constants included) and its sums in the others (without).
+    ///
+    /// # Errors
+    /// The first of `take`.
     pub(super) fn each(
         &self,
         lattice: &LawLattice,
         axes: &[usize],
         others: &Self,
-        mut take: impl FnMut(u64, &[f64], &[f64]),
-    ) {
+        mut take: impl FnMut(u64, &[f64], &[f64]) -> Result<()>,
+    ) -> Result<()> {
         let strides: Vec<u64> =
             axes.iter().map(|&axis| lattice.axes()[axis + 1..].iter().map(|a| a.len() as u64).product()).collect();
         let mut digits = vec![0usize; axes.len()];
@@ -110,9 +145,9 @@ impl Sums {
             add(&self.constants, &self.weights, &mut sums);
             add(&vec![0.0; others.constants.len()], &others.weights, &mut theirs);
             let index = digits.iter().zip(&strides).map(|(&digit, stride)| digit as u64 * stride).sum();
-            take(index, &sums, &theirs);
+            take(index, &sums, &theirs)?;
             let Some(i) = (0..axes.len()).rev().find(|&i| digits[i] + 1 < lattice.axes()[axes[i]].len()) else {
-                return;
+                return Ok(());
             };
             digits[i] += 1;
             digits[i + 1..].fill(0);

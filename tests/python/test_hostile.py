@@ -1,0 +1,345 @@
+"""What an attacker tried that once got through: files, names, devices, interrupts; each stays an error in words."""
+
+import os
+import signal
+import stat
+import subprocess
+import sys
+import threading
+from concurrent.futures import Executor, Future
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm import _core, rig
+from ftlm.base import output
+from ftlm.base.output import write_atomically
+from ftlm.cli import app
+from ftlm.search import contents
+from ftlm.search.contents import read_store
+
+
+def run_of(length=60):
+    t = np.arange(length) * 0.1
+    return ftlm.Run.from_arrays(inputs={"u": np.sign(np.sin(t))}, outputs={"y": np.sin(t)}, step=0.1)
+
+
+def ftlm_child(*arguments, **options):
+    return subprocess.run(
+        [sys.executable, "-m", "ftlm", *arguments],
+        check=False, timeout=120, stderr=subprocess.PIPE, text=True, **options,
+    )  # fmt: skip
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Files written
+
+
+def test_force_overwrites_regular_files_alone(tmp_path):
+    pipe, link, aim = tmp_path / "pipe", tmp_path / "link", tmp_path / "aim"
+    os.mkfifo(pipe)
+    aim.write_text("mine")
+    link.symlink_to(aim)
+    for path, what in ((pipe, "a device, pipe or socket"), (link, "a link")):
+        with pytest.raises(ftlm.DataError, match=f"is {what}, no regular file"):
+            write_atomically(path, b"x", force=True)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert link.is_symlink()
+    assert aim.read_text() == "mine"
+    device = tmp_path / "null"
+    try:
+        os.mknod(device, stat.S_IFCHR | 0o666, os.makedev(1, 3))
+    except PermissionError:
+        return
+    with pytest.raises(ftlm.DataError, match="is a device"):
+        run_of().to_csv(device, force=True)
+    assert stat.S_ISCHR(device.stat().st_mode)
+
+
+@pytest.mark.parametrize("mode", [0o600, 0o640])
+def test_a_file_that_is_overwritten_keeps_its_permissions(tmp_path, mode):
+    path = tmp_path / "run.csv"
+    path.write_text("mine")
+    path.chmod(mode)
+    run_of().to_csv(path, force=True)
+    assert stat.S_IMODE(path.stat().st_mode) == mode
+    assert [p.name for p in tmp_path.iterdir()] == ["run.csv"]
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_a_file_that_is_made_meanwhile_is_not_overwritten(tmp_path, monkeypatch, links):
+    path = tmp_path / "run.csv"
+    real = output.check_new
+
+    def late(file, **options):
+        found = real(file, **options)
+        if not path.exists():
+            path.write_text("theirs")
+        return found
+
+    monkeypatch.setattr(output, "check_new", late)
+    if not links:
+        monkeypatch.setattr(os, "link", lambda *_, **__: (_ for _ in ()).throw(PermissionError("no links here")))
+    with pytest.raises(ftlm.DataError, match="exists"):
+        write_atomically(path, b"ours", force=False)
+    assert path.read_text() == "theirs"
+    assert [p.name for p in tmp_path.iterdir()] == ["run.csv"]
+
+
+def test_a_folder_without_links_takes_files_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(os, "link", lambda *_, **__: (_ for _ in ()).throw(PermissionError("no links here")))
+    assert write_atomically(tmp_path / "a", b"ours", force=False).read_bytes() == b"ours"
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Files read
+
+
+@pytest.mark.parametrize("writing", [True, False])
+def test_a_store_that_is_no_file_is_refused_at_once(tmp_path, writing):
+    pipe = tmp_path / "store"
+    os.mkfifo(pipe)
+    for path in (pipe, "/dev/full", "/dev/zero"):
+        with pytest.raises(ftlm.DataError, match=r"no regular file|cannot be"):
+            ftlm.resume_search(path) if writing else read_store(path)
+
+
+@pytest.mark.parametrize("start", [b"", b"ftlm search store 1\n"])
+def test_a_sparse_file_of_gigabytes_is_refused_before_it_is_read(tmp_path, start):
+    path = tmp_path / "store"
+    path.write_bytes(start)
+    os.truncate(path, contents.LARGEST + 1)
+    with pytest.raises(ftlm.DataError, match="is no ftlm search store" if not start else "more than the"):
+        read_store(path)
+    with pytest.raises(ftlm.DataError, match="is no ftlm search store" if not start else "more than the"):
+        ftlm.resume_search(path)
+
+
+def test_names_of_very_many_columns_are_compared_once_each(tmp_path):
+    class Name(str):
+        compared = 0
+
+        def __eq__(self, other):
+            Name.compared += 1
+            return str.__eq__(self, other)
+
+        __hash__ = str.__hash__
+
+        def strip(self, *_):
+            return self
+
+    from ftlm.files.text import _names
+
+    names = [Name(f"a{k}") for k in range(3000)]
+    assert _names(names, tmp_path, 1, own=False) == names
+    # Every name beside every other would be 4.5 million.
+    assert Name.compared < 100_000
+    with pytest.raises(ftlm.DataError, match="'a7' is there 2 times"):
+        _names([*names, Name("a7")], tmp_path, 1, own=False)
+
+
+@pytest.fixture(scope="module")
+def parquet(tmp_path_factory):
+    pytest.importorskip("pyarrow")
+    path = tmp_path_factory.mktemp("parquet") / "run.parquet"
+    run_of().to_parquet(path)
+    return path
+
+
+def test_a_parquet_run_that_lost_rows_or_values_is_refused(parquet, tmp_path):
+    import pyarrow.parquet
+
+    table = pyarrow.parquet.read_table(parquet)
+    assert ftlm.load(parquet).length == 60
+    turned = table.select(table.column_names[::-1])
+    for changed in (table.slice(0, 10), table.set_column(2, "y", [np.zeros(60)]), turned):
+        kept = changed.replace_schema_metadata(table.schema.metadata)
+        pyarrow.parquet.write_table(kept, tmp_path / "other.parquet")
+        with pytest.raises(ftlm.DataError, match="rows were read where it says 60, or their checksum"):
+            ftlm.load(tmp_path / "other.parquet")
+    # A file of before, without a checksum, is read as it was.
+    plain = {k: v for k, v in table.schema.metadata.items() if k != b"ftlm-check"}
+    pyarrow.parquet.write_table(table.replace_schema_metadata(plain), tmp_path / "before.parquet")
+    assert ftlm.load(tmp_path / "before.parquet").length == 60
+
+
+@pytest.mark.slow
+def test_no_flipped_byte_of_a_parquet_footer_is_another_run(parquet, tmp_path):
+    whole, right = parquet.read_bytes(), ftlm.load(parquet)
+    path = tmp_path / "run.parquet"
+    footer = int.from_bytes(whole[-8:-4], "little")
+    for at in range(len(whole) - footer - 8, len(whole), 5):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << at % 8)]) + whole[at + 1 :])
+        try:
+            run = ftlm.load(path)
+        except ftlm.DataError:
+            continue
+        assert run.length == right.length, at
+        assert all(np.array_equal(run[name], right[name]) for name in run.signals), at
+
+
+def test_digits_have_no_underscores_in_files(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t,u,y\n0,1,1\n1,2,3_0.0\n2,3,4\n")
+    with pytest.raises(ftlm.DataError, match=r"'3_0\.0' is not a number"):
+        ftlm.load(path, inputs="u", outputs="y")
+
+
+def test_a_signal_whose_name_is_a_number_comes_back(tmp_path):
+    t = np.arange(9) * 0.1
+    run = ftlm.Run.from_arrays(inputs={"nan": np.cos(t)}, outputs={"y": np.sin(t)}, step=0.1)
+    run.to_csv(tmp_path / "a.csv")
+    assert np.array_equal(ftlm.load(tmp_path / "a.csv")["nan"], run["nan"])
+
+
+def test_one_column_is_not_an_input_and_an_output(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t,u,y\n0,1,1\n1,2,3\n2,3,4\n")
+    with pytest.raises(ftlm.DataError, match="column 'y' is the input 'a' and the output 'b'"):
+        ftlm.load(path, inputs={"a": "y"}, outputs={"b": "y"})
+
+
+def test_a_number_of_thousands_of_digits_is_an_error_in_words(written, tmp_path):
+    path = tmp_path / "columns.toml"
+    path.write_text(f"step = {'9' * 5000}\n")
+    with pytest.raises(ftlm.DataError, match="is not a TOML file"):
+        ftlm.load(written, columns=path)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Calls
+
+
+def test_a_multisine_of_years_is_refused():
+    with pytest.raises(ftlm.ModelError, match=r"period = 1e\+09 s of a multisine is longer than the longest run"):
+        rig.Excitation("multisine", period=1e9).commands(500.0, 1.0)
+
+
+class Empty(Executor):
+    """Tasks that come back with something that no task returns."""
+
+    def __init__(self, result):
+        self.result, self.sent = result, 0
+
+    def submit(self, *_, **__):
+        self.sent += 1
+        # Who waits for ever is found by this, not by a clock.
+        assert self.sent < 100
+        future = Future()
+        future.set_result(self.result)
+        return future
+
+
+@pytest.mark.parametrize("result", [None, 3, (1.0, 2, 3)])
+def test_an_executor_that_returns_nothing_ends(small_run, result):
+    with pytest.raises(ftlm.ConvergenceError, match="lost its work"):
+        ftlm.search_orders(
+            small_run, ftlm.equation("D^a y = c D^b y + d u"), ftlm.lattice(step=0.2), m=32, executor=Empty(result)
+        )  # fmt: skip
+
+
+def test_what_is_no_executor_is_refused(small_run):
+    with pytest.raises(ftlm.ModelError, match="is no executor"):
+        ftlm.search_orders(
+            small_run, ftlm.equation("D^a y = c D^b y + d u"), ftlm.lattice(step=0.2), m=32, executor=SimpleNamespace()
+        )  # fmt: skip
+
+
+CAPSULE = """
+import builtins, ftlm, numpy
+from ftlm import _core
+real = builtins.__import__
+def interrupted(name, *a, **k):
+    if "multiarray" in name:
+        raise KeyboardInterrupt
+    return real(name, *a, **k)
+builtins.__import__ = interrupted
+print(_core.pulse_means(numpy.ones(4), 3, True))
+"""
+
+
+def test_numpys_interface_is_there_before_a_ctrl_c_can_arrive():
+    done = subprocess.run([sys.executable, "-c", CAPSULE], check=True, capture_output=True, text=True, timeout=60)
+    assert done.stdout.strip() == "[1. 1. 1.]"
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="threads are counted in /proc")
+def test_ctrl_c_does_not_wait_for_a_transform():
+    x = np.random.default_rng(0).standard_normal(1 << 22)
+    kept = signal.signal(signal.SIGINT, signal.default_int_handler)
+    before = len(os.listdir("/proc/self/task"))
+    timer = threading.Timer(0.1, signal.raise_signal, [signal.SIGINT])
+    timer.start()
+
+    def integrals():
+        for _ in range(100):
+            ftlm.fractional_integral(x, 0.5, step=0.1)
+
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            integrals()
+    finally:
+        signal.signal(signal.SIGINT, kept)
+    # What it was computing is still being computed, and nobody waits for it.
+    assert len(os.listdir("/proc/self/task")) > before
+
+
+def test_more_points_than_memory_holds_are_refused():
+    for m in (2**31, 2**40, 2**62):
+        with pytest.raises(ftlm.ModelError, match="m = "):
+            _core.series_multiply(np.ones(3), np.ones(3), m)
+        with pytest.raises(ftlm.ModelError, match="m = "):
+            _core.pulse_means(np.ones(3), m, False)
+        with pytest.raises(ftlm.ModelError, match="m = "):
+            _core.filter_series([(1.0, 0.0)], [(1.0, 0.0), (1.0, 1.0)], m, 0.1)
+
+
+def test_an_order_that_is_no_number_does_not_turn_for_ever():
+    for terms in ([(1.679, 1.526), (-1.0, np.inf)], [(np.nan, 0.5)]):
+        with pytest.raises(ftlm.DataError, match="own terms"):
+            _core.grows(1.135, terms)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The command line
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    path = tmp_path_factory.mktemp("written") / "run.csv"
+    run_of().to_csv(path)
+    return path
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a disk that is always full")
+def test_a_full_output_is_one_line(written):
+    with open("/dev/full", "w") as full:
+        done = ftlm_child("inspect", str(written), stdout=full)
+    assert done.returncode == 3
+    assert done.stderr.startswith("ftlm: the system refuses: No space left on device")
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+
+
+def test_a_terminal_that_knows_ascii_alone_gets_its_result(tmp_path):
+    t = np.arange(60) * 0.1
+    ftlm.Run.from_arrays(inputs={"u": np.cos(t)}, outputs={"θ": np.sin(t)}, step=0.1).to_csv(tmp_path / "a.csv")
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = ftlm_child("inspect", str(tmp_path / "a.csv"), stdout=subprocess.PIPE, env=environment)
+    assert done.returncode == 0
+    assert "Traceback" not in done.stderr
+    assert "\\u03b8" in done.stdout
+
+
+def test_a_working_folder_that_is_gone_is_one_line(written, tmp_path, monkeypatch, capsys):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    with pytest.raises(SystemExit) as ended:
+        app(["record", "--duration", "0.1", "-o", "run.csv"], standalone_mode=True)
+    assert ended.value.code == 3
+    assert capsys.readouterr().err.startswith("ftlm: ")
