@@ -114,8 +114,8 @@ def speed() -> None:
     equation = (0, 1.8, [(0, 0.9), (1, 0.0)])
     for m in (1 << 11, 1 << 14, 1 << 17):
         record = (1e-3, np.stack([np.zeros(m), rng.normal(size=m)]), None)
-        rubs = timed(partial(_core.friction_respond, record, equation, [-3.0, 1.0], (0.5, 0.0, 1.0), []))
-        falls = timed(partial(_core.friction_respond, record, equation, [-3.0, 1.0], (0.5, 0.3, 0.01), []))
+        rubs = timed(partial(_core.friction_respond, record, [(equation, [-3.0, 1.0])], 0, (0.5, 0.0, 1.0), [[]]))
+        falls = timed(partial(_core.friction_respond, record, [(equation, [-3.0, 1.0])], 0, (0.5, 0.3, 0.01), [[]]))
         plain = timed(partial(_core.respond, record, [(equation, [-3.0, 1.0])], [False, True], [[]]))
         print(f"| {m} | {1e3 * rubs:.1f} | {rubs / plain:.1f} | {falls / plain:.1f} |", flush=True)
 

@@ -10,7 +10,7 @@ from msgspec import UNSET, UnsetType
 
 from ftlm.base.errors import DataError, FtlmError
 from ftlm.base.statistics import noise_of
-from ftlm.data.equations import Friction, Stribeck, Term
+from ftlm.data.equations import Equation, Friction, Stribeck, Term
 from ftlm.data.orders import Order
 from ftlm.data.readings import read
 from ftlm.data.run import Run
@@ -43,7 +43,7 @@ def race_with_friction(
     problem, runs = alike.problem, alike.runs
     structure = problem.structure
     check_moves(runs, structure)
-    rubs = structure.equations[0].friction
+    rubs = structure.equations[structure.sticks].friction
     if rubs is None:
         return race(alike, floor, threads, progress)
     coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
@@ -75,7 +75,7 @@ def raced(coarse: Grid, starts: list[Attempt], threads: int) -> list[Attempt]:
 
 def check_moves(runs: Sequence[Run], structure: Structure) -> None:
     """Refuse runs in none of which the body moves."""
-    output = structure.outputs[0]
+    output = structure.outputs[structure.sticks]
     if all(float(np.ptp(read(run[output]))) <= STILL * noise_of(run[output]) for run in runs):
         raise DataError(
             f"{output} never moves beyond its noise in {', '.join(r.name for r in runs)}, and a body that only rests "
@@ -85,14 +85,20 @@ def check_moves(runs: Sequence[Run], structure: Structure) -> None:
 
 def with_friction(structure: Structure, rubs: Friction | UnsetType) -> Structure:
     """The structure with other friction, or none."""
-    return replace(structure, equations=(replace(structure.equations[0], coulomb=rubs),))
+    return changed(structure, replace(structure.equations[structure.sticks], coulomb=rubs))
 
 
 def with_measured_sign(structure: Structure, rubs: Friction) -> Structure:
     """The structure with the sign of the measured velocity as a signal in the place of friction."""
-    item = structure.equations[0]
+    item = structure.equations[structure.sticks]
     term = Term(f"{COULOMB}{item.output}", Order(), rubs.coefficient, rubs.factor)
-    return replace(structure, equations=(replace(item, terms=(*item.terms, term), coulomb=UNSET),))
+    return changed(structure, replace(item, terms=(*item.terms, term), coulomb=UNSET))
+
+
+def changed(structure: Structure, item: Equation) -> Structure:
+    """The structure with another equation of the body that may stick."""
+    before = structure.equations
+    return replace(structure, equations=(*before[: structure.sticks], item, *before[structure.sticks + 1 :]))
 
 
 def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str) -> list[Attempt]:
@@ -112,7 +118,7 @@ def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str)
         # Without any friction it runs away.
         return out
     values = {**values, **dict(zip(linear.names, without.values.tolist(), strict=True))}
-    force = driving(coarse.runs, plain.with_coefficients({n: values[n] for n in plain.coefficient_names}))
+    force = driving(coarse.runs, known(linear, values))
     for share in SHARES if force > 0 else ():
         strength = share * force / -rubs.factor
         out.append(at(problem, {**values, name: strength}, f"{origin}, friction {share:g} of what drives"))
@@ -122,13 +128,12 @@ def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str)
 def falling(coarse: Grid, values: dict[str, float], more: Stribeck, origin: str) -> list[Attempt]:
     """Starts at numbers of a fit with Coulomb friction alone, with some more of it at low speeds."""
     problem = coarse.problem
-    rubs = problem.structure.equations[0].friction
+    rubs = problem.structure.equations[problem.structure.sticks].friction
     fc = (
         abs(rubs.factor) * values.get(str(rubs.coefficient), 0.0) if rubs is not None and rubs.strength is None else 0.0
     )
     fc = fc or (0.0 if rubs is None else rubs.strength or 0.0)
-    plain = with_friction(problem.structure, UNSET)
-    size = fc or driving(coarse.runs, plain.with_coefficients({n: values[n] for n in plain.coefficient_names}))
+    size = fc or driving(coarse.runs, known(FreeProblem.of(with_friction(problem.structure, UNSET)), values))
     pace = speed_of(coarse)
     forces = (
         [(NEAR[0], None)] if not isinstance(more.coefficient, str) else [(n, n * size / -more.factor) for n in NEAR]
@@ -145,7 +150,7 @@ def falling(coarse: Grid, values: dict[str, float], more: Stribeck, origin: str)
 
 def speed_of(coarse: Grid) -> float:
     """Root mean square of the body's measured speed, over intervals that noise does not fill."""
-    output = coarse.problem.structure.outputs[0]
+    output = coarse.problem.structure.outputs[coarse.problem.structure.sticks]
     parts = [np.diff(read(run[output])[:: coarse.decimation]) / (run.step * coarse.decimation) for run in coarse.runs]
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
@@ -156,9 +161,16 @@ def at(problem: FreeProblem, values: dict[str, float], origin: str) -> Attempt:
     return Attempt(orders, coefficients, origin, {}, inputs)
 
 
-def driving(runs: Sequence[Run], structure: Structure) -> float:
+def known(problem: FreeProblem, values: dict[str, float]) -> Equation:
+    """The equation of the body that may stick, without its friction, at named values."""
+    structure = problem.structure
+    coefficients = problem.named([values[n] for n in problem.coefficients])
+    item = structure.equations[structure.sticks]
+    return item.with_coefficients({n: coefficients[n] for n in item.coefficient_names})
+
+
+def driving(runs: Sequence[Run], item: Equation) -> float:
     """Root mean square of the largest force that another signal exerts by itself [unit of D^alpha y]."""
-    item = structure.equations[0]
     sizes = [0.0]
     for term in item.terms:
         if term.signal == item.output or term.order.names or term.order.constant != 0:
