@@ -16,8 +16,9 @@ from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.grid import FINEST, Attempt, Grid
-from ftlm.fit.problem import FreeProblem
+from ftlm.fit.problem import FRICTION_BOUNDS, FreeProblem
 from ftlm.fit.race import COARSE_SAMPLES, FINALISTS, FIRST_LAP, SECOND_LAP, Laps, race
+from ftlm.fit.sliding import slid
 from ftlm.solve.records import COULOMB
 
 #: Friction at a start as shares of the force that drives the body, from next to none upwards.
@@ -27,6 +28,8 @@ MULTIPLES = (1.0, 0.3)
 #: Stribeck friction at a start as shares of Coulomb's, and its speed as shares of that of the body.
 NEAR = (0.02, 0.2, 1.0)
 FALLS = (0.05, 0.2, 0.6)
+#: What hangs on a body at a start, as shares of the body's own inertia.
+CARRIED = (0.1, 0.3, 1.0, 3.0)
 #: A body that moves by less than this many deviations of its noise, peak to peak, has not moved.
 STILL = 10.0
 
@@ -55,12 +58,71 @@ def race_with_friction(
             values = dict(zip(less.names, attempt.values.tolist(), strict=True))
             starts += falling(coarse, values, rubs.stribeck, attempt.origin)
         return raced(coarse, starts, threads)
-    signed = with_measured_sign(structure, rubs)
-    reached = race(replace(alike, problem=FreeProblem.of(signed)), floor, threads, progress)
+    # Driven by measured signals, each of several bodies is told from its own equation, whatever the others do.
+    signed = FreeProblem.of(replace(with_measured_sign(structure, rubs), coupling="measured"))
+    reached = race(replace(alike, problem=signed), floor, threads, progress)
     for attempt in reached[:FINALISTS]:
-        values = dict(zip(FreeProblem.of(signed).names, attempt.values.tolist(), strict=True))
+        values = dict(zip(signed.names, attempt.values.tolist(), strict=True))
         starts += started(coarse, values, rubs, attempt.origin)
+    if len(structure.equations) > 1 and reached:
+        values = dict(zip(signed.names, reached[0].values.tolist(), strict=True))
+        starts += carrying(problem, runs, {**values, **signed.named(reached[0].coefficients)})
     return raced(coarse, starts, threads)
+
+
+def carrying(problem: FreeProblem, runs: Sequence[Run], values: dict[str, float]) -> list[Attempt]:
+    """Starts of a body by itself, with what hangs on it put back as action and reaction ask for, some shares of inertia.
+
+    The others are as they are when the measured body drives them; the body itself, driven by measured others, may be
+    explained by what they tell of its motion, without what drives it and without friction.
+    """
+    structure = problem.structure
+    item = structure.equations[structure.sticks]
+    if item.friction is None:
+        return []
+    alone = structure.equation(item.output)
+    kept = tuple(t for t in alone.equations[0].terms if t.signal not in structure.outputs or t.signal == item.output)
+    if not kept:
+        return []
+    alone = replace(alone, equations=(replace(alone.equations[0], terms=kept),))
+    bounds = dict(zip(problem.orders, problem.bounds, strict=True))
+    usual = {n: 0.0 for n in alone.order_names} | {
+        n: 1.0 for t in kept if t.signal == item.output for n in t.order.names
+    } | {n: FRICTION_BOUNDS[1] for n in item.order.names}  # fmt: skip
+    shared = {n for e in structure.equations if e is not item for n in e.order_names}
+    orders = {n: values[n] if n in shared and n not in item.order.names else v for n, v in usual.items()}
+    orders = {n: min(max(v, bounds[n][0]), bounds[n][1]) if n in bounds else v for n, v in orders.items()}
+    numbers = slid(runs, alone.with_orders(orders))
+    out = []
+    for share in CARRIED if numbers else ():
+        # What drives it and brakes it moves the others, too.
+        found = {**values, **reacting(structure, values, share), **{n: (1.0 + share) * v for n, v in numbers.items()}}
+        free = dict(zip(problem.coefficients, problem.free_from(found), strict=True))
+        rest = {n: v for n, v in {**values, **orders}.items() if n in problem.names}
+        out.append(at(problem, {**rest, **free}, f"{item.output} by itself, carrying {share:g} of its inertia"))
+    return out
+
+
+def reacting(structure: Structure, values: dict[str, float], share: float) -> dict[str, float]:
+    """Coefficients by which others act on the body: against what moves them, by so much of their inertia over its own."""
+    item = structure.equations[structure.sticks]
+    out: dict[str, float] = {}
+    for other in structure.equations:
+        if other is item:
+            continue
+        named = {**values, **{n: 0.0 for n in other.order_names if n not in values}}
+
+        def highest(term: Term, named: dict[str, float] = named) -> float:
+            return term.order.constant + sum(w * named[n] for n, w in term.order.weights)
+
+        own = sorted((t for t in other.terms if t.signal == other.output), key=highest)
+        back = sorted((t for t in item.terms if t.signal == other.output), key=highest)
+        for there, here in zip(own, back, strict=False):
+            if not isinstance(here.coefficient, str):
+                continue
+            value = there.fixed if there.fixed is not None else there.factor * values[str(there.coefficient)]
+            out[here.coefficient] = -share * value / here.factor
+    return out
 
 
 def raced(coarse: Grid, starts: list[Attempt], threads: int) -> list[Attempt]:
