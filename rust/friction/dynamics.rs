@@ -384,13 +384,13 @@ impl Run {
 /// mean stands, which moves the mean position by a share of the square of the step.
 pub(super) fn at_rest(output: &mut [f64], march: &March) {
     let (mut crept, mut before) = (0.0, output.first().copied().unwrap_or(0.0));
-    for k in 1..output.len() {
-        let now = output[k];
-        if march.edges[k - 1..=k + 1].iter().all(|v| *v == 0.0) {
+    for (value, edges) in output.iter_mut().skip(1).zip(march.edges.windows(3)) {
+        let now = *value;
+        if edges.iter().all(|v| *v == 0.0) {
             crept += now - before;
         }
         before = now;
-        output[k] = now - crept;
+        *value = now - crept;
     }
 }
 

@@ -1,4 +1,4 @@
-//! Free runs of a body with dry friction, alone or among bodies that it drives and that drive it, and their output error.
+//! Free runs of a body with dry friction, alone or among bodies coupled to it, and their output error.
 //!
 //! D^α y = Σ c D^ν s − F(Dy) sgn(Dy) + … with 1 < α ≤ 2, sgn set-valued at rest and F(v) = fc + fs exp(−(v/vs)²)
 //! ([`law`]). Everything but friction is linear, so superposition leaves one scalar problem: the velocity at the edges of

@@ -114,9 +114,10 @@ impl Forcing {
                         name: "exponent of an initial term".into(),
                         value: exponent + 1.0,
                         range: "(0, ∞) or 0".into(),
-                        remedy: "a level that a term above its equation's order differentiates needs that term's power of \
+                        remedy:
+                            "a level that a term above its equation's order differentiates needs that term's power of \
                                  t beside it; start at rest, or let the start be found"
-                            .into(),
+                                .into(),
                     });
                 }
                 let means = if i == sticks { power_means(exponent, m, step) } else { means_of(exponent, m, step) };

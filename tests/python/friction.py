@@ -157,11 +157,11 @@ def hub_and_link(
     force: Callable[[float], float], times: np.ndarray, hub: tuple[float, float, float], link: tuple[float, float],
     friction: float, more: float = 0.0, speed: float = 1.0, start: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """A hub on dry friction that carries an elastic link, integrated between its events: angles and velocity of the hub.
+    """A hub on dry friction that carries an elastic link, between its events: angles, and the hub's velocity.
 
-    D^2 x = a q + d Dq + b Dx + F - (f + fs exp(-(Dx/vs)^2)) sgn(Dx), D^2 q = - D^2 x - k q - c Dq, with (a, d, b) of the
-    hub and (k, c) of the link; the start is (x, Dx, q, Dq). Angles have shape (2, times). While the hub rests the link
-    rings by itself.
+    D^2 x = a q + d Dq + b Dx + F - (f + fs exp(-(Dx/vs)^2)) sgn(Dx), D^2 q = - D^2 x - k q - c Dq, with (a, d, b) of
+    the hub and (k, c) of the link; the start is (x, Dx, q, Dq). Angles have shape (2, times). While the hub rests
+    the link rings by itself.
     """
     (a, d, b), (k, c) = hub, link
     most, now, end = friction + more, 0.0, float(times[-1])

@@ -87,7 +87,7 @@ def test_the_free_run_converges_to_that_between_events(law, start) -> None:
         errors.append(np.max(np.abs(found["outputs"] - exact), axis=1) / size)
         slips.append(np.max(np.abs(found["velocity"] - np.interp(edges, times, v))))
     assert np.all(errors[2] < 1e-4)
-    # The second order in the step, events and all: a sixteenth for a quarter of it, up to where in a pulse each one lies.
+    # The second order in the step, events and all: a sixteenth for a quarter, up to where in its pulse each one lies.
     assert np.all(errors[2] < errors[0] / 8.0)
     assert slips[2] < slips[0] / 10.0
 
@@ -127,7 +127,14 @@ CHAIN = [
 
 @pytest.mark.parametrize(
     ("model", "sticks", "level"),
-    [(equations(), 0, 0.3), (arm(2.15), 0, 0.0), (arm(1.9), 0, 0.3), (arm(2.0), 0, 0.3), (CHAIN, 0, 0.3), (CHAIN, 1, 0.3)],
+    [
+        (equations(), 0, 0.3),
+        (arm(2.15), 0, 0.0),
+        (arm(1.9), 0, 0.3),
+        (arm(2.0), 0, 0.3),
+        (CHAIN, 0, 0.3),
+        (CHAIN, 1, 0.3),
+    ],
 )
 def test_without_friction_it_is_the_linear_free_run(model, sticks: int, level: float) -> None:
     means = averaged(1000)
@@ -200,3 +207,155 @@ def test_derivatives_are_those_of_finite_differences(orders) -> None:
     for k in range(count):
         expected = columns[k] - basis @ (basis.T @ columns[k])
         assert np.linalg.norm(found[k] - expected) < 2e-6 * np.linalg.norm(columns[k]), k
+
+
+# --------------------------------------------------------------------------------------------------------------- words
+
+
+def test_several_equations_with_friction_follow_each_other() -> None:
+    structure = ftlm.equation(WORDS)
+    assert structure.coupling == "simulated"
+    assert ftlm.equation(WORDS.replace(" - fc*sign(D x)", "")).coupling == "measured"
+    assert structure.sticks == 0
+    turned = ftlm.equation("; ".join(reversed(WORDS.split("; "))))
+    assert turned.sticks == 1
+    t = np.arange(401) * 0.01
+    run = run_of(force(t), 0 * t, 0 * t, 0.01)
+    first = ftlm.Model(ftlm.equation(WORDS, fixed={**TRUTH, "fc": 4.0})).simulate(run)
+    second = ftlm.Model(ftlm.equation("; ".join(reversed(WORDS.split("; "))), fixed={**TRUTH, "fc": 4.0})).simulate(run)
+    for name in ("x", "q"):
+        np.testing.assert_allclose(first[name], second[name], atol=1e-10)
+    # Against events, by the natural call.
+    angles, _ = friction.hub_and_link(force, t, HUB, LINK, 4.0)
+    for name, exact in zip(("x", "q"), angles, strict=True):
+        assert np.max(np.abs(first[name] - exact)) < 1e-3 * np.max(np.abs(exact))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: ftlm.equation(WORDS, coupling="measured"), "coupling='simulated'"),
+        (
+            lambda: ftlm.equation("D^2 x = q + u - 1*sign(D x); D^2 q = x - q - 2*sign(D q)"),
+            "equations of x and q have friction",
+        ),
+        (lambda: ftlm.equation(WORDS.replace("a q", "a D^2 q")), "order 2 of q is not below alpha"),
+        (lambda: ftlm.flexible_link(form="published", coupling="simulated", friction=True), "form='lagrange'"),
+        (lambda: ftlm.flexible_link(stage="both", coupling="simulated", friction=True), "one stage"),
+    ],
+)
+def test_what_is_not_followed_is_refused(make, said: str) -> None:
+    with pytest.raises(ModelError, match=said):
+        make()
+
+
+def test_highest_orders_that_cancel_are_refused() -> None:
+    # D^2 q = - D^2 x and D^2 x = - D^2 q + …: of a body that may stick the latter is refused, of two others the matrix.
+    three = "D^2 x = q + u - 1*sign(D x); D^2 q = D^2 p - q; D^2 p = D^2 q - 2 p + x"
+    t = np.arange(101) * 0.01
+    run = ftlm.Run.from_arrays(step=0.01, inputs={"u": force(t)}, outputs={"x": 0 * t, "q": 0 * t, "p": 0 * t})
+    with pytest.raises(ModelError, match="leading matrix of the equations is singular"):
+        ftlm.Model(ftlm.equation(three)).simulate(run)
+
+
+def test_a_file_keeps_it(tmp_path) -> None:
+    structure = ftlm.flexible_link(coupling="simulated", friction=True)
+    orders = {"alpha1": 1.95, "gamma1": 0.97, "beta2": 0.05, "mu2": 0.9}
+    values = {"a1": 628.0, "b1": -62.0, "d1": 2.0, "g1": 140.0, "fc1": 12.0, "a2": -235.5, "d2": -0.75}
+    model = ftlm.Model(structure.with_orders(orders).with_coefficients(values), orders=orders)
+    again = ftlm.load_model(model.save(tmp_path / "arm.json"))
+    t = np.arange(301) * 0.008
+    run = ftlm.Run.from_arrays(
+        step=0.008, inputs={"I1": 0.5 * np.sign(np.sin(3.0 * t))}, outputs={"theta11": 0 * t, "theta12": 0 * t}
+    )
+    there, back = model.simulate(run), again.simulate(run)
+    assert np.ptp(there["theta11"]) > 0.05
+    for name in ("theta11", "theta12"):
+        assert np.array_equal(there[name], back[name])
+    assert again.compare(there).fit_percent["theta12"] > 99.99
+
+
+# ----------------------------------------------------------------------------------------------------------- estimates
+
+
+def sampled_arm(seed: int, *, offset: float = 0.0, start=(0.0, 0.0, 0.0, 0.0)) -> ftlm.Run:
+    """The hub and its link under two sinusoids, between events, with 0.3 % of white noise."""
+    rng = np.random.default_rng(seed)
+    times, phases = np.arange(601) * 0.01, rng.uniform(0.0, 2.0 * np.pi, 2)
+
+    def pulled(t):
+        return 6.0 * np.sin(2.1 * t + phases[0]) + 3.0 * np.sin(5.3 * t + phases[1])
+
+    angles, _ = friction.hub_and_link(lambda t: pulled(t) + offset, times, HUB, LINK, 4.0, start=start)
+    angles += 0.003 * np.std(angles, axis=1)[:, None] * rng.standard_normal(angles.shape)
+    return run_of(pulled(times), *angles, 0.01, f"arm {seed}")
+
+
+def near(found, truth) -> None:
+    for name, value in truth.items():
+        assert abs(found.coefficients[name] - value) < 4.0 * found.standard_errors[name], name
+
+
+@pytest.mark.parametrize("seed", [4, pytest.param(6, marks=pytest.mark.slow)])
+def test_both_bodies_are_recovered(seed: int) -> None:
+    found = ftlm.identify(sampled_arm(seed), ftlm.equation(WORDS, initial="rest"), threads=1)
+    near(found, {**TRUTH, "fc": 4.0})
+    assert found.intervals["fc"][1] - found.intervals["fc"][0] < 0.02
+    assert min(found.fit_percent.values()) > 99.5
+    assert found.warnings == ()
+
+
+@pytest.mark.slow
+def test_several_runs_in_motion_with_offsets() -> None:
+    runs = [
+        sampled_arm(0, offset=0.5, start=(0.2, 0.8, 0.02, -0.1)),
+        sampled_arm(1, offset=-0.3, start=(0.0, 0.0, 0.03, 0.0)),
+    ]
+    found = ftlm.identify(runs, ftlm.equation(WORDS, initial="caputo", offset="constant"), threads=1)
+    near(found, {**TRUTH, "fc": 4.0})
+    np.testing.assert_allclose([o["x"]["constant"] for o in found.comparison.offsets], [0.5, -0.3], atol=0.02)
+
+
+@pytest.mark.slow
+def test_the_arm_is_identified_by_the_natural_call() -> None:
+    orders = {"alpha1": 1.95, "gamma1": 0.95, "beta2": 0.08, "mu2": 0.85}
+    free = {"a1": 628.0, "b1": -62.0, "d1": 2.0, "g1": 140.0, "fc1": 12.0, "j1": 0.375}
+    structure = ftlm.flexible_link(coupling="simulated", friction=True)
+    values = {**free, "a2": -628.0 * 0.375, "d2": -2.0 * 0.375}
+    model = ftlm.Model(
+        structure.with_orders(orders).with_coefficients({n: values[n] for n in structure.coefficient_names}),
+        orders=orders,
+    )
+    t, rng = np.arange(1501) * 0.004, np.random.default_rng(0)
+    current = 0.35 * np.sign(np.sin(2.1 * t)) + 0.3 * np.sin(5.3 * t + 0.4)
+    zeros = {"theta11": 0 * t, "theta12": 0 * t}
+    clean = model.simulate(ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=zeros))
+    noisy = {n: clean[n] + 0.003 * np.std(clean[n]) * rng.standard_normal(t.size) for n in zeros}
+    run = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy)
+    found = ftlm.identify(run, structure, threads=1).joint
+    for name, value in zip(found.names, found.values.tolist(), strict=True):
+        assert abs(value - {**orders, **free}[name]) < 4.0 * found.standard_errors[name], name
+
+
+def test_a_hub_that_never_moves_is_refused() -> None:
+    rng, t = np.random.default_rng(0), np.arange(400) * 0.01
+    run = run_of(np.sin(t), 1e-3 * rng.standard_normal(400), 0.1 * np.sin(9.0 * t), 0.01)
+    with pytest.raises(DataError, match="x never moves"):
+        ftlm.identify(run, ftlm.equation(WORDS, initial="caputo"))
+
+
+@pytest.mark.slow
+def test_a_hub_that_slides_one_way_does_not_tell_friction_from_an_offset() -> None:
+    times = np.arange(301) * 0.01
+
+    def pulled(t):
+        return 9.0 + 3.0 * np.sin(4.0 * t)
+
+    angles, v = friction.hub_and_link(pulled, times, HUB, LINK, 3.0)
+    assert np.all(v >= 0.0)
+    angles += 1e-3 * np.random.default_rng(0).standard_normal(angles.shape)
+    words = WORDS.replace("a q + d D q - b D x", "30 q + 0.4 D q - 1.5 D x").replace("k q - e D q", "90 q - 1.2 D q")
+    found = ftlm.identify(
+        run_of(pulled(times), *angles, 0.01), ftlm.equation(words, initial="rest", offset="constant"), threads=1
+    )
+    assert any("velocity of x never changes its sign" in w for w in found.warnings)

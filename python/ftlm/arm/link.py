@@ -164,9 +164,9 @@ def flexible_link(
         these terms are of the order of their equation, alpha_2, alpha_3 or alpha_4.
     friction
         Adds Coulomb friction to the hub's equation. With ``coupling="simulated"``, in the Lagrange form, it is
-        - fc_j * sign(D theta_j1) of the velocity that the model itself gives, set-valued at rest (:class:`Friction`), for
-        one stage, by output error: the hub sticks and slips while its link rings. With measured coupling it is a linear
-        term c * coulomb_theta_j1 of the sign of the measured velocity, in the published form of both equations.
+        - fc_j * sign(D theta_j1) of the velocity that the model itself gives, set-valued at rest (:class:`Friction`),
+        for one stage, by output error: the hub sticks and slips while its link rings. With measured coupling it is a
+        linear term c * coulomb_theta_j1 of the sign of the measured velocity, in the published form of both equations.
     cross_sensitivity
         Adds hub angles as they are (order 0) to the deflection's equation: strain gauges and cables make a measured
         deflection follow the hub's angle. e_2 theta_11 in that of theta_12, and with ``cross_stage="inertial"``
@@ -225,9 +225,9 @@ def flexible_link(
         coupling = "measured" if form == "lagrange" else "simulated"
     if friction and coupling == "simulated" and (form != "lagrange" or stage == "both"):
         raise ModelError(
-            "friction=True with coupling='simulated' follows the hub of one stage of form='lagrange', where it does not "
-            "enter the link's equation; name the stage and that form, or use coupling='measured', whose friction has "
-            "the sign of the measured velocity"
+            "friction=True with coupling='simulated' follows the hub of one stage of form='lagrange', where it does "
+            "not enter the link's equation; name the stage and that form, or use coupling='measured', whose friction "
+            "has the sign of the measured velocity"
         )
     if not hub and (form != "lagrange" or coupling == "simulated" or friction):
         raise ModelError(

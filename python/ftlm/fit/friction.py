@@ -71,7 +71,7 @@ def race_with_friction(
 
 
 def carrying(problem: FreeProblem, runs: Sequence[Run], values: dict[str, float]) -> list[Attempt]:
-    """Starts of a body by itself, with what hangs on it put back as action and reaction ask for, some shares of inertia.
+    """Starts of a body by itself, with what hangs on it put back as action and reaction ask for, shares of its inertia.
 
     The others are as they are when the measured body drives them; the body itself, driven by measured others, may be
     explained by what they tell of its motion, without what drives it and without friction.
@@ -104,7 +104,7 @@ def carrying(problem: FreeProblem, runs: Sequence[Run], values: dict[str, float]
 
 
 def reacting(structure: Structure, values: dict[str, float], share: float) -> dict[str, float]:
-    """Coefficients by which others act on the body: against what moves them, by so much of their inertia over its own."""
+    """Coefficients by which others act on the body: against what moves them, by their inertia over its own."""
     item = structure.equations[structure.sticks]
     out: dict[str, float] = {}
     for other in structure.equations:
@@ -180,7 +180,7 @@ def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str)
         # Without any friction it runs away.
         return out
     values = {**values, **dict(zip(linear.names, without.values.tolist(), strict=True))}
-    force = driving(coarse.runs, known(linear, values))
+    force = driving(coarse.runs, identified_body(linear, values))
     for share in SHARES if force > 0 else ():
         strength = share * force / -rubs.factor
         out.append(at(problem, {**values, name: strength}, f"{origin}, friction {share:g} of what drives"))
@@ -195,7 +195,8 @@ def falling(coarse: Grid, values: dict[str, float], more: Stribeck, origin: str)
         abs(rubs.factor) * values.get(str(rubs.coefficient), 0.0) if rubs is not None and rubs.strength is None else 0.0
     )
     fc = fc or (0.0 if rubs is None else rubs.strength or 0.0)
-    size = fc or driving(coarse.runs, known(FreeProblem.of(with_friction(problem.structure, UNSET)), values))
+    plain = FreeProblem.of(with_friction(problem.structure, UNSET))
+    size = fc or driving(coarse.runs, identified_body(plain, values))
     pace = speed_of(coarse)
     forces = (
         [(NEAR[0], None)] if not isinstance(more.coefficient, str) else [(n, n * size / -more.factor) for n in NEAR]
@@ -223,7 +224,7 @@ def at(problem: FreeProblem, values: dict[str, float], origin: str) -> Attempt:
     return Attempt(orders, coefficients, origin, {}, inputs)
 
 
-def known(problem: FreeProblem, values: dict[str, float]) -> Equation:
+def identified_body(problem: FreeProblem, values: dict[str, float]) -> Equation:
     """The equation of the body that may stick, without its friction, at named values."""
     structure = problem.structure
     coefficients = problem.named([values[n] for n in problem.coefficients])

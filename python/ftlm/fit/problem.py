@@ -131,7 +131,7 @@ class FreeProblem:
         ]  # fmt: skip
 
     def strength(self) -> list[tuple[float, list[tuple[int, int]]]]:
-        """Numbers fc, fs and vs of the friction of the equation that has some, as monomials in the free coefficients."""
+        """Numbers fc, fs and vs of the friction of the body that may stick, as monomials in the free coefficients."""
         rubs = self.structure.equations[self.structure.sticks].friction or Friction(0.0)
         more = rubs.stribeck or Stribeck(0.0, 1.0)
 

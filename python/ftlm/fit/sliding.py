@@ -26,8 +26,8 @@ def slid(runs: Sequence[Run], alone: Structure) -> dict[str, float]:
     """Coefficients of one equation with friction, its orders numbers, that explain its integrals on all runs best.
 
     Own terms pull back and friction brakes; what drives has any sign. The sign of the velocity is that of the measured
-    one where it stands out of its noise, elsewhere the body rests, and friction is what drives it. Each run has a level,
-    a velocity and a constant of its own.
+    one where it stands out of its noise, elsewhere the body rests, and friction is what drives it. Each run has a
+    level, a velocity and a constant of its own.
 
     Returns
     -------
@@ -67,14 +67,17 @@ def _regressors(run: Run, alone: Structure) -> _Part:
     gone = means[pace:] - means[:-pace]
     gone = np.concatenate([gone[:1].repeat(pace // 2), gone, gone[-1:].repeat(pace - pace // 2)])
     sign = np.where(np.abs(gone) > SEEN * noise_of(read(run[item.output])), np.sign(gone), 0.0)
-    drives = {k: rec.of(t.signal) for k, t in enumerate(item.terms) if t.signal != item.output and t.order.constant == 0.0}
+    drives = {
+        k: rec.of(t.signal) for k, t in enumerate(item.terms) if t.signal != item.output and t.order.constant == 0.0
+    }
     return integrals, means, sign, drives, rec.step
 
 
 def _integral(means: Floats, step: float, order: float) -> Floats:
     """Pulse means of the integral of this order, above 0."""
     signals = np.stack([np.zeros_like(means), means])
-    return _core.respond((step, signals, None), [((0, order, [(1, 0.0)]), [1.0])], [False, True], [[]])[0]
+    found: Floats = _core.respond((step, signals, None), [((0, order, [(1, 0.0)]), [1.0])], [False, True], [[]])[0]
+    return found
 
 
 def _value(item: Equation, k: int, found: Mapping[str, float]) -> float:

@@ -27,9 +27,9 @@ def motion_with_friction(model: Solved, rec: Record, powers: Sequence[Sequence[t
     Returns
     -------
     dict
-        ``outputs`` (pulse means, a row an equation), of the body with friction ``velocity`` (at the edges of the pulses,
-        one more; exactly 0 at rest), ``force`` (mean of the friction over each pulse, in the unit of D^alpha y) and
-        ``stuck`` (whether it is at rest at the end of each).
+        ``outputs`` (pulse means, a row an equation), of the body with friction ``velocity`` (at the edges of the
+        pulses, one more; exactly 0 at rest), ``force`` (mean of the friction over each pulse, in the unit of
+        D^alpha y) and ``stuck`` (whether it is at rest at the end of each).
     """
     equations = [(linear_tuple(e, rec.signals), [float(t.fixed or 0.0) for t in e.terms]) for e in model.equations]
     sticks = model.structure.sticks
@@ -78,14 +78,17 @@ def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | 
 def known_law(item: Equation, signals: Sequence[str]) -> tuple[int, tuple[float, list[float]], list[Any]]:
     """An identified equation as the core takes one in which everything might be free."""
     output, alpha, terms = linear_tuple(item, signals)
-    numbers = [(s, (order, []), (float(t.fixed or 0.0), [])) for (s, order), t in zip(terms, item.terms, strict=True)]
+    numbers: list[Any] = [
+        (s, (order, []), (float(t.fixed or 0.0), [])) for (s, order), t in zip(terms, item.terms, strict=True)
+    ]
     return output, (alpha, []), numbers
 
 
 def check_regular(run: Run, model: Solved) -> None:
     """Refuse samples at times of their own."""
     if has_own_times(run, model.structure):
+        output = model.outputs[model.structure.sticks]
         raise ModelError(
-            f"run {run.name!r} has rows at times of their own, and the equation of {model.outputs[model.structure.sticks]} has friction, "
+            f"run {run.name!r} has rows at times of their own, and the equation of {output} has friction, "
             "which is followed at regular times; resample the run yourself"
         )
