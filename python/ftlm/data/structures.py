@@ -279,8 +279,8 @@ class Structure:
         if len(self.equations) > 1 and self.coupling == "measured":
             raise ModelError(
                 f"{words}, and the structure {len(self.equations)} equations with measured coupling: driven by "
-                f"measured signals they share no free run, so give that of {rubbing[0]} a structure of its own, or follow "
-                "them together with coupling='simulated'"
+                f"measured signals they share no free run, so give that of {rubbing[0]} a structure of its own, or "
+                "follow them together with coupling='simulated'"
             )
         if self.sensor_filter is not None:
             raise ModelError(
