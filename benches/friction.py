@@ -1,8 +1,10 @@
 """A body that sticks, measured: recovery with intervals, cost of a free run, hubs of real arms.
 
 ``python benches/friction.py recovery [--seeds 20]``, ``stribeck [--seeds 20]``, ``speed``, ``measured``,
-``measured-stribeck``. Truth of the recovery is a cart in closed form between its events (tests/python/friction.py) with
-offsets a run, that of ``stribeck`` a sledge on a spring that sticks and slips; real runs are those of ``FTLM_DATA``.
+``measured-stribeck``, ``coupled [--seeds 20]``, ``coupled-measured``. Truth of the recovery is a cart in closed form
+between its events (tests/python/friction.py) with offsets a run, that of ``stribeck`` a sledge on a spring that sticks
+and slips, that of ``coupled`` a hub that sticks with a link that rings, both followed from the current alone; real runs
+are those of ``FTLM_DATA``.
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import argparse
 import statistics
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +35,9 @@ RUBS = " - fc*sign(D theta11)"
 FALLS = " - fs*exp(-(D theta11/vs)^2)*sign(D theta11)"
 SLEDGE = "D^2 y = - v D y - k y + g u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)"
 STICKS = {"v": 0.5, "k": 4.0, "g": 4.0, "fc": 0.5, "fs": 0.5, "vs": 0.2}
+#: A hub with a link: both from what drives the hub.
+ARM = "D^2 x = a q + d D q - b D x + g u - fc*sign(D x); D^2 q = - 1 D^2 x - k q - e D q"
+ARM_TRUTH = {"a": 30.0, "d": 0.4, "b": 1.5, "g": 1.0, "fc": 4.0, "k": 90.0, "e": 1.2}
 #: Steps that are fitted; the amplifier of the arm clips its command at a limit that the fit is left to find.
 FITTED = ("30", "20", "minus10", "minus20")
 JUDGED = ("10", "minus30", "0_return", "5", "minus5")
@@ -108,14 +114,64 @@ def stribeck(seeds: int) -> None:
               flush=True)  # fmt: skip
 
 
+def arm(seed: int, noise: float, *, offset: float = 0.0, start: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)) -> ftlm.Run:
+    """A hub on dry friction that carries a link, between its events."""
+    rng = np.random.default_rng(seed)
+    times, phases = np.arange(601) * 0.01, rng.uniform(0.0, 2.0 * np.pi, 2)
+
+    def pulled(t: Any) -> Any:
+        return 6.0 * np.sin(2.1 * t + phases[0]) + 3.0 * np.sin(5.3 * t + phases[1])
+
+    angles, _ = friction.hub_and_link(
+        lambda t: pulled(t) + offset, times, (30.0, 0.4, -1.5), (90.0, 1.2), 4.0, start=start
+    )
+    angles += noise * np.std(angles, axis=1)[:, None] * rng.standard_normal(angles.shape)
+    return ftlm.Run.from_arrays(step=0.01, inputs={"u": pulled(times)}, outputs={"x": angles[0], "q": angles[1]},
+                                intersample={"u": "foh"}, name=f"arm {seed}")  # fmt: skip
+
+
+def coupled(seeds: int) -> None:
+    """Coverage of 95 % intervals of a hub that sticks and its link: one run from rest, two in motion with offsets."""
+    for noise, moving in ((0.003, False), (0.02, False), (0.003, True)):
+        more = {"initial": "caputo", "offset": "constant"} if moving else {"initial": "rest"}
+        scores, inside, taken = [], [], []
+        for seed in range(seeds):
+            runs = [arm(seed, noise)]
+            if moving:
+                pairs = ((0.5, (0.2, 0.8, 0.02, -0.1)), (-0.3, (0.0, 0.0, 0.03, 0.0)))
+                runs = [arm(2 * seed + k, noise, offset=o, start=s) for k, (o, s) in enumerate(pairs)]
+            begun = time.process_time()
+            found = ftlm.identify(runs, ftlm.equation(ARM, **more), threads=1)
+            taken.append(time.process_time() - begun)
+            scores.append([(found.coefficients[n] - v) / found.standard_errors[n] for n, v in ARM_TRUTH.items()])
+            inside.append([found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in ARM_TRUTH.items()])
+        z = np.array(scores)
+        counts = ", ".join(f"{n} {c}" for n, c in zip(ARM_TRUTH, np.sum(inside, axis=0), strict=True))
+        kind = "two runs in motion, offsets" if moving else "one run from rest"
+        print(f"| {noise:g} | {kind} | {counts} of {seeds} | "
+              f"{np.abs(z).max():.2f} | {statistics.median(taken):.2g} |", flush=True)  # fmt: skip
+
+
+def coupled_measured() -> None:
+    """Hub and link of the real arm from the current alone, with friction and without, fitted on one unit."""
+    runs = {
+        "psf": run_of(DATA / "two_link_psf" / "psf.csv", "Im1_meas_A", name="psf", slice=(1.1, 19.5)),
+        "lqr": run_of(DATA / "two_link_lqr" / "lqr.csv", "Im1_meas_A", name="lqr"),
+    }
+    whole = {"alpha1": 2.0, "gamma1": 1.0, "beta2": 0.0, "mu2": 1.0}
+    for rubs in (False, True):
+        arm1 = ftlm.flexible_link(coupling="simulated", friction=rubs, offset="constant").with_orders(whole)
+        told(replace(arm1, initial="caputo"), [runs["psf"]], runs)
+
+
 def speed() -> None:
     """A free run of order 1.8 with friction, at one strength and falling, beside the linear one."""
     rng = np.random.default_rng(0)
     equation = (0, 1.8, [(0, 0.9), (1, 0.0)])
     for m in (1 << 11, 1 << 14, 1 << 17):
         record = (1e-3, np.stack([np.zeros(m), rng.normal(size=m)]), None)
-        rubs = timed(partial(_core.friction_respond, record, equation, [-3.0, 1.0], (0.5, 0.0, 1.0), []))
-        falls = timed(partial(_core.friction_respond, record, equation, [-3.0, 1.0], (0.5, 0.3, 0.01), []))
+        rubs = timed(partial(_core.friction_respond, record, [(equation, [-3.0, 1.0])], 0, (0.5, 0.0, 1.0), [[]]))
+        falls = timed(partial(_core.friction_respond, record, [(equation, [-3.0, 1.0])], 0, (0.5, 0.3, 0.01), [[]]))
         plain = timed(partial(_core.respond, record, [(equation, [-3.0, 1.0])], [False, True], [[]]))
         print(f"| {m} | {1e3 * rubs:.1f} | {rubs / plain:.1f} | {falls / plain:.1f} |", flush=True)
 
@@ -179,7 +235,7 @@ def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm
     begun = time.process_time()
     found = ftlm.identify(fitted, structure, threads=1)
     taken = time.process_time() - begun
-    values = {**found.coefficients, **found.limits}
+    values = {n: v for n, v in {**found.coefficients, **found.limits}.items() if n in found.standard_errors}
     numbers = ", ".join(f"{n} {v:.4g} ± {found.standard_errors[n]:.2g}" for n, v in values.items())
     names = {run.name for run in fitted}
     print(f"{structure}: {numbers}; {taken:.2g} s", flush=True)
@@ -187,19 +243,24 @@ def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm
         print(f"    ! {warning}", flush=True)
     for name, run in runs.items():
         there = found.model.compare(run)
-        print(f"    {name} {'fitted' if name in names else 'judged'}: {there.fit_percent['theta11']:.2f}, "
+        fits = ", ".join(f"{n} {v:.2f}" for n, v in there.fit_percent.items())
+        print(f"    {name} {'fitted' if name in names else 'judged'}: {fits}, "
               f"offset {there.offsets[0]['theta11']['constant']:+.3f}", flush=True)  # fmt: skip
+
+
+WHAT = ("recovery", "stribeck", "speed", "measured", "measured-stribeck", "coupled", "coupled-measured")
 
 
 def main() -> None:
     """Run what is asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=("recovery", "stribeck", "speed", "measured", "measured-stribeck"))
+    parser.add_argument("what", choices=WHAT)
     parser.add_argument("--seeds", type=int, default=20)
     asked = parser.parse_args()
     {
         "recovery": lambda: recovery(asked.seeds), "stribeck": lambda: stribeck(asked.seeds), "speed": speed,
-        "measured": measured, "measured-stribeck": measured_stribeck,
+        "measured": measured, "measured-stribeck": measured_stribeck, "coupled": lambda: coupled(asked.seeds),
+        "coupled-measured": coupled_measured,
     }[asked.what]()  # fmt: skip
 
 

@@ -225,21 +225,22 @@ def output_error(
 def grows(alpha: float, own_terms: Sequence[tuple[float, float]]) -> bool: ...
 
 class _Motion(TypedDict):
-    output: _Vector
+    outputs: _Matrix
     velocity: _Vector
     force: _Vector
     stuck: Any
 
 def friction_respond(
     run: _Record,
-    equation: _Structure,
-    coefficients: Sequence[float],
+    equations: Sequence[_Equation],
+    sticks: int,
     strength: tuple[float, float, float],
-    terms: Sequence[tuple[float, float]],
+    terms: Sequence[Sequence[tuple[float, float]]],
 ) -> _Motion: ...
 def friction_error(
     runs: Sequence[_Experiment],
-    law: _FreeEquation,
+    laws: Sequence[_FreeEquation],
+    sticks: int,
     strength: Sequence[_Monomial],
     order_bounds: Sequence[tuple[float, float]],
     names: Sequence[str],

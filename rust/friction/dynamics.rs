@@ -1,26 +1,30 @@
-//! The body between its inputs and its friction: operators on pulse means, velocities at the edges of pulses, free runs.
+//! Bodies between their inputs and the friction of one: operators on pulse means, velocities at the edges of pulses, free
+//! runs.
 //!
-//! The output follows from the equation as every linear free run does, friction being one more input once it is known. The velocity obeys the same equation, all that drives it differentiated once. At an edge it is what the pulses
-//! before it add up to there, exactly for what is constant within each.
+//! The outputs follow from the equations as every linear free run does, friction being one more input once it is known. The
+//! velocities obey the same equations, all that drives them differentiated once. At an edge the velocity of the body that
+//! may stick is what the pulses before it add up to there, exactly for what is constant within each.
 
+use super::integrals::{edge_kernel, product, Driver, Integrated};
 use super::law::{Law, Phase};
 use super::march::March;
 use super::online::Heads;
-use super::states::Forcing;
-use crate::equation::{Structure, ORDER_GRAIN};
+use super::states::{Forcing, Link};
+use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, Error, Result};
-use crate::excess::kernel_and_slope;
-use crate::kernels::digamma;
+use crate::excess::{kernel_and_slope, MAX_EXCESS};
 use crate::regressors::Record;
-use crate::series::{divide, reciprocal, Buffers, Kernel};
+use crate::regularity::check_regular;
+use crate::series::{self, reciprocal, Kernel, Solver};
+use crate::small;
 
-/// An equation with friction of its own output's velocity.
+/// Equations that follow each other's outputs, one of them with friction of its own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Body {
-    /// D^α y = Σ c D^ν s, 1 < α ≤ 2; orders of every signal below α.
-    pub structure: Structure,
-    /// One coefficient a term.
-    pub coefficients: Vec<f64>,
+    /// D^α y = Σ c D^ν s; of the one with friction 1 < α ≤ 2, and orders of every signal below α.
+    pub equations: Vec<Equation>,
+    /// Which of them has friction.
+    pub sticks: usize,
     /// F of − F(Dy) sgn(Dy).
     pub friction: Law,
 }
@@ -28,31 +32,52 @@ pub struct Body {
 /// A free run.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Motion {
-    /// Pulse means of the output.
-    pub output: Vec<f64>,
-    /// Velocity at the edges of the pulses, one more than there are pulses; exactly 0 at rest.
+    /// Pulse means of each equation's output.
+    pub outputs: Vec<Vec<f64>>,
+    /// Velocity of the body that may stick at the edges of the pulses, one more than there are pulses; exactly 0 at rest.
     pub velocity: Vec<f64>,
-    /// Mean of the friction over each pulse, in the unit of D^α y.
+    /// Mean of the friction over each pulse, in the unit of its D^α y.
     pub force: Vec<f64>,
     /// What the body did in each pulse.
     pub phases: Vec<Phase>,
 }
 
 impl Body {
+    /// One equation by itself.
+    #[must_use]
+    pub fn alone(equation: Equation, friction: Law) -> Self {
+        Self { equations: vec![equation], sticks: 0, friction }
+    }
+
     /// Refuses orders that this law does not know, and coefficients that are no numbers.
     ///
     /// # Errors
     /// [`Error::OutOfRange`], [`Error::Structure`], [`Error::Length`], [`Error::NotFinite`].
     pub fn check(&self, signals: usize) -> Result<()> {
-        self.structure.check(signals, |_| true)?;
-        check_length("coefficients", self.structure.terms.len(), self.coefficients.len())?;
-        check_finite("coefficients", &self.coefficients)?;
-        let Law { coulomb, stribeck, speed } = self.friction;
-        check_finite("friction", &[coulomb, stribeck, speed])?;
         let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
             Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
         };
-        let alpha = self.structure.order;
+        let Some(own) = self.equations.get(self.sticks) else {
+            return Err(Error::Length {
+                name: "equations".into(),
+                expected: self.sticks + 1,
+                found: self.equations.len(),
+            });
+        };
+        for (i, Equation { structure, coefficients }) in self.equations.iter().enumerate() {
+            structure.check(signals, |_| true)?;
+            check_length("coefficients", structure.terms.len(), coefficients.len())?;
+            check_finite("coefficients", coefficients)?;
+            if self.equations[..i].iter().any(|e| e.structure.output == structure.output) {
+                return Err(Error::Structure {
+                    what: format!("two equations have signal {} as their output", structure.output),
+                    remedy: "give one equation an output".into(),
+                });
+            }
+        }
+        let Law { coulomb, stribeck, speed } = self.friction;
+        check_finite("friction", &[coulomb, stribeck, speed])?;
+        let alpha = own.structure.order;
         if !(alpha > 1.0 && alpha <= 2.0) {
             return refuse("order of a body with friction", alpha, "(1, 2]", "a velocity needs inertia");
         }
@@ -62,208 +87,240 @@ impl Body {
         if speed <= 0.0 {
             return refuse("speed of Stribeck friction", speed, "(0, ∞)", "it is the speed at which friction falls");
         }
-        match self.structure.terms.iter().find(|t| t.order >= alpha - ORDER_GRAIN) {
-            Some(term) => refuse("order beside friction", term.order, "below that of the body", "lower it"),
-            None => Ok(()),
+        for (i, Equation { structure, .. }) in self.equations.iter().enumerate() {
+            // What drives another body must not jump in its velocity; other bodies may lean on accelerations.
+            let above = |order: f64| order >= structure.order - ORDER_GRAIN;
+            let wrong = |signal: usize| i == self.sticks || self.place(signal).is_none();
+            match structure.terms.iter().find(|t| above(t.order) && wrong(t.signal)) {
+                Some(term) if i == self.sticks => {
+                    return refuse("order beside friction", term.order, "below that of the body", "lower it")
+                }
+                Some(term) => {
+                    return refuse("order of what drives a body", term.order, "below that of the body", "lower it")
+                }
+                None => {}
+            }
         }
+        check_regular(&self.equations)
     }
 
-    /// Free run with given initial terms, (exponent, coefficient) pairs of powers of t. O(m log² m).
+    /// Which equation a signal is the output of.
+    pub(super) fn place(&self, signal: usize) -> Option<usize> {
+        self.equations.iter().position(|e| e.structure.output == signal)
+    }
+
+    /// Free run with given initial terms, (exponent, coefficient) pairs of powers of t by equation. O(n² m log² m).
     ///
     /// # Errors
-    /// As [`Body::check`]; [`Error::Diverged`] where the run leaves the range of numbers.
+    /// As [`Body::check`]; [`Error::Diverged`] where the run leaves the range of numbers, [`Error::LeadingZero`] where the
+    /// grid makes the equations unsolvable.
     ///
     /// ```
-    /// use ftlm::equation::{Structure, Term};
+    /// use ftlm::equation::{Equation, Structure, Term};
     /// use ftlm::friction::{Body, Law};
     /// use ftlm::regressors::Record;
     /// # fn main() -> ftlm::error::Result<()> {
     /// // A block slides at 1 m/s on friction of 2 m/s²: it stops after half a second, 0.25 m on, and stays.
     /// let structure = Structure { output: 0, order: 2.0, terms: vec![Term { signal: 1, order: 0.0 }] };
-    /// let block = Body { structure, coefficients: vec![1.0], friction: Law::coulomb(2.0) };
+    /// let block = Body::alone(Equation::new(structure, vec![1.0])?, Law::coulomb(2.0));
     /// let run = Record::new(0.01, vec![vec![0.0; 100], vec![0.0; 100]], None)?;
-    /// let motion = block.run(&run, &[(1.0, 1.0)])?;
+    /// let motion = block.run(&run, &[vec![(1.0, 1.0)]])?;
     /// assert!((motion.velocity[25] - 0.5).abs() < 1e-12 && motion.velocity[50..].iter().all(|v| v.abs() < 1e-12));
-    /// assert!((motion.output[99] - 0.25).abs() < 1e-9);
+    /// assert!((motion.outputs[0][99] - 0.25).abs() < 1e-9);
     /// # Ok(())
     /// # }
     /// ```
-    pub fn run(&self, record: &Record, initial: &[(f64, f64)]) -> Result<Motion> {
+    pub fn run(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Motion> {
         self.check(record.len())?;
-        let (exponents, values): (Vec<f64>, Vec<f64>) = initial.iter().copied().unzip();
-        check_finite("coefficients of the initial terms", &values)?;
-        crate::equation::Initial::Powers(exponents).check()?;
-        let forcing = Forcing::of(initial, &self.own(), record.m(), record.step());
-        let run = Run::new(self, &Operators::new(self, record), &forcing)?;
-        Ok(Motion { output: run.output, velocity: run.march.edges, force: run.march.force, phases: run.march.phases })
-    }
-
-    /// Integration and coefficient of each own term.
-    pub(super) fn own(&self) -> Vec<(f64, f64)> {
-        let structure = &self.structure;
-        (structure.terms.iter().zip(&self.coefficients))
-            .filter(|(term, _)| term.signal == structure.output)
-            .map(|(term, &c)| (structure.order - term.order, c))
-            .collect()
-    }
-}
-
-/// What pulses of a signal give at the ends of pulses, integrated by η > 0, and its derivative with respect to η.
-#[allow(clippy::cast_precision_loss)]
-fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>) {
-    let scale = libm::pow(step, eta) / libm::tgamma(eta + 1.0);
-    let turn = libm::log(step) - digamma(eta + 1.0);
-    (0..m)
-        .map(|n| {
-            // (n + 1)^η − n^η without the cancellation.
-            let (value, slope) = if n == 0 {
-                (1.0, 0.0)
-            } else {
-                let (n, near) = (n as f64, libm::log1p(1.0 / n as f64));
-                let (power, grown) = (libm::pow(n, eta), libm::expm1(eta * near));
-                (power * grown, power * (libm::log(n) * grown + near * (grown + 1.0)))
-            };
-            (scale * value, scale * (value * turn + slope))
-        })
-        .unzip()
-}
-
-/// Below this integration a signal shows at an edge as the pulses on either side have it.
-const SEEN_AT_ONCE: f64 = 1e-6;
-
-/// A signal integrated as its term asks on all three levels, or the slope of that with respect to the order.
-#[derive(Debug, Clone)]
-pub(super) struct Integrated {
-    pub(super) output: Vec<f64>,
-    pub(super) velocity: Vec<f64>,
-    pub(super) edges: Vec<f64>,
-}
-
-/// Kernels of a signal that drives the body, integrated by η on the level of the output: values and slopes.
-pub(super) struct Driver {
-    output: [Vec<f64>; 2],
-    velocity: [Vec<f64>; 2],
-    edges: Option<[Vec<f64>; 2]>,
-}
-
-impl Driver {
-    fn new(eta: f64, m: usize, step: f64) -> Self {
-        let (output, velocity) = (kernel_and_slope(eta, m, step), kernel_and_slope(eta - 1.0, m, step));
-        let edges = (eta - 1.0 > SEEN_AT_ONCE).then(|| edge_kernel(eta - 1.0, m, step));
-        Self {
-            output: [output.0, output.1],
-            velocity: [velocity.0, velocity.1],
-            edges: edges.map(|(value, slope)| [value, slope]),
+        check_length("initial terms", self.equations.len(), initial.len())?;
+        for terms in initial {
+            let (exponents, values): (Vec<f64>, Vec<f64>) = terms.iter().copied().unzip();
+            check_finite("coefficients of the initial terms", &values)?;
+            Initial::Powers(exponents).check()?;
         }
+        let forcing = Forcing::of(initial, &self.links(), self.sticks, record.m(), record.step())?;
+        let run = Run::new(self, &Operators::new(self, record)?, &forcing)?;
+        Ok(Motion { outputs: run.outputs, velocity: run.march.edges, force: run.march.force, phases: run.march.phases })
     }
 
-    /// The signal through the kernels (0) or their slopes (1).
-    pub(super) fn of(&self, signal: &Kernel, which: usize) -> Integrated {
-        let velocity = product(signal, &self.velocity[which]);
-        let edges = match &self.edges {
-            Some(kernels) => product(signal, &kernels[which]),
-            None => at_edges(&velocity),
+    /// Of each equation the terms of outputs that are followed.
+    pub(super) fn links(&self) -> Vec<Vec<Link>> {
+        let of = |Equation { structure, coefficients }: &Equation| {
+            (structure.terms.iter().zip(coefficients))
+                .filter_map(|(term, &coefficient)| {
+                    let (order, integration) = (term.order, structure.order - term.order);
+                    self.place(term.signal).map(|output| Link { output, order, integration, coefficient })
+                })
+                .collect()
         };
-        Integrated { output: product(signal, &self.output[which]), velocity, edges }
+        self.equations.iter().map(of).collect()
     }
 }
 
-/// A product with what was cached.
-pub(super) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
-    let mut out = vec![0.0; series.len()];
-    cached.apply(series, &mut out, &mut Buffers::default());
-    out
-}
-
-/// Values at the ends of the pulses from means: those on either side, the last extended.
-fn at_edges(means: &[f64]) -> Vec<f64> {
-    let m = means.len();
-    let mut out: Vec<f64> = means.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();
-    let last = means.last().copied().unwrap_or(0.0);
-    out.push(if m > 1 { 1.5 * last - 0.5 * means[m - 2] } else { last });
-    out
-}
-
-/// Everything linear about a body on a record.
+/// Everything linear about bodies on a record.
 pub(super) struct Operators {
-    /// Kernels and spectrum of each term's signal, where it is another than the output.
-    pub(super) drivers: Vec<Option<(Driver, Kernel)>>,
+    /// Kernels and spectrum of each term's signal, where it is no output that is followed, by equation.
+    pub(super) drivers: Vec<Vec<Option<(Driver, Kernel)>>>,
     /// Each driver's signal, integrated.
-    pub(super) driven: Vec<Option<Integrated>>,
-    /// Kernel of each own term on means and at edges, with slopes.
-    pub(super) own: Vec<Option<[Vec<f64>; 4]>>,
+    pub(super) driven: Vec<Vec<Option<Integrated>>>,
+    /// Kernel of each term of a followed output on means and, in the body's equation, at edges, with slopes.
+    pub(super) own: Vec<Vec<Option<[Vec<f64>; 4]>>>,
     /// A of A y = b.
-    divisor: Vec<f64>,
-    /// Spectrum of 1/A.
-    pub(super) inverse: Kernel,
-    /// Spectrum of the own terms at edges, together.
-    pub(super) own_edges: Kernel,
+    matrix: Vec<Vec<Vec<f64>>>,
+    /// Spectra of A⁻¹.
+    inverse: Vec<Vec<Kernel>>,
+    /// Inverse of A's leading coefficients.
+    leading: Vec<f64>,
+    /// Spectrum of what velocities of each output add to the body's at edges, where they add something.
+    edges: Vec<Option<Kernel>>,
     /// Kernels of friction.
     pub(super) friction: Driver,
     /// What a pulse of force does to the velocity at the ends of pulses.
     pub(super) response: Heads,
     pub(super) first: f64,
+    sticks: usize,
 }
 
 impl Operators {
-    pub(super) fn new(body: &Body, record: &Record) -> Self {
-        let (m, step, structure) = (record.m(), record.step(), &body.structure);
-        let mut divisor = vec![0.0; m];
-        divisor[0] = 1.0;
-        let mut own_edges = vec![0.0; m];
+    pub(super) fn new(body: &Body, record: &Record) -> Result<Self> {
+        let (m, step, n, sticks) = (record.m(), record.step(), body.equations.len(), body.sticks);
+        let mut matrix = vec![vec![vec![0.0; m]; n]; n];
+        let mut own_edges: Vec<Option<Vec<f64>>> = vec![None; n];
         let (mut drivers, mut driven, mut own) = (Vec::new(), Vec::new(), Vec::new());
-        for (term, &c) in structure.terms.iter().zip(&body.coefficients) {
-            let eta = structure.order - term.order;
-            if term.signal == structure.output {
-                let (means, edges) = (kernel_and_slope(eta, m, step), edge_kernel(eta, m, step));
-                divisor.iter_mut().zip(&means.0).for_each(|(a, v)| *a -= c * v);
-                own_edges.iter_mut().zip(&edges.0).for_each(|(e, v)| *e += c * v);
-                own.push(Some([means.0, means.1, edges.0, edges.1]));
-                drivers.push(None);
-                driven.push(None);
-            } else {
-                let (driver, signal) = (Driver::new(eta, m, step), Kernel::new(record.signal(term.signal)));
-                driven.push(Some(driver.of(&signal, 0)));
-                drivers.push(Some((driver, signal)));
-                own.push(None);
+        for (i, Equation { structure, coefficients }) in body.equations.iter().enumerate() {
+            matrix[i][i][0] = 1.0;
+            let (mut row_drivers, mut row_driven, mut row_own) = (Vec::new(), Vec::new(), Vec::new());
+            for (term, &c) in structure.terms.iter().zip(coefficients) {
+                let eta = structure.order - term.order;
+                if eta <= -MAX_EXCESS {
+                    // Reported like a step too far, so that a search shortens it.
+                    return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
+                }
+                if let Some(j) = body.place(term.signal) {
+                    let means = kernel_and_slope(eta, m, step);
+                    matrix[i][j].iter_mut().zip(&means.0).for_each(|(a, v)| *a -= c * v);
+                    let edges = if i == sticks { edge_kernel(eta, m, step) } else { (Vec::new(), Vec::new()) };
+                    if i == sticks {
+                        let sum = own_edges[j].get_or_insert_with(|| vec![0.0; m]);
+                        sum.iter_mut().zip(&edges.0).for_each(|(e, v)| *e += c * v);
+                    }
+                    row_own.push(Some([means.0, means.1, edges.0, edges.1]));
+                    row_drivers.push(None);
+                    row_driven.push(None);
+                } else {
+                    let driver = Driver::new(eta, m, step, i == sticks);
+                    let signal = Kernel::new(record.signal(term.signal));
+                    row_driven.push(Some(driver.of(&signal, 0)));
+                    row_drivers.push(Some((driver, signal)));
+                    row_own.push(None);
+                }
             }
+            drivers.push(row_drivers);
+            driven.push(row_driven);
+            own.push(row_own);
         }
-        let inverse = Kernel::new(&reciprocal(&divisor));
-        let own_edges = Kernel::new(&own_edges);
-        let friction = Driver::new(structure.order, m, step);
-        let mut response = product(&own_edges, &product(&inverse, &friction.velocity[0]));
-        if let Some(kernels) = &friction.edges {
+        let leading: Vec<f64> = matrix.iter().flatten().map(|a| a.first().copied().unwrap_or(0.0)).collect();
+        let leading = small::inverse(&leading, n)?;
+        let inverse = inverse_of(&matrix)?;
+        let edges: Vec<Option<Kernel>> = own_edges.iter().map(|e| e.as_deref().map(Kernel::new)).collect();
+        let friction = Driver::new(body.equations[sticks].structure.order, m, step, true);
+        let mut made = Self {
+            drivers,
+            driven,
+            own,
+            matrix,
+            inverse,
+            leading,
+            edges,
+            friction,
+            response: Heads::new(&[]),
+            first: 0.0,
+            sticks,
+        };
+        let mut pulse = vec![Vec::new(); n];
+        pulse[sticks].clone_from(&made.friction.velocity[0]);
+        let mut response = made.at_edges(&made.through(&pulse), m);
+        if let Some(kernels) = &made.friction.edges {
             response.iter_mut().zip(&kernels[0]).for_each(|(g, v)| *g += v);
         }
-        let first = response.first().copied().unwrap_or(0.0);
-        let response = Heads::new(&response);
-        Self { drivers, driven, own, divisor, inverse, own_edges, friction, response, first }
+        made.first = response.first().copied().unwrap_or(0.0);
+        made.response = Heads::new(&response);
+        Ok(made)
     }
 
-    /// Derivative of the first number of the response from those of α (`turn`) and of each own term: (coefficient's,
-    /// integration's).
-    pub(super) fn first_slope(&self, body: &Body, turn: f64, moves: &[(f64, f64)]) -> f64 {
-        let Some(kernels) = &self.friction.edges else { return 0.0 };
-        let (through, through_slope) = (self.friction.velocity[0][0], turn * self.friction.velocity[1][0]);
-        let (mut edge, mut edge_slope, mut divisor_slope) = (0.0, 0.0, 0.0);
-        for ((own, &c), &(dc, deta)) in self.own.iter().zip(&body.coefficients).zip(moves) {
-            if let Some([mean, mean_slope, end, end_slope]) = own {
-                edge += c * end[0];
-                edge_slope += dc * end[0] + c * deta * end_slope[0];
-                divisor_slope -= dc * mean[0] + c * deta * mean_slope[0];
+    /// A⁻¹ of right-hand sides, empty ones being zero.
+    pub(super) fn through(&self, rhs: &[Vec<f64>]) -> Vec<Vec<f64>> {
+        let of = |row: &Vec<Kernel>| {
+            let parts = row.iter().zip(rhs).filter(|(_, b)| !b.is_empty()).map(|(kernel, b)| product(kernel, b));
+            parts.reduce(|a, b| a.iter().zip(&b).map(|(x, y)| x + y).collect()).unwrap_or_default()
+        };
+        self.inverse.iter().map(of).collect()
+    }
+
+    /// What velocities of all outputs add to that of the body at the ends of pulses.
+    pub(super) fn at_edges(&self, velocities: &[Vec<f64>], m: usize) -> Vec<f64> {
+        let mut out = vec![0.0; m];
+        for (kernel, velocity) in self.edges.iter().zip(velocities) {
+            if let Some(kernel) = kernel {
+                out.iter_mut().zip(product(kernel, velocity)).for_each(|(s, v)| *s += v);
             }
         }
-        let a = self.divisor[0];
-        turn * kernels[1][0] + (edge_slope * through + edge * through_slope) / a
-            - edge * through * divisor_slope / (a * a)
+        out
     }
+
+    /// Derivative of the first number of the response from those of the body's α (`turn`) and of each own term of each
+    /// equation: (coefficient's, integration's).
+    pub(super) fn first_slope(&self, body: &Body, turn: f64, moves: &[Vec<(f64, f64)>]) -> f64 {
+        let Some(kernels) = &self.friction.edges else { return 0.0 };
+        let (n, b) = (self.matrix.len(), self.sticks);
+        let (through, through_slope) = (self.friction.velocity[0][0], turn * self.friction.velocity[1][0]);
+        // First numbers of the velocities that a pulse of force gives, and of the system's slope times them.
+        let velocities: Vec<f64> = (0..n).map(|j| self.leading[j * n + b] * through).collect();
+        let mut rhs = vec![0.0; n];
+        rhs[b] = through_slope;
+        let (mut edge, mut edge_slope) = (vec![0.0; n], 0.0);
+        for (i, Equation { structure, coefficients }) in body.equations.iter().enumerate() {
+            for (k, (own, &c)) in self.own[i].iter().zip(coefficients).enumerate() {
+                let (Some([mean, mean_slope, end, end_slope]), (dc, deta)) = (own, moves[i][k]) else { continue };
+                let Some(j) = body.place(structure.terms[k].signal) else { continue };
+                rhs[i] += (dc * mean[0] + c * deta * mean_slope[0]) * velocities[j];
+                if i == b {
+                    edge[j] += c * end[0];
+                    edge_slope += (dc * end[0] + c * deta * end_slope[0]) * velocities[j];
+                }
+            }
+        }
+        let moved: f64 = (0..n).map(|j| edge[j] * (0..n).map(|i| self.leading[j * n + i] * rhs[i]).sum::<f64>()).sum();
+        turn * kernels[1][0] + edge_slope + moved
+    }
+}
+
+/// Spectra of A⁻¹.
+fn inverse_of(matrix: &[Vec<Vec<f64>>]) -> Result<Vec<Vec<Kernel>>> {
+    let n = matrix.len();
+    if let [row] = matrix {
+        return Ok(vec![vec![Kernel::new(&reciprocal(&row[0]))]]);
+    }
+    let m = matrix[0][0].len();
+    let mut rows: Vec<Vec<Kernel>> = (0..n).map(|_| Vec::with_capacity(n)).collect();
+    let mut solver = Solver::new(matrix)?;
+    for j in 0..n {
+        let mut unit = vec![vec![0.0; m]; n];
+        unit[j].first_mut().into_iter().for_each(|first| *first = 1.0);
+        for (row, column) in rows.iter_mut().zip(solver.solve(&unit)?) {
+            row.push(Kernel::new(&column));
+        }
+    }
+    Ok(rows)
 }
 
 /// A free run with all that its derivatives are made of.
 pub(super) struct Run {
-    pub(super) output: Vec<f64>,
-    /// Pulse means of the velocity.
-    pub(super) velocity: Vec<f64>,
+    pub(super) outputs: Vec<Vec<f64>>,
+    /// That of the body as the equations have it, without what [`at_rest`] takes away.
+    pub(super) solved: Vec<f64>,
+    /// Pulse means of the velocities.
+    pub(super) velocities: Vec<Vec<f64>>,
     pub(super) march: March,
     /// Spectrum of the friction.
     pub(super) force: Kernel,
@@ -272,18 +329,16 @@ pub(super) struct Run {
 impl Run {
     pub(super) fn new(body: &Body, operators: &Operators, forcing: &Forcing) -> Result<Self> {
         let mut total = forcing.clone();
-        for (driven, &c) in operators.driven.iter().zip(&body.coefficients) {
-            if let Some(driven) = driven {
-                for (sum, part) in [
-                    (&mut total.output, &driven.output),
-                    (&mut total.velocity, &driven.velocity),
-                    (&mut total.edges, &driven.edges),
-                ] {
-                    sum.iter_mut().zip(part).for_each(|(s, v)| *s += c * v);
+        for (i, (row, equation)) in operators.driven.iter().zip(&body.equations).enumerate() {
+            for (driven, &c) in row.iter().zip(&equation.coefficients) {
+                if let Some(driven) = driven {
+                    total.add_to(i, c, driven);
                 }
             }
         }
-        let free = product(&operators.own_edges, &product(&operators.inverse, &total.velocity));
+        let b = body.sticks;
+        let m = total.edges.len();
+        let free = operators.at_edges(&operators.through(&total.velocity), m);
         let linear: Vec<f64> = free.iter().zip(&total.edges).map(|(a, b)| a + b).collect();
         if let Some(index) = linear.iter().position(|v| !v.is_finite()) {
             return Err(Error::Diverged { what: "free run".into(), index });
@@ -299,19 +354,43 @@ impl Run {
         }
         let force = Kernel::new(&march.force);
         let held = operators.friction.of(&force, 0);
-        total.output.iter_mut().zip(&held.output).for_each(|(b, v)| *b -= v);
-        total.velocity.iter_mut().zip(&held.velocity).for_each(|(b, v)| *b -= v);
-        let output = if march.edges.iter().all(|v| *v == 0.0) {
-            // What never leaves its rest is where it was, not where rounding puts it.
-            vec![total.level; linear.len()]
+        total.output[b].iter_mut().zip(&held.output).for_each(|(b, v)| *b -= v);
+        total.velocity[b].iter_mut().zip(&held.velocity).for_each(|(b, v)| *b -= v);
+        let still = march.edges.iter().all(|v| *v == 0.0);
+        let mut outputs = if still && body.equations.len() == 1 {
+            vec![vec![total.levels[b]; m]]
         } else {
-            divide(&total.output, &operators.divisor)?
+            let rhs: Vec<&[f64]> = total.output.iter().map(Vec::as_slice).collect();
+            series::solve(&operators.matrix, &rhs)?
         };
-        if let Some(index) = output.iter().position(|v| !v.is_finite()) {
+        let solved = outputs[b].clone();
+        if still {
+            // What never leaves its rest is where it was, not where rounding puts it.
+            outputs[b] = vec![total.levels[b]; m];
+        } else if outputs.len() > 1 {
+            at_rest(&mut outputs[b], &march);
+        }
+        if let Some(index) = outputs.iter().find_map(|y| y.iter().position(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
-        let velocity = product(&operators.inverse, &total.velocity);
-        Ok(Self { output, velocity, march, force })
+        let velocities = operators.through(&total.velocity);
+        Ok(Self { outputs, solved, velocities, march, force })
+    }
+}
+
+/// Takes from an output, or its slope, what it creeps while the body rests.
+///
+/// Its velocity is 0 at the edges of each pulse, but a force that another body exerts changes within it while friction's
+/// mean stands, which moves the mean position by a share of the square of the step.
+pub(super) fn at_rest(output: &mut [f64], march: &March) {
+    let (mut crept, mut before) = (0.0, output.first().copied().unwrap_or(0.0));
+    for (value, edges) in output.iter_mut().skip(1).zip(march.edges.windows(3)) {
+        let now = *value;
+        if edges.iter().all(|v| *v == 0.0) {
+            crept += now - before;
+        }
+        before = now;
+        *value = now - crept;
     }
 }
 

@@ -30,8 +30,8 @@ pub struct Fit {
     pub inputs: Vec<f64>,
     /// States of each run.
     pub states: Vec<Vec<f64>>,
-    /// The initial terms that they are, (exponent, coefficient), run by run.
-    pub initial: Vec<Vec<(f64, f64)>>,
+    /// The initial terms that they are, (exponent, coefficient), run by run and equation by equation.
+    pub initial: Vec<Vec<Vec<(f64, f64)>>>,
     /// Half the weighted sum of squared residuals.
     pub cost: f64,
     /// Weighted residuals, run after run.
@@ -239,7 +239,7 @@ pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, set
     }
     let inputs: Vec<f64> =
         start.inputs.iter().zip(&model.inputs).map(|(v, i)| v.clamp(i.bounds.0, i.bounds.1)).collect();
-    let count = model.states(&orders).len();
+    let count = model.states(&orders).0.len();
     let mut states = start.states.clone();
     if states.len() != experiments.len() || states.iter().any(|s| s.len() != count) {
         states = experiments.iter().map(|e| begun(model, &orders, &coefficients, &inputs, e)).collect();

@@ -1,9 +1,9 @@
-//! Free runs of a body with dry friction, and their output error.
+//! Free runs of a body with dry friction, alone or among bodies coupled to it, and their output error.
 //!
 //! D^α y = Σ c D^ν s − F(Dy) sgn(Dy) + … with 1 < α ≤ 2, sgn set-valued at rest and F(v) = fc + fs exp(−(v/vs)²)
 //! ([`law`]). Everything but friction is linear, so superposition leaves one scalar problem: the velocity at the edges of
 //! the pulses is V = L − g ∗ φ with φ ∈ F(V) sgn(V), L the velocity without friction and g what a pulse of force does to
-//! it ([`dynamics`]). It is marched pulse by pulse ([`march`]), the sum over the past by blocked transforms ([`online`]).
+//! it, both of the coupled equations ([`dynamics`]). It is marched pulse by pulse ([`march`]), the sum over the past by blocked transforms ([`online`]).
 //! A body at rest stays exactly at rest while friction can hold it.
 //!
 //! Derivatives follow the march: φ is F while the body slides, and what holds it while it sticks. Offsets and the state in
@@ -11,6 +11,7 @@
 
 pub mod dynamics;
 pub mod fit;
+mod integrals;
 pub mod law;
 pub mod march;
 mod model;

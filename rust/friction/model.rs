@@ -1,9 +1,10 @@
 //! A body with friction whose orders and coefficients are free: its residuals on every experiment, and their derivatives.
 
-use super::dynamics::{product, Body, Integrated, Operators, Run};
+use super::dynamics::{at_rest, Body, Operators, Run};
+use super::integrals::{product, Integrated};
 use super::law::Law;
 use super::states::{together, Forcing, State};
-use crate::equation::{Initial, Structure, Term};
+use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimate::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
 use crate::regressors::Record;
@@ -44,11 +45,13 @@ impl FreeLaw {
     }
 }
 
-/// What is estimated: one equation, its output alone unknown, with friction of that output's velocity.
+/// What is estimated: equations that follow each other's outputs, one with friction of its own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionModel {
     /// The linear terms.
-    pub equation: FreeEquation,
+    pub equations: Vec<FreeEquation>,
+    /// Which of them has friction.
+    pub sticks: usize,
     /// F of − F(Dy) sgn(Dy).
     pub friction: FreeLaw,
     /// What is free of inputs, one number of an input at most.
@@ -113,16 +116,20 @@ impl FrictionModel {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
         };
         let known = |c: &Monomial| c.powers.iter().all(|&(i, _)| i < self.coordinates.len());
-        let terms = &self.equation.terms;
-        if self.equation.output >= signals || terms.iter().any(|t| t.0 >= signals || !known(&t.2)) {
-            return refuse("an equation names a signal or a coefficient that is not there", "number them from 0");
+        if self.sticks >= self.equations.len() {
+            return refuse("friction stands in an equation that is not there", "number them from 0");
+        }
+        for FreeEquation { output, terms, .. } in &self.equations {
+            if *output >= signals || terms.iter().any(|t| t.0 >= signals || !known(&t.2)) {
+                return refuse("an equation names a signal or a coefficient that is not there", "number them from 0");
+            }
         }
         let numbers = self.friction.numbers();
         if numbers.iter().any(|n| !known(n) || n.powers.len() > 1 || n.factor < 0.0) {
             return refuse("friction is no multiple of one free coefficient", "give it one that is not negative");
         }
         for (k, &FreeInput { signal, law, bounds: (low, high) }) in self.inputs.iter().enumerate() {
-            if signal >= signals || signal == self.equation.output {
+            if signal >= signals || self.equations.iter().any(|e| e.output == signal) {
                 return refuse("a free limit of what is no input", "limit inputs only");
             }
             if law == InputLaw::Delay || self.inputs[..k].iter().any(|i| i.signal == signal) {
@@ -132,12 +139,14 @@ impl FrictionModel {
                 return refuse("bounds of a limit that do not rise from 0", "give two rising values from 0");
             }
         }
-        for order in terms.iter().map(|t| &t.1).chain([&self.equation.order]) {
-            check_length("weights of an order", self.order_bounds.len(), order.weights.len())?;
+        for equation in &self.equations {
+            for order in equation.terms.iter().map(|t| &t.1).chain([&equation.order]) {
+                check_length("weights of an order", self.order_bounds.len(), order.weights.len())?;
+            }
         }
         for experiment in experiments {
             experiment.check()?;
-            check_length("outputs", 1, experiment.samples.len())?;
+            check_length("outputs", self.equations.len(), experiment.samples.len())?;
             if experiment.filter.is_some() || experiment.own.is_some() {
                 return refuse("friction behind a filter, or with samples at times of their own", "leave them out");
             }
@@ -145,78 +154,65 @@ impl FrictionModel {
         self.initial.check()
     }
 
-    pub(super) fn structure(&self, orders: &[f64]) -> Structure {
+    fn body(&self, orders: &[f64], coefficients: &[f64]) -> Body {
         let at = |law: &crate::equation::AffineOrder| {
             law.constant + law.weights.iter().zip(orders).map(|(w, x)| w * x).sum::<f64>()
         };
-        Structure {
-            output: self.equation.output,
-            order: at(&self.equation.order),
-            terms: (self.equation.terms.iter()).map(|(s, o, _)| Term { signal: *s, order: at(o) }).collect(),
-        }
-    }
-
-    fn body(&self, orders: &[f64], coefficients: &[f64]) -> Body {
+        let of = |equation: &FreeEquation| Equation {
+            structure: Structure {
+                output: equation.output,
+                order: at(&equation.order),
+                terms: (equation.terms.iter()).map(|(s, o, _)| Term { signal: *s, order: at(o) }).collect(),
+            },
+            coefficients: equation.terms.iter().map(|t| t.2.at(coefficients)).collect(),
+        };
         Body {
-            structure: self.structure(orders),
-            coefficients: self.equation.terms.iter().map(|t| t.2.at(coefficients)).collect(),
+            equations: self.equations.iter().map(of).collect(),
+            sticks: self.sticks,
             friction: self.friction.at(coefficients),
         }
     }
 
-    /// States of every run at these orders.
-    pub(super) fn states(&self, orders: &[f64]) -> Vec<State> {
-        let alpha = &self.equation.order.weights;
-        let moves = |term: usize| {
-            let own = &self.equation.terms[term].1.weights;
+    /// States of every run at these orders, and the equations without their coefficients.
+    pub(super) fn states(&self, orders: &[f64]) -> (Vec<State>, Vec<Equation>) {
+        let moves = |i: usize, term: usize| {
+            let alpha = &self.equations[i].order.weights;
+            let own = &self.equations[i].terms[term].1.weights;
             alpha.iter().zip(own).any(|(a, w)| (a - w).abs() > 0.0)
         };
-        State::all(&self.structure(orders), &self.initial, moves)
+        let body = self.body(orders, &vec![0.0; self.coordinates.len()]);
+        (State::all(&body.equations, &self.initial, moves), body.equations)
     }
 
-    /// States of a run as its first samples have them: where the body is and how fast, a constant as given, the rest 0.
+    /// States of a run as its first samples have them: where the bodies are and how fast, a constant beside friction as
+    /// given, the rest 0.
     pub(super) fn first_states(&self, orders: &[f64], experiment: &Experiment, constant: f64) -> Vec<f64> {
-        let samples = experiment.samples.first().map_or(&[][..], Vec::as_slice);
-        let near = &samples[..samples.len().min(FIRST_SAMPLES)];
-        #[allow(clippy::cast_precision_loss)]
-        let (count, step) = (near.len() as f64, experiment.record.step() * experiment.every as f64);
-        let middle = 0.5 * (count - 1.0);
-        let mean = near.iter().sum::<f64>() / count.max(1.0);
-        #[allow(clippy::cast_precision_loss)]
-        let (mut across, mut along) = (0.0, 0.0);
-        for (k, value) in near.iter().enumerate() {
-            #[allow(clippy::cast_precision_loss)]
-            let x = k as f64 - middle;
-            across += x * (value - mean);
-            along += x * x;
-        }
-        let rate = if along > 0.0 { across / along / step } else { 0.0 };
-        let level = mean - rate * middle * step;
-        let alpha = self.structure(orders).order;
-        let value = |state: &State| match state {
-            State::Level => level,
-            State::Rate => rate,
-            State::Offset(0) => constant / libm::tgamma(alpha + 1.0),
+        let (states, equations) = self.states(orders);
+        let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
+        let value = |state: &State| match *state {
+            State::Level(i) => begun[i].0,
+            State::Rate(i) => begun[i].1,
+            State::Offset(i, 0) if i == self.sticks => constant / libm::tgamma(equations[i].structure.order + 1.0),
             _ => 0.0,
         };
-        self.states(orders).iter().map(value).collect()
+        states.iter().map(value).collect()
     }
 
-    /// Powers of t of a run's states: (exponent, coefficient).
-    pub(super) fn powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<(f64, f64)> {
+    /// Powers of t of a run's states by equation: (exponent, coefficient).
+    pub(super) fn powers(&self, orders: &[f64], coefficients: &[f64], values: &[f64]) -> Vec<Vec<(f64, f64)>> {
         let body = self.body(orders, coefficients);
-        let own = body.own();
-        together(
-            self.states(orders)
-                .iter()
-                .zip(values)
-                .flat_map(|(state, &x)| state.powers(&body.structure, &own).into_iter().map(move |(e, c)| (e, x * c))),
-        )
+        let links = body.links();
+        let (states, _) = self.states(orders);
+        let parts = states.iter().zip(values).flat_map(|(state, &x)| {
+            state.powers(&body.equations, &links).into_iter().map(move |(i, e, c)| (i, e, x * c))
+        });
+        together(body.equations.len(), parts)
     }
 
-    fn forcing(&self, orders: &[f64], coefficients: &[f64], values: &[f64], record: &Record) -> Forcing {
-        let own = self.body(orders, coefficients).own();
-        Forcing::of(&self.powers(orders, coefficients, values), &own, record.m(), record.step())
+    fn forcing(&self, orders: &[f64], coefficients: &[f64], values: &[f64], record: &Record) -> Result<Forcing> {
+        let links = self.body(orders, coefficients).links();
+        let powers = self.powers(orders, coefficients, values);
+        Forcing::of(&powers, &links, self.sticks, record.m(), record.step())
     }
 
     /// The record as its inputs act, none where that is as they are, and how these move with their free numbers.
@@ -242,12 +238,12 @@ impl FrictionModel {
         let mut out = Evaluation { residuals: Vec::new(), size: 0.0, parts: Vec::with_capacity(experiments.len()) };
         for (experiment, values) in experiments.iter().zip(&point.states) {
             let (acting, bent) = self.acting(&experiment.record, &point.inputs)?;
-            let operators = Operators::new(&body, acting.as_ref().unwrap_or(&experiment.record));
-            let forcing = self.forcing(&point.orders, &point.coefficients, values, &experiment.record);
+            let operators = Operators::new(&body, acting.as_ref().unwrap_or(&experiment.record))?;
+            let forcing = self.forcing(&point.orders, &point.coefficients, values, &experiment.record)?;
             let run = Run::new(&body, &operators, &forcing)?;
             let mut residuals = experiment.measured();
             out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
-            let sampled = experiment.sampled(std::slice::from_ref(&run.output));
+            let sampled = experiment.sampled(&run.outputs);
             residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
             out.residuals.extend(residuals);
             out.parts.push(Part { operators, run, bent });
@@ -276,15 +272,15 @@ impl FrictionModel {
         let body = self.body(&point.orders, &point.coefficients);
         let mut columns = vec![Vec::with_capacity(at.residuals.len()); all.len()];
         for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
-            let spectra = Spectra::new(&body, part);
+            let spectra = Spectra::new(part, self.sticks);
             for (column, moved) in columns.iter_mut().zip(&all) {
                 if matches!(moved, Moved::State(run, _) if *run != index) {
-                    column.extend(std::iter::repeat_n(0.0, experiment.compared()));
+                    column.extend(std::iter::repeat_n(0.0, self.equations.len() * experiment.compared()));
                     continue;
                 }
-                let slope = self.slope(&body, experiment, part, &spectra, point, index, moved);
+                let slopes = self.slopes(&body, experiment, part, &spectra, point, index, moved)?;
                 // Residuals fall where the response rises.
-                column.extend(experiment.sampled(&[slope]).into_iter().map(|v| -v));
+                column.extend(experiment.sampled(&slopes).into_iter().map(|v| -v));
             }
         }
         if columns.iter().flatten().any(|v| !v.is_finite()) {
@@ -293,9 +289,9 @@ impl FrictionModel {
         Ok(columns)
     }
 
-    /// How the output's means move with one parameter.
+    /// How the outputs' means move with one parameter.
     #[allow(clippy::too_many_arguments)]
-    fn slope(
+    fn slopes(
         &self,
         body: &Body,
         experiment: &Experiment,
@@ -304,95 +300,114 @@ impl FrictionModel {
         point: &Point,
         run: usize,
         moved: &Moved,
-    ) -> Vec<f64> {
+    ) -> Result<Vec<Vec<f64>>> {
         let (operators, motion, record) = (&part.operators, &part.run, &experiment.record);
-        let (alpha_moves, moves, friction_moves) = self.moves(point, moved);
-        let mut total = self.forcing_slope(point, &point.states[run], record, moved);
-        let mut add = |weight: f64, part: &Integrated| {
+        let Moves { alphas, terms: moves, friction: friction_moves } = self.moves(point, moved);
+        let b = self.sticks;
+        let mut total = self.forcing_slope(point, &point.states[run], record, moved)?;
+        let mut add = |i: usize, weight: f64, part: &Integrated| {
             if weight != 0.0 {
-                total.output.iter_mut().zip(&part.output).for_each(|(s, v)| *s += weight * v);
-                total.velocity.iter_mut().zip(&part.velocity).for_each(|(s, v)| *s += weight * v);
-                total.edges.iter_mut().zip(&part.edges).for_each(|(s, v)| *s += weight * v);
+                total.add_to(i, weight, part);
             }
         };
-        for (k, (&(dc, deta), &c)) in moves.iter().zip(&body.coefficients).enumerate() {
-            if let (Some(driven), Some((driver, signal))) = (&operators.driven[k], &operators.drivers[k]) {
-                add(dc, driven);
-                if deta != 0.0 {
-                    add(c * deta, &driver.of(signal, 1));
+        for (i, equation) in body.equations.iter().enumerate() {
+            for (k, (&(dc, deta), &c)) in moves[i].iter().zip(&equation.coefficients).enumerate() {
+                let signal = equation.structure.terms[k].signal;
+                if let (Some(driven), Some((driver, spectrum))) = (&operators.driven[i][k], &operators.drivers[i][k]) {
+                    add(i, dc, driven);
+                    if deta != 0.0 {
+                        add(i, c * deta, &driver.of(spectrum, 1));
+                    }
+                    if let Moved::Input(input) = moved {
+                        if signal == self.inputs[*input].signal {
+                            add(i, c, &driver.of(&Kernel::new(&part.bent[*input]), 0));
+                        }
+                    }
                 }
-            }
-            if let (Moved::Input(i), Some((driver, _))) = (moved, &operators.drivers[k]) {
-                if self.equation.terms[k].0 == self.inputs[*i].signal {
-                    add(c, &driver.of(&Kernel::new(&part.bent[*i]), 0));
-                }
-            }
-            if let Some(kernels) = &operators.own[k] {
-                if dc != 0.0 {
-                    add(dc, &spectra.own(kernels, 0));
-                }
-                if deta != 0.0 {
-                    add(c * deta, &spectra.own(kernels, 1));
+                if let (Some(kernels), Some(j)) = (&operators.own[i][k], body.place(signal)) {
+                    if dc != 0.0 {
+                        add(i, dc, &spectra.own(j, kernels, 0));
+                    }
+                    if deta != 0.0 {
+                        add(i, c * deta, &spectra.own(j, kernels, 1));
+                    }
                 }
             }
         }
-        if alpha_moves != 0.0 {
-            add(-alpha_moves, &operators.friction.of(&motion.force, 1));
+        if alphas[b] != 0.0 {
+            add(b, -alphas[b], &operators.friction.of(&motion.force, 1));
         }
-        let through = product(&operators.own_edges, &product(&operators.inverse, &total.velocity));
+        let through = operators.at_edges(&operators.through(&total.velocity), record.m());
         let at_ends: Vec<f64> = through.iter().zip(&total.edges).map(|(a, b)| a + b).collect();
-        let first = operators.first_slope(body, alpha_moves, &moves);
+        let first = operators.first_slope(body, alphas[b], &moves);
         let forces = motion.march.slope(&at_ends, &operators.response, first, friction_moves, total.start);
         if let Some(forces) = forces {
             let held = operators.friction.of(&Kernel::new(&forces), 0);
-            total.output.iter_mut().zip(&held.output).for_each(|(s, v)| *s -= v);
+            total.output[b].iter_mut().zip(&held.output).for_each(|(s, v)| *s -= v);
         }
-        product(&operators.inverse, &total.output)
+        let mut slopes = operators.through(&total.output);
+        if slopes.len() > 1 {
+            at_rest(&mut slopes[b], &motion.march);
+        }
+        Ok(slopes)
     }
 
-    /// Derivatives of α, of (coefficient, integration) of each term, and of fc, fs and vs.
-    fn moves(&self, point: &Point, moved: &Moved) -> (f64, Vec<(f64, f64)>, [f64; 3]) {
-        let terms = &self.equation.terms;
+    /// What a parameter moves of the body's numbers.
+    fn moves(&self, point: &Point, moved: &Moved) -> Moves {
+        let mut out = Moves {
+            alphas: vec![0.0; self.equations.len()],
+            terms: self.equations.iter().map(|e| vec![(0.0, 0.0); e.terms.len()]).collect(),
+            friction: [0.0; 3],
+        };
         match *moved {
             Moved::Order(j) => {
                 let of = |weights: &[f64]| weights.get(j).copied().unwrap_or(0.0);
-                let alpha = of(&self.equation.order.weights);
-                (alpha, terms.iter().map(|t| (0.0, alpha - of(&t.1.weights))).collect(), [0.0; 3])
+                for (i, equation) in self.equations.iter().enumerate() {
+                    let alpha = of(&equation.order.weights);
+                    out.alphas[i] = alpha;
+                    out.terms[i] = equation.terms.iter().map(|t| (0.0, alpha - of(&t.1.weights))).collect();
+                }
             }
-            Moved::Coefficient(j) => (
-                0.0,
-                terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect(),
-                self.friction.numbers().map(|number| number.slope(&point.coefficients, j)),
-            ),
-            Moved::State(..) | Moved::Input(_) => (0.0, vec![(0.0, 0.0); terms.len()], [0.0; 3]),
+            Moved::Coefficient(j) => {
+                for (terms, equation) in out.terms.iter_mut().zip(&self.equations) {
+                    *terms = equation.terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect();
+                }
+                out.friction = self.friction.numbers().map(|number| number.slope(&point.coefficients, j));
+            }
+            Moved::State(..) | Moved::Input(_) => {}
         }
+        out
     }
 
     /// How what a run starts with moves: it is linear in states and coefficients, and smooth in orders.
-    fn forcing_slope(&self, point: &Point, values: &[f64], record: &Record, moved: &Moved) -> Forcing {
+    fn forcing_slope(&self, point: &Point, values: &[f64], record: &Record, moved: &Moved) -> Result<Forcing> {
         let idle = values.is_empty() || values.iter().all(|x| *x == 0.0);
+        let none = || Ok(Forcing::none(record.m(), self.equations.len(), self.sticks));
         match *moved {
             Moved::State(_, state) => {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
                 self.forcing(&point.orders, &point.coefficients, &unit, record)
             }
             // What a run starts with knows nothing of its inputs.
-            Moved::Input(_) => Forcing::none(record.m()),
-            _ if idle => Forcing::none(record.m()),
+            Moved::Input(_) => none(),
+            _ if idle => none(),
             Moved::Coefficient(j) => {
-                let own = |k: usize| self.equation.terms[k].0 == self.equation.output;
-                let depends = |k: usize| self.equation.terms[k].2.slope(&point.coefficients, j) != 0.0;
-                if !(0..self.equation.terms.len()).any(|k| own(k) && depends(k)) {
-                    return Forcing::none(record.m());
+                let followed = |signal: usize| self.equations.iter().any(|e| e.output == signal);
+                let mut terms = self.equations.iter().flat_map(|e| &e.terms);
+                if !terms.any(|t| followed(t.0) && t.2.slope(&point.coefficients, j) != 0.0) {
+                    return none();
                 }
-                let step = point.coefficients[j].abs().max(1.0);
-                let mut shifted = point.coefficients.clone();
-                shifted[j] += step;
-                difference(
-                    &self.forcing(&point.orders, &shifted, values, record),
-                    &self.forcing(&point.orders, &point.coefficients, values, record),
-                    step,
-                )
+                let at = |by: f64| {
+                    let mut shifted = point.coefficients.clone();
+                    shifted[j] += by;
+                    self.forcing(&point.orders, &shifted, values, record)
+                };
+                let size = point.coefficients[j].abs().max(1.0);
+                if self.equations.len() == 1 {
+                    return Ok(difference(&at(size)?, &at(0.0)?, size));
+                }
+                // Levels of outputs that feed through at once are no linear function of coefficients.
+                Ok(difference(&at(SHIFT * size)?, &at(-SHIFT * size)?, 2.0 * SHIFT * size))
             }
             Moved::Order(j) => {
                 let shifted = |by: f64| {
@@ -400,45 +415,66 @@ impl FrictionModel {
                     orders[j] += by;
                     self.forcing(&orders, &point.coefficients, values, record)
                 };
-                difference(&shifted(SHIFT), &shifted(-SHIFT), 2.0 * SHIFT)
+                Ok(difference(&shifted(SHIFT)?, &shifted(-SHIFT)?, 2.0 * SHIFT))
             }
         }
     }
 }
 
+/// Derivatives of each α, of (coefficient, integration) of each term, and of fc, fs and vs.
+struct Moves {
+    alphas: Vec<f64>,
+    terms: Vec<Vec<(f64, f64)>>,
+    friction: [f64; 3],
+}
+
+/// Level and velocity of an output as its first samples have them.
+fn first_of(samples: &[f64], experiment: &Experiment) -> (f64, f64) {
+    let near = &samples[..samples.len().min(FIRST_SAMPLES)];
+    #[allow(clippy::cast_precision_loss)]
+    let (count, step) = (near.len() as f64, experiment.record.step() * experiment.every as f64);
+    let middle = 0.5 * (count - 1.0);
+    let mean = near.iter().sum::<f64>() / count.max(1.0);
+    #[allow(clippy::cast_precision_loss)]
+    let (mut across, mut along) = (0.0, 0.0);
+    for (k, value) in near.iter().enumerate() {
+        #[allow(clippy::cast_precision_loss)]
+        let x = k as f64 - middle;
+        across += x * (value - mean);
+        along += x * x;
+    }
+    let rate = if along > 0.0 { across / along / step } else { 0.0 };
+    (mean - rate * middle * step, rate)
+}
+
 fn difference(up: &Forcing, down: &Forcing, step: f64) -> Forcing {
-    let mut out = Forcing::none(up.output.len());
+    let mut out = up.nothing();
     out.add(1.0 / step, up);
     out.add(-1.0 / step, down);
     out
 }
 
-/// Spectra of output and velocity, which own terms take in.
-struct Spectra {
-    output: Option<Kernel>,
-    velocity: Option<Kernel>,
-}
+/// Spectra of outputs and velocities, which terms of them take in.
+struct Spectra(Vec<(Kernel, Kernel)>);
 
 impl Spectra {
-    fn new(body: &Body, part: &Part) -> Self {
-        let any = !body.own().is_empty();
-        Self {
-            output: any.then(|| Kernel::new(&part.run.output)),
-            velocity: any.then(|| Kernel::new(&part.run.velocity)),
-        }
+    fn new(part: &Part, sticks: usize) -> Self {
+        let run = &part.run;
+        let of = |(j, (y, v)): (usize, (&Vec<f64>, &Vec<f64>))| {
+            (Kernel::new(if j == sticks { &run.solved } else { y }), Kernel::new(v))
+        };
+        Self(run.outputs.iter().zip(&run.velocities).enumerate().map(of).collect())
     }
 
-    /// An own term's share through its kernels (0) or their slopes (1).
-    fn own(&self, kernels: &[Vec<f64>; 4], which: usize) -> Integrated {
+    /// Share of a term of an output through its kernels (0) or their slopes (1).
+    fn own(&self, output: usize, kernels: &[Vec<f64>; 4], which: usize) -> Integrated {
         let [mean, mean_slope, end, end_slope] = kernels;
         let (means, ends) = if which == 0 { (mean, end) } else { (mean_slope, end_slope) };
-        let of = |spectrum: &Option<Kernel>, kernel: &[f64]| {
-            spectrum.as_ref().map_or_else(|| vec![0.0; kernel.len()], |cached| product(cached, kernel))
-        };
+        let (position, velocity) = &self.0[output];
         Integrated {
-            output: of(&self.output, means),
-            velocity: of(&self.velocity, means),
-            edges: of(&self.velocity, ends),
+            output: product(position, means),
+            velocity: product(velocity, means),
+            edges: if ends.is_empty() { Vec::new() } else { product(velocity, ends) },
         }
     }
 }

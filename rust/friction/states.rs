@@ -1,166 +1,261 @@
-//! What a run starts with, and the constant on its right-hand side, as powers of t that drive output and velocity.
+//! What a run starts with, and the constants on its right-hand sides, as powers of t that drive outputs and velocities.
 
-use crate::equation::{Initial, Structure, ORDER_GRAIN};
+use super::integrals::Integrated;
+use crate::equation::{Equation, Initial, ORDER_GRAIN};
+use crate::error::{Error, Result};
+use crate::excess::kernel;
 use crate::kernels::power_means;
+use crate::small;
 
-/// What drives a body besides its inputs: on the level of its output and of its velocity.
+/// A term of an output that is followed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Link {
+    /// Equation of the output.
+    pub(super) output: usize,
+    pub(super) order: f64,
+    /// α of the equation in which it stands less that order.
+    pub(super) integration: f64,
+    pub(super) coefficient: f64,
+}
+
+/// What drives bodies besides their inputs: on the level of their outputs and of their velocities, by equation.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Forcing {
     /// Pulse means on the level of the output.
-    pub(super) output: Vec<f64>,
+    pub(super) output: Vec<Vec<f64>>,
     /// Pulse means on the level of the velocity.
-    pub(super) velocity: Vec<f64>,
-    /// The same at the ends of the pulses.
+    pub(super) velocity: Vec<Vec<f64>>,
+    /// The same at the ends of the pulses, of the body that may stick.
     pub(super) edges: Vec<f64>,
-    /// The velocity at the start.
+    /// The velocity of that body at the start.
     pub(super) start: f64,
-    /// The output at the start.
-    pub(super) level: f64,
+    /// The outputs at the start.
+    pub(super) levels: Vec<f64>,
+    sticks: usize,
 }
 
 impl Forcing {
-    pub(super) fn none(m: usize) -> Self {
-        Self { output: vec![0.0; m], velocity: vec![0.0; m], edges: vec![0.0; m], start: 0.0, level: 0.0 }
+    pub(super) fn none(m: usize, n: usize, sticks: usize) -> Self {
+        let rows = vec![vec![0.0; m]; n];
+        Self { output: rows.clone(), velocity: rows, edges: vec![0.0; m], start: 0.0, levels: vec![0.0; n], sticks }
+    }
+
+    /// The same size, nothing in it.
+    pub(super) fn nothing(&self) -> Self {
+        Self::none(self.edges.len(), self.levels.len(), self.sticks)
     }
 
     /// Adds another one, weighted.
     pub(super) fn add(&mut self, weight: f64, other: &Self) {
-        for (sum, part) in
-            [(&mut self.output, &other.output), (&mut self.velocity, &other.velocity), (&mut self.edges, &other.edges)]
-        {
+        let rows = self.output.iter_mut().chain(&mut self.velocity).zip(other.output.iter().chain(&other.velocity));
+        for (sum, part) in rows.chain([(&mut self.edges, &other.edges)]) {
             sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
         }
         self.start += weight * other.start;
-        self.level += weight * other.level;
+        self.levels.iter_mut().zip(&other.levels).for_each(|(s, v)| *s += weight * v);
     }
 
-    /// Powers of t on the level of the output, as (exponent, coefficient), for own terms (integration, coefficient).
+    /// Adds an integrated signal to one equation, weighted.
+    pub(super) fn add_to(&mut self, equation: usize, weight: f64, part: &Integrated) {
+        let add = |sum: &mut Vec<f64>, part: &[f64]| sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
+        add(&mut self.output[equation], &part.output);
+        add(&mut self.velocity[equation], &part.velocity);
+        if equation == self.sticks {
+            add(&mut self.edges, &part.edges);
+        }
+    }
+
+    /// Powers of t on the level of the outputs, as (exponent, coefficient) by equation, beside terms of followed outputs.
     ///
-    /// A level x₀ at the start is integrated by the own terms, and so is the jump to it: to the velocity it is
+    /// A level x₀ at the start is integrated by these terms, and so is the jump to it: to the velocity it is
     /// c x₀ t^{η−1}/Γ(η).
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] where the
+    /// levels at the start follow from no equation.
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn of(powers: &[(f64, f64)], own: &[(f64, f64)], m: usize, step: f64) -> Self {
-        let mut out = Self::none(m);
-        let mut rates: Vec<(f64, f64, f64)> = Vec::new();
-        let mut rate = |exponent: f64, value: f64| match rates.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN)
-        {
-            Some(known) => (known.1, known.2) = (known.1 + value, known.2.max(value.abs())),
-            None => rates.push((exponent, value, value.abs())),
-        };
-        let mut level = 0.0;
-        for &(exponent, value) in powers {
-            if value != 0.0 {
-                let means = power_means(exponent, m, step);
-                out.output.iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
+    pub(super) fn of(
+        powers: &[Vec<(f64, f64)>],
+        links: &[Vec<Link>],
+        sticks: usize,
+        m: usize,
+        step: f64,
+    ) -> Result<Self> {
+        let n = powers.len();
+        let mut out = Self::none(m, n, sticks);
+        out.levels = levels(powers, links)?;
+        for (i, own) in powers.iter().enumerate() {
+            let mut rates: Vec<(f64, f64, f64)> = Vec::new();
+            let mut rate =
+                |exponent: f64, value: f64| match rates.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN) {
+                    Some(known) => (known.1, known.2) = (known.1 + value, known.2.max(value.abs())),
+                    None => rates.push((exponent, value, value.abs())),
+                };
+            for &(exponent, value) in own {
+                if value != 0.0 {
+                    let means = if i == sticks { power_means(exponent, m, step) } else { means_of(exponent, m, step) };
+                    out.output[i].iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
+                }
+                if exponent.abs() >= ORDER_GRAIN {
+                    rate(exponent - 1.0, value * exponent);
+                }
             }
-            if exponent.abs() < ORDER_GRAIN {
-                level += value;
-            } else {
-                rate(exponent - 1.0, value * exponent);
+            for link in links[i].iter().filter(|link| link.integration.abs() >= ORDER_GRAIN) {
+                let eta = link.integration;
+                rate(eta - 1.0, link.coefficient * out.levels[link.output] / libm::tgamma(eta));
+            }
+            for (exponent, value, largest) in rates {
+                // What a jump adds and an initial term takes away again is nothing, but for rounding.
+                if value.abs() <= 1e-13 * largest {
+                    continue;
+                }
+                if exponent <= -1.0 {
+                    return Err(Error::OutOfRange {
+                        name: "exponent of an initial term".into(),
+                        value: exponent + 1.0,
+                        range: "(0, ∞) or 0".into(),
+                        remedy:
+                            "a level that a term above its equation's order differentiates needs that term's power of \
+                                 t beside it; start at rest, or let the start be found"
+                                .into(),
+                    });
+                }
+                let means = if i == sticks { power_means(exponent, m, step) } else { means_of(exponent, m, step) };
+                out.velocity[i].iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
+                if i != sticks {
+                    continue;
+                }
+                let ends = (1..=m).map(|k| libm::pow(k as f64 * step, exponent));
+                out.edges.iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
+                if exponent.abs() < ORDER_GRAIN {
+                    out.start += value;
+                }
             }
         }
-        for &(eta, c) in own.iter().filter(|(eta, _)| *eta > 0.0) {
-            rate(eta - 1.0, c * level / libm::tgamma(eta));
-        }
-        out.level = level;
-        for (exponent, value, largest) in rates {
-            // What a jump adds and an initial term takes away again is nothing, but for rounding.
-            if value.abs() <= 1e-13 * largest {
-                continue;
-            }
-            let means = power_means(exponent, m, step);
-            out.velocity.iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
-            let ends = (1..=m).map(|k| libm::pow(k as f64 * step, exponent));
-            out.edges.iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
-            if exponent.abs() < ORDER_GRAIN {
-                out.start += value;
-            }
-        }
-        out
+        Ok(out)
     }
 }
 
-/// What is free of a run's start: each a combination of powers of t.
+/// Pulse means of t^e; of a negative power as the kernels of derivatives make it of a jump, which it takes away again.
+fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+    if exponent >= 0.0 {
+        return power_means(exponent, m, step);
+    }
+    let (mut sum, scale) = (0.0, libm::tgamma(exponent + 1.0));
+    let summed = |v: f64| {
+        sum += v;
+        scale * sum
+    };
+    kernel(exponent, m, step).into_iter().map(summed).collect()
+}
+
+/// Outputs at the start: the powers t^0, and what of other levels feeds through at once.
+fn levels(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>]) -> Result<Vec<f64>> {
+    let n = powers.len();
+    let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
+    let given: Vec<f64> = powers.iter().map(constant).collect();
+    if !links.iter().flatten().any(|link| link.integration.abs() < ORDER_GRAIN) {
+        return Ok(given);
+    }
+    let mut matrix = vec![0.0; n * n];
+    for (i, row) in links.iter().enumerate() {
+        matrix[i * n + i] += 1.0;
+        for link in row.iter().filter(|link| link.integration.abs() < ORDER_GRAIN) {
+            matrix[i * n + link.output] -= link.coefficient;
+        }
+    }
+    let inverse = small::inverse(&matrix, n)?;
+    Ok((0..n).map(|i| (0..n).map(|j| inverse[i * n + j] * given[j]).sum()).collect())
+}
+
+/// What is free of a run's start: each a combination of powers of t, of the equation named first.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum State {
-    /// The level at which the body stood before, and moved on from.
-    Level,
+    /// The level at which the output stood before, and moved on from.
+    Level(usize),
     /// Its velocity.
-    Rate,
+    Rate(usize),
     /// The power of t by which a term starts whose signal did not start at 0.
     Jump {
-        /// The term.
-        term: usize,
+        /// Equation and term.
+        at: (usize, usize),
         /// One more for each derivative of the signal.
         more: u32,
     },
     /// A constant on the right-hand side, or a ramp (1).
-    Offset(u32),
+    Offset(usize, u32),
     /// A power of t that was asked for.
-    Power(f64),
+    Power(usize, f64),
 }
 
 impl State {
-    /// Those of a run; `free` says of which term or of α (none) the integration moves with an order.
-    pub(super) fn all(structure: &Structure, initial: &Initial, free: impl Fn(usize) -> bool) -> Vec<Self> {
-        let mut all = match initial.under() {
-            Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => Vec::new(),
-            Initial::Powers(powers) => powers.iter().map(|&e| Self::Power(e)).collect(),
-            Initial::Caputo => {
-                let mut all = vec![Self::Level, Self::Rate];
-                for (term, driver) in structure.terms.iter().enumerate().filter(|(_, t)| t.signal != structure.output) {
-                    for more in (0_u32..).take_while(|&i| f64::from(i) < driver.order - ORDER_GRAIN) {
-                        let exponent = structure.order - driver.order + f64::from(more);
-                        let known = [0.0, 1.0].iter().any(|e: &f64| (e - exponent).abs() < ORDER_GRAIN);
-                        if free(term) || !known {
-                            all.push(Self::Jump { term, more });
+    /// Those of a run; `free` says of which term of an equation the integration moves with an order.
+    pub(super) fn all(equations: &[Equation], initial: &Initial, free: impl Fn(usize, usize) -> bool) -> Vec<Self> {
+        let followed = |signal: usize| equations.iter().any(|e| e.structure.output == signal);
+        let mut all: Vec<Self> = Vec::new();
+        for (i, Equation { structure, .. }) in equations.iter().enumerate() {
+            match initial.under() {
+                Initial::Rest | Initial::Offset { .. } | Initial::Filtered { .. } => {}
+                Initial::Powers(powers) => all.extend(powers.iter().map(|&e| Self::Power(i, e))),
+                Initial::Caputo => {
+                    all.push(Self::Level(i));
+                    if structure.order > 1.0 + ORDER_GRAIN {
+                        all.push(Self::Rate(i));
+                    }
+                    for (term, driver) in structure.terms.iter().enumerate().filter(|(_, t)| !followed(t.signal)) {
+                        for more in (0_u32..).take_while(|&k| f64::from(k) < driver.order - ORDER_GRAIN) {
+                            let exponent = structure.order - driver.order + f64::from(more);
+                            let known = [0.0, 1.0].iter().any(|e: &f64| (e - exponent).abs() < ORDER_GRAIN);
+                            if free(i, term) || !known {
+                                all.push(Self::Jump { at: (i, term), more });
+                            }
                         }
                     }
                 }
-                all
             }
-        };
-        let offsets = initial.offset_exponents(structure.order).len();
-        all.extend((0..offsets).filter_map(|i| u32::try_from(i).ok()).map(Self::Offset));
+        }
+        for (i, Equation { structure, .. }) in equations.iter().enumerate() {
+            let offsets = initial.offset_exponents(structure.order).len();
+            all.extend((0..offsets).filter_map(|k| u32::try_from(k).ok()).map(|k| Self::Offset(i, k)));
+        }
         all
     }
 
-    /// The powers of t that a unit of it is, on the level of the output: (exponent, coefficient).
-    pub(super) fn powers(self, structure: &Structure, own: &[(f64, f64)]) -> Vec<(f64, f64)> {
-        match self {
-            // Caputo's derivative of a level is 0, so an own term does not see it unless its order is 0.
-            Self::Level => std::iter::once((0.0, 1.0))
-                .chain(
-                    own.iter()
-                        .filter(|(eta, _)| *eta < structure.order - ORDER_GRAIN)
-                        .map(|&(eta, c)| (eta, -c / libm::tgamma(eta + 1.0))),
-                )
-                .collect(),
-            Self::Rate => std::iter::once((1.0, 1.0))
-                .chain(
-                    own.iter()
-                        .filter(|(eta, _)| *eta < structure.order - 1.0 - ORDER_GRAIN)
-                        .map(|&(eta, c)| (eta + 1.0, -c / libm::tgamma(eta + 2.0))),
-                )
-                .collect(),
-            Self::Jump { term, more } => {
-                vec![(structure.order - structure.terms[term].order + f64::from(more), 1.0)]
+    /// The powers of t that a unit of it is, on the level of the outputs: equation, exponent, coefficient.
+    pub(super) fn powers(self, equations: &[Equation], links: &[Vec<Link>]) -> Vec<(usize, f64, f64)> {
+        // Caputo's derivative of a level is 0, so a term does not see it unless its order is 0.
+        let unseen = |output: usize, whole: f64| {
+            let mut all = vec![(output, whole, 1.0)];
+            for (i, row) in links.iter().enumerate() {
+                for link in row.iter().filter(|link| link.output == output && link.order > whole + ORDER_GRAIN) {
+                    let exponent = link.integration + whole;
+                    all.push((i, exponent, -link.coefficient / libm::tgamma(exponent + 1.0)));
+                }
             }
-            Self::Offset(more) => vec![(structure.order + f64::from(more), 1.0)],
-            Self::Power(exponent) => vec![(exponent, 1.0)],
+            all
+        };
+        match self {
+            Self::Level(i) => unseen(i, 0.0),
+            Self::Rate(i) => unseen(i, 1.0),
+            Self::Jump { at: (i, term), more } => {
+                let structure = &equations[i].structure;
+                vec![(i, structure.order - structure.terms[term].order + f64::from(more), 1.0)]
+            }
+            Self::Offset(i, more) => vec![(i, equations[i].structure.order + f64::from(more), 1.0)],
+            Self::Power(i, exponent) => vec![(i, exponent, 1.0)],
         }
     }
 }
 
-/// Powers of t of several states together, equal exponents merged.
-pub(super) fn together(parts: impl IntoIterator<Item = (f64, f64)>) -> Vec<(f64, f64)> {
-    let mut out: Vec<(f64, f64)> = Vec::new();
-    for (exponent, value) in parts {
-        match out.iter_mut().find(|known| (known.0 - exponent).abs() < ORDER_GRAIN) {
+/// Powers of t of several states together by equation, equal exponents merged.
+pub(super) fn together(n: usize, parts: impl IntoIterator<Item = (usize, f64, f64)>) -> Vec<Vec<(f64, f64)>> {
+    let mut out: Vec<Vec<(f64, f64)>> = vec![Vec::new(); n];
+    for (i, exponent, value) in parts {
+        match out[i].iter_mut().find(|known| (known.0 - exponent).abs() < ORDER_GRAIN) {
             Some(known) => known.1 += value,
-            None => out.push((exponent, value)),
+            None => out[i].push((exponent, value)),
         }
     }
-    out.sort_by(|a, b| a.0.total_cmp(&b.0));
+    out.iter_mut().for_each(|own| own.sort_by(|a, b| a.0.total_cmp(&b.0)));
     out
 }

@@ -10,6 +10,7 @@ use super::estimate::{
     coordinates, experiment, free_equation, free_inputs, status, ExperimentArg, FreeEquationArg, FreeInputArg,
     MonomialArg,
 };
+use crate::equation::Equation;
 use crate::estimate::output_error as joint;
 use crate::friction::law::Phase;
 use crate::friction::{self, Body, FreeLaw, FrictionModel, Law, Start};
@@ -19,19 +20,23 @@ use crate::friction::{self, Body, FreeLaw, FrictionModel, Law, Start};
 pub fn friction_respond<'py>(
     py: Python<'py>,
     run: RecordArg<'py>,
-    equation: StructureArg,
-    coefficients: Vec<f64>,
+    equations: Vec<(StructureArg, Vec<f64>)>,
+    sticks: usize,
     strength: (f64, f64, f64),
-    terms: Vec<(f64, f64)>,
+    terms: Vec<Vec<(f64, f64)>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let record = record(&run)?;
     let inputs = vec![true; record.len()];
     let (coulomb, stribeck, speed) = strength;
     let friction = Law { coulomb, stribeck, speed };
-    let body = Body { structure: structure(equation, record.len(), &inputs)?, coefficients, friction };
+    let equations = equations
+        .into_iter()
+        .map(|(arg, coefficients)| Ok(Equation { structure: structure(arg, record.len(), &inputs)?, coefficients }))
+        .collect::<PyResult<_>>()?;
+    let body = Body { equations, sticks, friction };
     let motion = detached(py, || body.run(&record, &terms))?;
     let dict = PyDict::new(py);
-    dict.set_item("output", PyArray1::from_vec(py, motion.output))?;
+    dict.set_item("outputs", stacked(py, &motion.outputs)?)?;
     dict.set_item("velocity", PyArray1::from_vec(py, motion.velocity))?;
     dict.set_item("force", PyArray1::from_vec(py, motion.force))?;
     let stuck = motion.phases.iter().map(|phase| *phase == Phase::Stick).collect();
@@ -44,7 +49,8 @@ pub fn friction_respond<'py>(
 pub fn friction_error<'py>(
     py: Python<'py>,
     runs: Vec<ExperimentArg<'py>>,
-    law: FreeEquationArg,
+    laws: Vec<FreeEquationArg>,
+    sticks: usize,
     strength: [MonomialArg; 3],
     order_bounds: Vec<(f64, f64)>,
     names: Vec<String>,
@@ -59,7 +65,8 @@ pub fn friction_error<'py>(
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
     let [coulomb, stribeck, speed] = strength.map(|(factor, powers)| joint::Monomial { factor, powers });
     let model = FrictionModel {
-        equation: free_equation(law),
+        equations: laws.into_iter().map(free_equation).collect(),
+        sticks,
         friction: FreeLaw { coulomb, stribeck, speed },
         inputs: free_inputs(&inputs)?,
         order_bounds,

@@ -151,3 +151,56 @@ def exact_cart(
             left -= gone
         y[k + 1], v[k + 1] = x, w
     return y, v
+
+
+def hub_and_link(
+    force: Callable[[float], float], times: np.ndarray, hub: tuple[float, float, float], link: tuple[float, float],
+    friction: float, more: float = 0.0, speed: float = 1.0, start: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """A hub on dry friction that carries an elastic link, between its events: angles, and the hub's velocity.
+
+    D^2 x = a q + d Dq + b Dx + F - (f + fs exp(-(Dx/vs)^2)) sgn(Dx), D^2 q = - D^2 x - k q - c Dq, with (a, d, b) of
+    the hub and (k, c) of the link; the start is (x, Dx, q, Dq). Angles have shape (2, times). While the hub rests
+    the link rings by itself.
+    """
+    (a, d, b), (k, c) = hub, link
+    most, now, end = friction + more, 0.0, float(times[-1])
+    state = np.array(start, dtype=float)
+    angles, rate = np.zeros((2, times.size)), np.zeros(times.size)
+    angles[:, 0], rate[0] = state[[0, 2]], state[1]
+
+    def pull(t: float, x: np.ndarray) -> float:
+        return a * x[2] + d * x[3] + force(t)
+
+    def side_at_rest(t: float, x: np.ndarray) -> float:
+        return float(np.sign(pull(t, x))) if abs(pull(t, x)) > most else 0.0
+
+    side = float(np.sign(state[1])) or side_at_rest(0.0, state)
+    while now < end:
+
+        def motion(t: float, x: np.ndarray, s: float = side) -> list[float]:
+            away = 0.0
+            if s:
+                away = pull(t, x) + b * x[1] - s * (friction + more * np.exp(-((x[1] / speed) ** 2)))
+            return [x[1] if s else 0.0, away, x[3], -away - k * x[2] - c * x[3]]
+
+        def event(t: float, x: np.ndarray, s: float = side, begun: float = now) -> float:
+            if s:
+                return s * x[1] if t > begun + 1e-9 else 1.0
+            return abs(pull(t, x)) - most if t > begun + 1e-9 else -1.0
+
+        event.terminal, event.direction = True, -1.0 if side else 1.0
+        found = solve_ivp(motion, (now, end), state, events=event, rtol=1e-11, atol=1e-13, method="DOP853",
+                          dense_output=True, max_step=end / 1000)  # fmt: skip
+        inside = np.flatnonzero((times > now) & (times <= found.t[-1]))
+        if inside.size:
+            there = found.sol(times[inside])
+            angles[:, inside], rate[inside] = there[[0, 2]], there[1] if side else 0.0
+        now, state = float(found.t[-1]), found.y[:, -1].copy()
+        if found.status == 1:
+            if side:
+                state[1] = 0.0
+                side = side_at_rest(now, state)
+            else:
+                side = float(np.sign(pull(now, state)))
+    return angles, rate

@@ -170,8 +170,11 @@ def test_friction_terms():
         ftlm.Term("coulomb_theta21", ftlm.Order(), "c3"),
         ftlm.Term("coulomb_theta21", ftlm.Order(), "c4"),
     ]
-    with pytest.raises(ftlm.ModelError, match="friction=True makes the coupled free run non-linear"):
+    with pytest.raises(ftlm.ModelError, match="follows the hub of one stage of form='lagrange'"):
         ftlm.flexible_link(form="published", friction=True)
+    followed = ftlm.flexible_link(stage=2, coupling="simulated", friction=True)
+    assert [e.friction for e in followed.equations] == [ftlm.Friction("fc2"), None]
+    assert "coulomb_theta21" not in followed.signals
 
 
 def test_both_stages():

@@ -174,8 +174,8 @@ def test_derivatives_are_those_of_finite_differences(orders) -> None:
 
     def at(point):
         return _core.friction_error(
-            runs, law, [(1.0, [(i, 1)]) for i in (2, 3, 4)], [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 5, (True, [], 1),
-            list(point[:2]), list(point[2:7]), [], [list(point[7:10]), list(point[10:])], 1, 1e-9,
+            runs, [law], 0, [(1.0, [(i, 1)]) for i in (2, 3, 4)], [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 5,
+            (True, [], 1), list(point[:2]), list(point[2:7]), [], [list(point[7:10]), list(point[10:])], 1, 1e-9,
         )  # fmt: skip
 
     point = np.array([*orders, 0.7, 1.1, 0.6, 0.3, 0.15, 0.1, 0.2, 0.05, -0.2, 0.4, -0.1])

@@ -1,6 +1,6 @@
 //! A body that sticks: its march against a plain one, closed forms, derivatives against differences, refusals.
 
-use ftlm::equation::{AffineOrder, Initial, Structure, Term};
+use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimate::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
 use ftlm::friction::law::{Moves, Phase};
@@ -11,11 +11,8 @@ use ftlm::regressors::Record;
 
 fn body(order: f64, friction: f64) -> Body {
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
-    Body {
-        structure: Structure { output: 0, order, terms },
-        coefficients: vec![-1.0, 1.0],
-        friction: Law::coulomb(friction),
-    }
+    let structure = Structure { output: 0, order, terms };
+    Body::alone(Equation { structure, coefficients: vec![-1.0, 1.0] }, Law::coulomb(friction))
 }
 
 fn force(m: usize) -> Vec<f64> {
@@ -134,20 +131,20 @@ fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
     for (stribeck, speed) in [(-0.1, 0.2), (0.1, 0.0), (0.1, -0.2)] {
         let mut wrong = body(1.8, 0.5);
         wrong.friction = Law { stribeck, speed, ..wrong.friction };
-        assert!(matches!(wrong.run(&record, &[]), Err(Error::OutOfRange { .. })));
+        assert!(matches!(wrong.run(&record, &[vec![]]), Err(Error::OutOfRange { .. })));
     }
     let mut lost = body(1.8, 0.5);
     lost.friction.speed = f64::NAN;
-    assert!(matches!(lost.run(&record, &[]), Err(Error::NotFinite { .. })));
+    assert!(matches!(lost.run(&record, &[vec![]]), Err(Error::NotFinite { .. })));
     Ok(())
 }
 
 #[test]
 fn what_never_leaves_its_rest_is_where_it_was() -> Result<(), Error> {
     let record = Record::new(0.01, vec![vec![0.0; 400], force(400)], None)?;
-    let motion = body(2.0, 2.5).run(&record, &[(0.0, 0.7), (1.0, 0.7)])?;
+    let motion = body(2.0, 2.5).run(&record, &[vec![(0.0, 0.7), (1.0, 0.7)]])?;
     assert!(motion.velocity.iter().all(|v| *v == 0.0));
-    assert!(motion.output.iter().all(|y| (y - 0.7).abs() < 1e-15));
+    assert!(motion.outputs[0].iter().all(|y| (y - 0.7).abs() < 1e-15));
     Ok(())
 }
 
@@ -156,16 +153,17 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
     let m = 600;
     let record = Record::new(0.02, vec![vec![0.0; m], force(m)], None)?;
     let truth = body(1.9, 0.8);
-    let output = truth.run(&record, &[])?.output;
+    let output = truth.run(&record, &[vec![]])?.outputs.swap_remove(0);
     let experiment = Experiment::new(record, 1, vec![ftlm::means::point_samples(&output)], vec![1.0])?;
     let order = |constant: f64, weight: f64| AffineOrder { constant, weights: vec![weight] };
     let free = |i: usize, factor: f64| Monomial { factor, powers: vec![(i, 1)] };
     let model = FrictionModel {
-        equation: FreeEquation {
+        equations: vec![FreeEquation {
             output: 0,
             order: order(0.0, 1.0),
             terms: vec![(0, order(1.0, 0.0), free(0, -1.0)), (1, order(0.0, 0.0), free(1, 1.0))],
-        },
+        }],
+        sticks: 0,
         friction: FreeLaw::coulomb(free(2, 1.0)),
         inputs: vec![],
         order_bounds: vec![(1.2, 2.0)],
@@ -190,19 +188,19 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
 fn what_has_no_velocity_is_refused() -> Result<(), Error> {
     let record = Record::new(0.01, vec![vec![0.0; 50], vec![1.0; 50]], None)?;
     for wrong in [body(1.0, 0.5), body(2.3, 0.5), body(2.0, -0.5)] {
-        assert!(matches!(wrong.run(&record, &[]), Err(Error::OutOfRange { .. })));
+        assert!(matches!(wrong.run(&record, &[vec![]]), Err(Error::OutOfRange { .. })));
     }
     let mut fast = body(1.5, 0.5);
-    fast.structure.terms[1].order = 1.5;
-    assert!(matches!(fast.run(&record, &[]), Err(Error::OutOfRange { .. })));
+    fast.equations[0].structure.terms[1].order = 1.5;
+    assert!(matches!(fast.run(&record, &[vec![]]), Err(Error::OutOfRange { .. })));
     let mut lost = body(1.5, 0.5);
-    lost.coefficients[0] = f64::NAN;
-    assert!(lost.run(&record, &[]).is_err());
+    lost.equations[0].coefficients[0] = f64::NAN;
+    assert!(lost.run(&record, &[vec![]]).is_err());
     // Pushed away from where it is held: nothing is left of the digits of a run without friction.
     let mut tipping = body(2.0, 5.0);
-    tipping.structure.terms[0].order = 0.0;
-    tipping.coefficients[0] = 400.0;
+    tipping.equations[0].structure.terms[0].order = 0.0;
+    tipping.equations[0].coefficients[0] = 400.0;
     let long = Record::new(0.05, vec![vec![0.0; 400], vec![1.0; 400]], None)?;
-    assert!(matches!(tipping.run(&long, &[]), Err(Error::Diverged { .. })));
+    assert!(matches!(tipping.run(&long, &[vec![]]), Err(Error::Diverged { .. })));
     Ok(())
 }

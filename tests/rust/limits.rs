@@ -68,7 +68,8 @@ fn linear(law: InputLaw) -> FreeModel {
 
 fn rubbing(law: InputLaw) -> FrictionModel {
     FrictionModel {
-        equation: equation(),
+        equations: vec![equation()],
+        sticks: 0,
         friction: FreeLaw::coulomb(free(2, 1.0)),
         inputs: limited(law),
         order_bounds: vec![(1.2, 2.0)],
@@ -79,15 +80,13 @@ fn rubbing(law: InputLaw) -> FrictionModel {
 
 /// A run of a body with friction f (or none) whose input acts as a law says; the record has it as commanded.
 fn run(law: InputLaw, limit: f64, f: f64, seed: u64) -> Result<Experiment, Error> {
-    use ftlm::equation::{Structure, Term};
+    use ftlm::equation::{Equation, Structure, Term};
     let u = command(seed);
     let terms = vec![Term { signal: 0, order: 1.0 }, Term { signal: 1, order: 0.0 }];
-    let body = friction::Body {
-        structure: Structure { output: 0, order: 1.8, terms },
-        coefficients: vec![-1.0, 1.5],
-        friction: Law::coulomb(f),
-    };
-    let output = body.run(&Record::new(STEP, vec![vec![0.0; M], acting(&u, law, limit)], None)?, &[])?.output;
+    let structure = Structure { output: 0, order: 1.8, terms };
+    let body = friction::Body::alone(Equation { structure, coefficients: vec![-1.0, 1.5] }, Law::coulomb(f));
+    let record = Record::new(STEP, vec![vec![0.0; M], acting(&u, law, limit)], None)?;
+    let output = body.run(&record, &[vec![]])?.outputs.swap_remove(0);
     let record = Record::new(STEP, vec![output.clone(), u], None)?;
     Experiment::new(record, 1, vec![point_samples(&output)], vec![1.0])
 }

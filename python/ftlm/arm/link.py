@@ -10,11 +10,12 @@ both follow from the physical ones.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Literal, TypeAlias
 
 from ftlm.arm.parameters import INTEGER_ORDERS, PARAMETERS, LinkParameters
 from ftlm.base.errors import ModelError
-from ftlm.data.equations import Equation, Term
+from ftlm.data.equations import Equation, Friction, Term
 from ftlm.data.orders import Order
 from ftlm.data.structures import Hints, SensorFilter, Structure, check_offset
 from ftlm.model.model import Model
@@ -162,8 +163,10 @@ def flexible_link(
         in (8): theta_21 stands in the equation of theta_12 with alpha_2 - mu_2 + gamma_3, and so on. Of a stage alone
         these terms are of the order of their equation, alpha_2, alpha_3 or alpha_4.
     friction
-        Adds a Coulomb term c * sign(D theta_j1) to the hub's equation, in the published form to both; needs measured
-        coupling.
+        Adds Coulomb friction to the hub's equation. With ``coupling="simulated"``, in the Lagrange form, it is
+        - fc_j * sign(D theta_j1) of the velocity that the model itself gives, set-valued at rest (:class:`Friction`),
+        for one stage, by output error: the hub sticks and slips while its link rings. With measured coupling it is a
+        linear term c * coulomb_theta_j1 of the sign of the measured velocity, in the published form of both equations.
     cross_sensitivity
         Adds hub angles as they are (order 0) to the deflection's equation: strain gauges and cables make a measured
         deflection follow the hub's angle. e_2 theta_11 in that of theta_12, and with ``cross_stage="inertial"``
@@ -220,8 +223,12 @@ def flexible_link(
         raise ModelError(f"parameters = {parameters!r} is not known; use {' or '.join(map(repr, PARAMETERS))}")
     if coupling is None:
         coupling = "measured" if form == "lagrange" else "simulated"
-    if friction and coupling == "simulated":
-        raise ModelError("friction=True makes the coupled free run non-linear; use coupling='measured'")
+    if friction and coupling == "simulated" and (form != "lagrange" or stage == "both"):
+        raise ModelError(
+            "friction=True with coupling='simulated' follows the hub of one stage of form='lagrange', where it does "
+            "not enter the link's equation; name the stage and that form, or use coupling='measured', whose friction "
+            "has the sign of the measured velocity"
+        )
     if not hub and (form != "lagrange" or coupling == "simulated" or friction):
         raise ModelError(
             "hub=False leaves the deflection to the measured hub: it needs form='lagrange' and coupling='measured', "
@@ -234,7 +241,9 @@ def flexible_link(
     for j in stages:
         named = input_order if form == "published" else None
         orders = order_law(j, form=form, input_order=named, velocities="velocities" in laws)
-        made = _stage(j, form, orders, laws, friction)
+        made = _stage(j, form, orders, laws, friction and coupling == "measured")
+        if friction and coupling == "simulated":
+            made = (replace(made[0], coulomb=Friction(f"fc{j}", -1.0)), made[1])
         if cross_stage:
             made = _pushed(made, j, laws, stage == "both") if cross_stage == "inertial" else _twisted(made, j)
         if cross_sensitivity:

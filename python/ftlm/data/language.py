@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 from msgspec import UNSET
 
@@ -34,6 +35,7 @@ def equation(
     initial: str | Iterable[float] = "auto",
     sensor_filter: SensorFilter | None = None,
     offset: str | None = None,
+    coupling: Literal["measured", "simulated"] | None = None,
 ) -> Structure:
     """Any linear fractional equation, in words.
 
@@ -68,6 +70,9 @@ def equation(
         ``"constant"``: an unknown constant on the right-hand side of each equation, as ``+ c`` says in words;
         ``"ramp"``: a constant and a constant times t; ``"none"``. One each run, estimated with the coefficients and
         never carried to another run. Default what the text says.
+    coupling
+        Of several equations: ``"measured"``, each is driven by the other outputs as they were measured, the default;
+        ``"simulated"``, all follow from the other signals alone, as they do by default where one of them has friction.
 
     Returns
     -------
@@ -93,9 +98,13 @@ def equation(
         if not math.isfinite(real_number(f"fixed coefficient {name}", value)):
             raise ModelError(f"fixed coefficient {name} = {value} is not finite; give a number")
     equations = [e.with_coefficients(fixed) for e in equations]
+    if coupling is None:
+        rubs = len(equations) > 1 and any(e.friction is not None for e in equations)
+        coupling = "simulated" if rubs else "measured"
     structure = (
         Structure(
             equations=tuple(equations),
+            coupling=coupling,
             initial=check_initial(initial),
             sensor_filter=sensor_filter,
             offset=_offset_of([(item, found) for item, found, _ in parsed], offset),

@@ -261,14 +261,26 @@ class Structure:
         """Whether the output of an equation may stick."""
         return any(e.friction is not None for e in self.equations)
 
+    @property
+    def sticks(self) -> int:
+        """Place of the equation with friction, the first one where there are several; 0 without."""
+        return next((i for i, e in enumerate(self.equations) if e.friction is not None), 0)
+
     def _check_friction(self) -> None:
         """Refuse what a free run with friction does not know yet."""
-        first = next(e.output for e in self.equations if e.friction is not None)
-        words = f"the equation of {first} has friction"
-        if len(self.equations) > 1:
+        rubbing = [e.output for e in self.equations if e.friction is not None]
+        words = f"the equation of {rubbing[0]} has friction"
+        if len(rubbing) > 1:
             raise ModelError(
-                f"{words}, and the structure {len(self.equations)} equations: friction is followed in one equation by "
-                "itself, driven by the other signals as measured: give it alone"
+                f"the equations of {' and '.join(rubbing)} have friction: a free run follows one body that may stick, "
+                "and bodies that drive it and that it drives; leave the friction of the others out, or follow each in "
+                "a structure of its own, driven by the other signals as measured"
+            )
+        if len(self.equations) > 1 and self.coupling == "measured":
+            raise ModelError(
+                f"{words}, and the structure {len(self.equations)} equations with measured coupling: driven by "
+                f"measured signals they share no free run, so give that of {rubbing[0]} a structure of its own, or "
+                "follow them together with coupling='simulated'"
             )
         if self.sensor_filter is not None:
             raise ModelError(
@@ -277,8 +289,11 @@ class Structure:
             )
         if self.free_delays:
             raise ModelError(f"{words}, and the delay of {', '.join(self.free_delays)} is free; give it in seconds")
-        if self.coefficient_law:
-            raise ModelError(f"{words}, and its coefficients follow a law; leave one of the two out")
+        tied = {n for name, _, factors in self.coefficient_law for n in (name, *factors)}
+        rubs = self.equations[self.sticks].friction
+        held = [n for n in (() if rubs is None else rubs.names) if n in tied]
+        if held:
+            raise ModelError(f"{words}, and a law ties its {held[0]} to other coefficients; leave one of the two out")
         if isinstance(self.initial, History) or self.initial == "history":
             raise ModelError(
                 f"{words}: powers of t for an unknown past would give it velocities that it never had; use "

@@ -10,14 +10,15 @@ from msgspec import UNSET, UnsetType
 
 from ftlm.base.errors import DataError, FtlmError
 from ftlm.base.statistics import noise_of
-from ftlm.data.equations import Friction, Stribeck, Term
+from ftlm.data.equations import Equation, Friction, Stribeck, Term
 from ftlm.data.orders import Order
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.grid import FINEST, Attempt, Grid
-from ftlm.fit.problem import FreeProblem
+from ftlm.fit.problem import FRICTION_BOUNDS, FreeProblem
 from ftlm.fit.race import COARSE_SAMPLES, FINALISTS, FIRST_LAP, SECOND_LAP, Laps, race
+from ftlm.fit.sliding import slid
 from ftlm.solve.records import COULOMB
 
 #: Friction at a start as shares of the force that drives the body, from next to none upwards.
@@ -27,6 +28,8 @@ MULTIPLES = (1.0, 0.3)
 #: Stribeck friction at a start as shares of Coulomb's, and its speed as shares of that of the body.
 NEAR = (0.02, 0.2, 1.0)
 FALLS = (0.05, 0.2, 0.6)
+#: What hangs on a body at a start, as shares of the body's own inertia.
+CARRIED = (0.1, 0.3, 1.0, 3.0)
 #: A body that moves by less than this many deviations of its noise, peak to peak, has not moved.
 STILL = 10.0
 
@@ -43,7 +46,7 @@ def race_with_friction(
     problem, runs = alike.problem, alike.runs
     structure = problem.structure
     check_moves(runs, structure)
-    rubs = structure.equations[0].friction
+    rubs = structure.equations[structure.sticks].friction
     if rubs is None:
         return race(alike, floor, threads, progress)
     coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
@@ -55,12 +58,71 @@ def race_with_friction(
             values = dict(zip(less.names, attempt.values.tolist(), strict=True))
             starts += falling(coarse, values, rubs.stribeck, attempt.origin)
         return raced(coarse, starts, threads)
-    signed = with_measured_sign(structure, rubs)
-    reached = race(replace(alike, problem=FreeProblem.of(signed)), floor, threads, progress)
+    # Driven by measured signals, each of several bodies is told from its own equation, whatever the others do.
+    signed = FreeProblem.of(replace(with_measured_sign(structure, rubs), coupling="measured"))
+    reached = race(replace(alike, problem=signed), floor, threads, progress)
     for attempt in reached[:FINALISTS]:
-        values = dict(zip(FreeProblem.of(signed).names, attempt.values.tolist(), strict=True))
+        values = dict(zip(signed.names, attempt.values.tolist(), strict=True))
         starts += started(coarse, values, rubs, attempt.origin)
+    if len(structure.equations) > 1 and reached:
+        values = dict(zip(signed.names, reached[0].values.tolist(), strict=True))
+        starts += carrying(problem, runs, {**values, **signed.named(reached[0].coefficients)})
     return raced(coarse, starts, threads)
+
+
+def carrying(problem: FreeProblem, runs: Sequence[Run], values: dict[str, float]) -> list[Attempt]:
+    """Starts of a body by itself, with what hangs on it put back as action and reaction ask for, shares of its inertia.
+
+    The others are as they are when the measured body drives them; the body itself, driven by measured others, may be
+    explained by what they tell of its motion, without what drives it and without friction.
+    """
+    structure = problem.structure
+    item = structure.equations[structure.sticks]
+    if item.friction is None:
+        return []
+    alone = structure.equation(item.output)
+    kept = tuple(t for t in alone.equations[0].terms if t.signal not in structure.outputs or t.signal == item.output)
+    if not kept:
+        return []
+    alone = replace(alone, equations=(replace(alone.equations[0], terms=kept),))
+    bounds = dict(zip(problem.orders, problem.bounds, strict=True))
+    usual = {n: 0.0 for n in alone.order_names} | {
+        n: 1.0 for t in kept if t.signal == item.output for n in t.order.names
+    } | {n: FRICTION_BOUNDS[1] for n in item.order.names}  # fmt: skip
+    shared = {n for e in structure.equations if e is not item for n in e.order_names}
+    orders = {n: values[n] if n in shared and n not in item.order.names else v for n, v in usual.items()}
+    orders = {n: min(max(v, bounds[n][0]), bounds[n][1]) if n in bounds else v for n, v in orders.items()}
+    numbers = slid(runs, alone.with_orders(orders))
+    out = []
+    for share in CARRIED if numbers else ():
+        # What drives it and brakes it moves the others, too.
+        found = {**values, **reacting(structure, values, share), **{n: (1.0 + share) * v for n, v in numbers.items()}}
+        free = dict(zip(problem.coefficients, problem.free_from(found), strict=True))
+        rest = {n: v for n, v in {**values, **orders}.items() if n in problem.names}
+        out.append(at(problem, {**rest, **free}, f"{item.output} by itself, carrying {share:g} of its inertia"))
+    return out
+
+
+def reacting(structure: Structure, values: dict[str, float], share: float) -> dict[str, float]:
+    """Coefficients by which others act on the body: against what moves them, by their inertia over its own."""
+    item = structure.equations[structure.sticks]
+    out: dict[str, float] = {}
+    for other in structure.equations:
+        if other is item:
+            continue
+        named = {**values, **{n: 0.0 for n in other.order_names if n not in values}}
+
+        def highest(term: Term, named: dict[str, float] = named) -> float:
+            return term.order.constant + sum(w * named[n] for n, w in term.order.weights)
+
+        own = sorted((t for t in other.terms if t.signal == other.output), key=highest)
+        back = sorted((t for t in item.terms if t.signal == other.output), key=highest)
+        for there, here in zip(own, back, strict=False):
+            if not isinstance(here.coefficient, str):
+                continue
+            value = there.fixed if there.fixed is not None else there.factor * values[str(there.coefficient)]
+            out[here.coefficient] = -share * value / here.factor
+    return out
 
 
 def raced(coarse: Grid, starts: list[Attempt], threads: int) -> list[Attempt]:
@@ -75,7 +137,7 @@ def raced(coarse: Grid, starts: list[Attempt], threads: int) -> list[Attempt]:
 
 def check_moves(runs: Sequence[Run], structure: Structure) -> None:
     """Refuse runs in none of which the body moves."""
-    output = structure.outputs[0]
+    output = structure.outputs[structure.sticks]
     if all(float(np.ptp(read(run[output]))) <= STILL * noise_of(run[output]) for run in runs):
         raise DataError(
             f"{output} never moves beyond its noise in {', '.join(r.name for r in runs)}, and a body that only rests "
@@ -85,14 +147,20 @@ def check_moves(runs: Sequence[Run], structure: Structure) -> None:
 
 def with_friction(structure: Structure, rubs: Friction | UnsetType) -> Structure:
     """The structure with other friction, or none."""
-    return replace(structure, equations=(replace(structure.equations[0], coulomb=rubs),))
+    return changed(structure, replace(structure.equations[structure.sticks], coulomb=rubs))
 
 
 def with_measured_sign(structure: Structure, rubs: Friction) -> Structure:
     """The structure with the sign of the measured velocity as a signal in the place of friction."""
-    item = structure.equations[0]
+    item = structure.equations[structure.sticks]
     term = Term(f"{COULOMB}{item.output}", Order(), rubs.coefficient, rubs.factor)
-    return replace(structure, equations=(replace(item, terms=(*item.terms, term), coulomb=UNSET),))
+    return changed(structure, replace(item, terms=(*item.terms, term), coulomb=UNSET))
+
+
+def changed(structure: Structure, item: Equation) -> Structure:
+    """The structure with another equation of the body that may stick."""
+    before = structure.equations
+    return replace(structure, equations=(*before[: structure.sticks], item, *before[structure.sticks + 1 :]))
 
 
 def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str) -> list[Attempt]:
@@ -112,7 +180,7 @@ def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str)
         # Without any friction it runs away.
         return out
     values = {**values, **dict(zip(linear.names, without.values.tolist(), strict=True))}
-    force = driving(coarse.runs, plain.with_coefficients({n: values[n] for n in plain.coefficient_names}))
+    force = driving(coarse.runs, identified_body(linear, values))
     for share in SHARES if force > 0 else ():
         strength = share * force / -rubs.factor
         out.append(at(problem, {**values, name: strength}, f"{origin}, friction {share:g} of what drives"))
@@ -122,13 +190,13 @@ def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str)
 def falling(coarse: Grid, values: dict[str, float], more: Stribeck, origin: str) -> list[Attempt]:
     """Starts at numbers of a fit with Coulomb friction alone, with some more of it at low speeds."""
     problem = coarse.problem
-    rubs = problem.structure.equations[0].friction
+    rubs = problem.structure.equations[problem.structure.sticks].friction
     fc = (
         abs(rubs.factor) * values.get(str(rubs.coefficient), 0.0) if rubs is not None and rubs.strength is None else 0.0
     )
     fc = fc or (0.0 if rubs is None else rubs.strength or 0.0)
-    plain = with_friction(problem.structure, UNSET)
-    size = fc or driving(coarse.runs, plain.with_coefficients({n: values[n] for n in plain.coefficient_names}))
+    plain = FreeProblem.of(with_friction(problem.structure, UNSET))
+    size = fc or driving(coarse.runs, identified_body(plain, values))
     pace = speed_of(coarse)
     forces = (
         [(NEAR[0], None)] if not isinstance(more.coefficient, str) else [(n, n * size / -more.factor) for n in NEAR]
@@ -145,7 +213,7 @@ def falling(coarse: Grid, values: dict[str, float], more: Stribeck, origin: str)
 
 def speed_of(coarse: Grid) -> float:
     """Root mean square of the body's measured speed, over intervals that noise does not fill."""
-    output = coarse.problem.structure.outputs[0]
+    output = coarse.problem.structure.outputs[coarse.problem.structure.sticks]
     parts = [np.diff(read(run[output])[:: coarse.decimation]) / (run.step * coarse.decimation) for run in coarse.runs]
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
@@ -156,9 +224,16 @@ def at(problem: FreeProblem, values: dict[str, float], origin: str) -> Attempt:
     return Attempt(orders, coefficients, origin, {}, inputs)
 
 
-def driving(runs: Sequence[Run], structure: Structure) -> float:
+def identified_body(problem: FreeProblem, values: dict[str, float]) -> Equation:
+    """The equation of the body that may stick, without its friction, at named values."""
+    structure = problem.structure
+    coefficients = problem.named([values[n] for n in problem.coefficients])
+    item = structure.equations[structure.sticks]
+    return item.with_coefficients({n: coefficients[n] for n in item.coefficient_names})
+
+
+def driving(runs: Sequence[Run], item: Equation) -> float:
     """Root mean square of the largest force that another signal exerts by itself [unit of D^alpha y]."""
-    item = structure.equations[0]
     sizes = [0.0]
     for term in item.terms:
         if term.signal == item.output or term.order.names or term.order.constant != 0:

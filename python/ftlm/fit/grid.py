@@ -188,7 +188,7 @@ def _with_friction(
     structure = problem.structure
     known = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
     return _core.friction_error(
-        experiments, problem.laws(structure.signals)[0], problem.strength(), bounds, coordinates,
+        experiments, problem.laws(structure.signals), structure.sticks, problem.strength(), bounds, coordinates,
         initial_tuple(structure.initial, structure.offset), attempt.orders, attempt.coefficients, inputs, known,
         evaluations, tolerance,
     )  # fmt: skip

@@ -98,7 +98,11 @@ class FreeProblem:
         if structure.has_friction:
             # A velocity needs inertia, and friction of it an order of 2 at most.
             ends = dict(zip(structure.order_names, bounds, strict=True))
-            inertia = {n: (max(ends[n][0], FRICTION_BOUNDS[0]), min(ends[n][1], FRICTION_BOUNDS[1])) for n in highest}
+            body = structure.equations[structure.sticks].order
+            inertia = {
+                n: (max(ends[n][0], FRICTION_BOUNDS[0]), min(ends[n][1], FRICTION_BOUNDS[1]))
+                for n in (body.names if body.is_single else ())
+            }
             bounds = list((ends | inertia).values())
         coefficients = tuple(dict.fromkeys(free))
         return cls(structure, structure.order_names, coefficients, tuple(bounds), products, structure.free_inputs)
@@ -140,8 +144,8 @@ class FreeProblem:
         ]  # fmt: skip
 
     def strength(self) -> list[tuple[float, list[tuple[int, int]]]]:
-        """Numbers fc, fs and vs of the friction of the only equation, as monomials in the free coefficients."""
-        rubs = self.structure.equations[0].friction or Friction(0.0)
+        """Numbers fc, fs and vs of the friction of the body that may stick, as monomials in the free coefficients."""
+        rubs = self.structure.equations[self.structure.sticks].friction or Friction(0.0)
         more = rubs.stribeck or Stribeck(0.0, 1.0)
 
         def monomial(coefficient: str | float, factor: float) -> tuple[float, list[tuple[int, int]]]:

@@ -305,10 +305,11 @@ def one_sided(model: Model, free: Sequence[Sampled]) -> list[str]:
     """Warn where friction and an offset do the same: the body slides in one direction only."""
     if not model.structure.has_friction or model.structure.offset == "none":
         return []
-    output = model.outputs[0]
+    sticks = model.structure.sticks
+    output = model.outputs[sticks]
     for run in free:
-        moved = np.diff(run.outputs[0])
-        least = TURNED * float(np.ptp(run.outputs[0]))
+        moved = np.diff(run.outputs[sticks])
+        least = TURNED * float(np.ptp(run.outputs[sticks]))
         if np.any(moved > least) and np.any(moved < -least):
             return []
     return [

@@ -1,7 +1,8 @@
-"""Free runs of a body that may stick, and what a run of it starts with."""
+"""Free runs of bodies one of which may stick, and what a run of them starts with."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,23 +21,30 @@ EVALUATIONS = 60
 STILL = 1e-12
 
 
-def motion_with_friction(item: Equation, rec: Record, powers: list[tuple[float, float]]) -> _core._Motion:
-    """Output and velocity of an identified equation with friction, its initial terms given as (exponent, coefficient).
+def motion_with_friction(model: Solved, rec: Record, powers: Sequence[Sequence[tuple[float, float]]]) -> _core._Motion:
+    """Outputs of identified equations one of which has friction, initial terms by equation as (exponent, coefficient).
 
     Returns
     -------
     dict
-        ``output`` (pulse means), ``velocity`` (at the edges of the pulses, one more; exactly 0 at rest), ``force``
-        (mean of the friction over each pulse, in the unit of D^alpha y) and ``stuck`` (whether the body is at rest at
-        the end of each).
+        ``outputs`` (pulse means, a row an equation), of the body with friction ``velocity`` (at the edges of the
+        pulses, one more; exactly 0 at rest), ``force`` (mean of the friction over each pulse, in the unit of
+        D^alpha y) and ``stuck`` (whether it is at rest at the end of each).
     """
-    strength = (item.friction or Friction(0.0)).law
-    coefficients = [float(t.fixed or 0.0) for t in item.terms]
-    return _core.friction_respond(rec.core(), linear_tuple(item, rec.signals), coefficients, strength, powers)
+    equations = [(linear_tuple(e, rec.signals), [float(t.fixed or 0.0) for t in e.terms]) for e in model.equations]
+    sticks = model.structure.sticks
+    return _core.friction_respond(
+        rec.core(), equations, sticks, strength(model.equations[sticks]), [list(terms) for terms in powers]
+    )
+
+
+def strength(item: Equation) -> tuple[float, float, float]:
+    """Numbers fc, fs and vs of an equation's friction."""
+    return (item.friction or Friction(0.0)).law
 
 
 def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | None = None) -> dict[str, Any]:
-    """Initial terms and offset that bring a free run with friction closest to a run, ``every`` pulses an interval.
+    """Initial terms and offsets that bring a free run with friction closest to a run, ``every`` pulses an interval.
 
     They change when a body sticks and slides, so that they are found by descent, from where and how fast the run starts
     or from states that are near.
@@ -44,36 +52,43 @@ def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | 
     Returns
     -------
     dict
-        As the core's joint fit, without anything free: ``states``, and ``powers``, their (exponent, coefficient).
+        As the core's joint fit, without anything free: ``states``, and ``powers``, their (exponent, coefficient) by run
+        and equation.
     """
-    item = model.equations[0]
     check_regular(run, model)
-    samples = run[item.output]
+    samples = np.stack([run[name] for name in model.outputs])
     known = ~np.isnan(samples)
-    size = float(np.std(samples[known]))
+    sizes = np.nanstd(samples, axis=1)
     shares: Floats | None = None
     if not known.all():
-        shares = np.where(known[1:-1], 1.0, 0.0)[None]
+        shares = np.ascontiguousarray(np.where(known[:, 1:-1], 1.0, 0.0))
     experiment = (
-        rec.core(), every, np.where(known, samples, 0.0)[None], None, [1.0 / size if size > 0 else 1.0],
+        rec.core(), every, np.where(known, samples, 0.0), None, [1.0 / s if s > 0 else 1.0 for s in sizes.tolist()],
         [(None, False)] * len(rec.signals), shares, None,
     )  # fmt: skip
-    output, alpha, terms = linear_tuple(item, rec.signals)
-    law: tuple[int, tuple[float, list[float]], list[Any]] = (
-        output, (alpha, []),
-        [(s, (order, []), (float(t.fixed or 0.0), [])) for (s, order), t in zip(terms, item.terms, strict=True)],
-    )  # fmt: skip
-    strength: list[tuple[float, list[Any]]] = [(x, []) for x in (item.friction or Friction(0.0)).law]
+    laws = [known_law(item, rec.signals) for item in model.equations]
+    sticks = model.structure.sticks
+    rubs: list[tuple[float, list[Any]]] = [(x, []) for x in strength(model.equations[sticks])]
     return _core.friction_error(
-        [experiment], law, strength, [], [], initial_tuple(rec.initial, rec.offset), [], [], [],
+        [experiment], laws, sticks, rubs, [], [], initial_tuple(rec.initial, rec.offset), [], [], [],
         [] if near is None else [near], EVALUATIONS, STILL,
     )  # fmt: skip
+
+
+def known_law(item: Equation, signals: Sequence[str]) -> tuple[int, tuple[float, list[float]], list[Any]]:
+    """An identified equation as the core takes one in which everything might be free."""
+    output, alpha, terms = linear_tuple(item, signals)
+    numbers: list[Any] = [
+        (s, (order, []), (float(t.fixed or 0.0), [])) for (s, order), t in zip(terms, item.terms, strict=True)
+    ]
+    return output, (alpha, []), numbers
 
 
 def check_regular(run: Run, model: Solved) -> None:
     """Refuse samples at times of their own."""
     if has_own_times(run, model.structure):
+        output = model.outputs[model.structure.sticks]
         raise ModelError(
-            f"run {run.name!r} has rows at times of their own, and the equation of {model.outputs[0]} has friction, "
+            f"run {run.name!r} has rows at times of their own, and the equation of {output} has friction, "
             "which is followed at regular times; resample the run yourself"
         )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -101,7 +102,7 @@ def refined(
     if initial is None and model.structure.has_friction:
         # Level and velocity at the start are found by descent, whose ends scatter by more than steps move them.
         rec = record(run, model.structure, FRICTION_REFINEMENT * own)
-        initial = {model.outputs[0]: dict(begun(model, run, rec, FRICTION_REFINEMENT)["powers"][0])}
+        initial = begun_terms(model, begun(model, run, rec, FRICTION_REFINEMENT))
     elif initial is None:
         model = started(model, run)
     times = run.time if on_grid and has_own_times(run, model.structure) else own_times(model, run)
@@ -131,6 +132,11 @@ def _like(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
     """Initial terms of these outputs and exponents with other values."""
     left = iter(values.tolist())
     return {o: {e: next(left) for e in powers} for o, powers in terms.items()}
+
+
+def begun_terms(model: Solved, found: Mapping[str, Any]) -> dict[str, dict[float, float]]:
+    """Initial terms by output and exponent of the only run of a fit with friction."""
+    return {o: dict(terms) for o, terms in zip(model.outputs, found["powers"][0], strict=True)}
 
 
 def own_times(model: Solved, run: Run) -> Floats | None:
@@ -185,7 +191,7 @@ def sampled(
         kept = {o: dict(initial.get(o, {})) for o in model.outputs}
         return _read(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
     if model.structure.has_friction:
-        kept = {model.outputs[0]: dict(begun(model, run, rec, every)["powers"][0])}
+        kept = begun_terms(model, begun(model, run, rec, every))
         return _read(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
     names = [
         (e.output, power)
@@ -247,8 +253,7 @@ def _fitted(
 def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
     """Pulse means of the outputs, before the sensor filter: all together, or each driven by the measured others."""
     if model.structure.has_friction:
-        item = model.equations[0]
-        return motion_with_friction(item, rec, sorted(terms[item.output].items()))["output"][None]
+        return motion_with_friction(model, rec, [sorted(terms[o].items()) for o in model.outputs])["outputs"]
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
     powers = [sorted(terms[o].items()) for o in model.outputs]
     inputs = list(rec.inputs)

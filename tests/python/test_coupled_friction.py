@@ -1,0 +1,361 @@
+"""A hub that sticks with a link that hangs on it: both from the current alone, against events; words; estimates."""
+
+from __future__ import annotations
+
+from math import gamma
+
+import numpy as np
+import pytest
+
+import friction
+import ftlm
+from ftlm import _core
+from ftlm.errors import DataError, ModelError
+
+#: Hub (a, d, b) and link (k, c): D^2 x = a q + d Dq + b Dx + u - friction, D^2 q = - D^2 x - k q - c Dq.
+HUB, LINK = (30.0, 0.4, -1.5), (90.0, 1.2)
+WORDS = "D^2 x = a q + d D q - b D x + g u - fc*sign(D x); D^2 q = - 1 D^2 x - k q - e D q"
+TRUTH = {"a": 30.0, "d": 0.4, "b": 1.5, "g": 1.0, "k": 90.0, "e": 1.2}
+END = 4.0
+
+
+def force(t):
+    return 6.0 * np.sin(2.1 * t) + 3.0 * np.sin(5.3 * t + 0.4)
+
+
+def equations(hub=HUB, link=LINK):
+    """The core's two equations over (x, q, u)."""
+    (a, d, b), (k, c) = hub, link
+    return [
+        ((0, 2.0, [(1, 0.0), (1, 1.0), (0, 1.0), (2, 0.0)]), [a, d, b, 1.0]),
+        ((1, 2.0, [(0, 2.0), (1, 0.0), (1, 1.0)]), [-1.0, -k, -c]),
+    ]
+
+
+def motion(means, step, strength, powers=((), ()), model=None, sticks=0):
+    law = strength if isinstance(strength, tuple) else (strength, 0.0, 1.0)
+    record = (step, np.stack([np.zeros_like(means), np.zeros_like(means), means]), None)
+    return _core.friction_respond(record, model or equations(), sticks, law, [list(p) for p in powers])
+
+
+def averaged(m: int) -> np.ndarray:
+    """Pulse means of the force."""
+    fine = (np.arange(50 * m) + 0.5) * END / (50 * m)
+    return force(fine).reshape(m, 50).mean(axis=1)
+
+
+def started(x: float, dx: float, q: float, dq: float) -> list[list[tuple[float, float]]]:
+    """Powers of t of a start: those of Caputo, what a term sees of a level or a velocity taken out."""
+    (_, d, b), (_, c) = HUB, LINK
+    hub = {0.0: x, 1.0: dx - d * q - b * x}
+    link = {0.0: q + x, 1.0: dq + dx + c * q}
+    return [list(p.items()) for p in (hub, link)]
+
+
+def run_of(u, x, q, step, name="run", *, held=False):
+    return ftlm.Run.from_arrays(
+        step=step, inputs={"u": u}, outputs={"x": x, "q": q}, intersample={"u": "zoh" if held else "foh"}, name=name
+    )
+
+
+def model_of(fc: float, words: str = WORDS, **more: float) -> ftlm.Model:
+    return ftlm.Model(ftlm.equation(words, fixed={**TRUTH, "fc": fc, **more}))
+
+
+# ------------------------------------------------------------------------------------------------------------ free runs
+
+
+@pytest.mark.parametrize(
+    ("law", "start"),
+    [
+        ((4.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.0)),
+        ((6.0, 0.0, 1.0), (0.3, 1.0, 0.05, -0.4)),
+        ((3.0, 3.0, 0.2), (0.0, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_the_free_run_converges_to_that_between_events(law, start) -> None:
+    times = np.linspace(0.0, END, 8001)
+    angles, v = friction.hub_and_link(force, times, HUB, LINK, *law, start=start)
+    assert 0.1 < np.mean(v == 0.0) < 0.9
+    assert np.ptp(np.sign(v)) == 2.0
+    size = np.max(np.abs(angles), axis=1)
+    errors, slips = [], []
+    for m in (500, 1000, 2000):
+        found = motion(averaged(m), END / m, law, started(*start))
+        middles, edges = (np.arange(m) + 0.5) * END / m, np.arange(m + 1) * END / m
+        exact = np.stack([np.interp(middles, times, row) for row in angles])
+        errors.append(np.max(np.abs(found["outputs"] - exact), axis=1) / size)
+        slips.append(np.max(np.abs(found["velocity"] - np.interp(edges, times, v))))
+    assert np.all(errors[2] < 1e-4)
+    # The second order in the step, events and all: a sixteenth for a quarter, up to where in its pulse each one lies.
+    assert np.all(errors[2] < errors[0] / 8.0)
+    assert slips[2] < slips[0] / 10.0
+
+
+def test_what_sticks_stands_while_its_link_rings() -> None:
+    m, step = 2000, 0.002
+    found = motion(np.concatenate([np.full(200, 8.0), np.zeros(m - 200)]), step, 3.0)
+    stuck = found["stuck"]
+    last = int(np.flatnonzero(~stuck)[-1])
+    assert last < m // 2
+    assert not found["velocity"][last + 2 :].any()
+    x, q = found["outputs"]
+    assert np.ptp(x[last + 3 :]) < 1e-15 * np.max(np.abs(x)) * m
+    # Clamped, the link is the oscillator D^2 q = - k q - c Dq.
+    k, c = LINK
+    rings = q[last + 3 :]
+    crossings = np.flatnonzero(np.diff(np.sign(rings)) != 0)
+    assert len(crossings) > 5
+    period = 2 * step * np.mean(np.diff(crossings))
+    assert period == pytest.approx(2 * np.pi / np.sqrt(k - c * c / 4), rel=0.01)
+
+
+def arm(nu: float):
+    """Orders of the arm: the link carries the hub above its own order, below it, or at it."""
+    return [
+        ((0, 1.9, [(1, 0.3), (1, 1.0), (0, 0.95), (2, 0.0)]), [30.0, 0.4, -1.5, 1.0]),
+        ((1, 2.0, [(0, nu), (1, 0.2), (1, 0.8)]), [-1.0, -90.0, -2.0]),
+    ]
+
+
+#: Two bodies, either of which may stick.
+CHAIN = [
+    ((0, 2.0, [(1, 0.0), (0, 1.0), (0, 0.0)]), [20.0, -1.0, -20.0]),
+    ((1, 1.8, [(0, 0.0), (1, 0.9), (2, 0.0)]), [5.0, -2.0, 3.0]),
+]
+
+
+@pytest.mark.parametrize(
+    ("model", "sticks", "level"),
+    [
+        (equations(), 0, 0.3),
+        (arm(2.15), 0, 0.0),
+        (arm(1.9), 0, 0.3),
+        (arm(2.0), 0, 0.3),
+        (CHAIN, 0, 0.3),
+        (CHAIN, 1, 0.3),
+    ],
+)
+def test_without_friction_it_is_the_linear_free_run(model, sticks: int, level: float) -> None:
+    means = averaged(1000)
+    record = (END / 1000, np.stack([0 * means, 0 * means, means]), None)
+    powers = [[(0.0, level), (1.0, -0.2)], [(0.0, 0.1), (1.0, 0.3), (2.0, 0.2)]]
+    linear = _core.respond(record, model, [False, False, True], powers)
+    found = motion(means, END / 1000, 0.0, powers, model, sticks)["outputs"]
+    np.testing.assert_allclose(found, linear, atol=1e-9 * np.max(np.abs(linear)))
+
+
+@pytest.mark.parametrize("nu", [2.15, 1.9, 2.0])
+def test_where_a_hub_starts_moves_nothing(nu: float) -> None:
+    # No term sees the level itself, and every one that differentiates it has its power of t.
+    means, eta = averaged(1000), 2.0 - nu
+    base = motion(means, END / 1000, 3.0, model=arm(nu))
+    level = 5.0
+    own = {0.0: level, 1.9 - 0.95: 1.5 * level / gamma(1.95)}
+    powers = [list(own.items()), [(eta, level / gamma(eta + 1.0))]]
+    moved = motion(means, END / 1000, 3.0, powers, arm(nu))
+    np.testing.assert_allclose(moved["velocity"], base["velocity"], atol=1e-10)
+    np.testing.assert_allclose(moved["outputs"][0] - level, base["outputs"][0], atol=1e-9)
+    np.testing.assert_allclose(moved["outputs"][1], base["outputs"][1], atol=1e-9)
+
+
+# ------------------------------------------------------------------------------------------------------- sensitivities
+
+
+@pytest.mark.parametrize("orders", [(1.9, 0.95, 2.1), (1.8, 0.9, 1.95), (1.95, 1.1, 2.0)])
+def test_derivatives_are_those_of_finite_differences(orders) -> None:
+    rng = np.random.default_rng(1)
+
+    def experiment(m: int, every: int):
+        u = 8 * np.sin(0.012 * np.arange(m)) + 1.3 * rng.normal(size=m) + 0.2
+        samples = rng.normal(size=(2, m // every + 1))
+        record = (0.004, np.stack([0 * u, 0 * u, u]), None)
+        return (record, every, samples, None, [1.3, 5.0], [(None, False)] * 3, None, None)
+
+    runs = [experiment(400, 1), experiment(600, 2)]
+
+    def order(constant: float, free: int | None = None):
+        return constant, [1.0 if k == free else 0.0 for k in range(3)]
+
+    # Free orders are alpha and gamma of the hub and that of the hub in the link; the link's stiffness is a product.
+    laws = [
+        (0, order(0.0, 0), [(1, order(0.2), (1.0, [(0, 1)])), (0, order(0.0, 1), (-1.0, [(1, 1)])),
+                            (2, order(0.0), (1.0, [(2, 1)]))]),
+        (1, order(2.0), [(0, order(0.0, 2), (-1.0, [])), (1, order(0.2), (-1.0, [(0, 1), (3, 1)])),
+                         (1, order(0.8), (-1.0, [(4, 1)]))]),
+    ]  # fmt: skip
+    count, states = 9, 2 * 6
+    law = [(1.0, [(5, 1)]), (0.4, [(5, 1)]), (0.2, [])]
+
+    def at(point):
+        return _core.friction_error(
+            runs, laws, 0, law, [(1.05, 2.0), (0.0, 1.5), (0.0, 2.5)], ["plain"] * 6, (True, [], 1), list(point[:3]),
+            list(point[3:count]), [], [list(point[count : count + 6]), list(point[count + 6 :])], 1, 1e-9,
+        )  # fmt: skip
+
+    starts = [0.02, -0.3, 0.01, 0.2, 0.4, 0.1, -0.05, 0.1, 0.02, -0.3, 0.3, -0.1]
+    point = np.array([*orders, 30.0, 1.5, 1.2, 3.0, 2.0, 3.0, *starts])
+    assert point.size == count + states
+    found = np.asarray(at(point)["jacobian"])
+    columns = []
+    for i in range(point.size):
+        step = np.zeros(point.size)
+        step[i] = 1e-6
+        up, down = (np.asarray(at(point + s)["residuals"]) for s in (step, -step))
+        columns.append((up - down) / 2e-6)
+    basis = np.linalg.qr(np.array(columns[count:]).T)[0]
+    for k in range(count):
+        expected = columns[k] - basis @ (basis.T @ columns[k])
+        assert np.linalg.norm(found[k] - expected) < 2e-6 * np.linalg.norm(columns[k]), k
+
+
+# --------------------------------------------------------------------------------------------------------------- words
+
+
+def test_several_equations_with_friction_follow_each_other() -> None:
+    structure = ftlm.equation(WORDS)
+    assert structure.coupling == "simulated"
+    assert ftlm.equation(WORDS.replace(" - fc*sign(D x)", "")).coupling == "measured"
+    assert structure.sticks == 0
+    turned = ftlm.equation("; ".join(reversed(WORDS.split("; "))))
+    assert turned.sticks == 1
+    t = np.arange(401) * 0.01
+    run = run_of(force(t), 0 * t, 0 * t, 0.01)
+    first = ftlm.Model(ftlm.equation(WORDS, fixed={**TRUTH, "fc": 4.0})).simulate(run)
+    second = ftlm.Model(ftlm.equation("; ".join(reversed(WORDS.split("; "))), fixed={**TRUTH, "fc": 4.0})).simulate(run)
+    for name in ("x", "q"):
+        np.testing.assert_allclose(first[name], second[name], atol=1e-10)
+    # Against events, by the natural call.
+    angles, _ = friction.hub_and_link(force, t, HUB, LINK, 4.0)
+    for name, exact in zip(("x", "q"), angles, strict=True):
+        assert np.max(np.abs(first[name] - exact)) < 1e-3 * np.max(np.abs(exact))
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: ftlm.equation(WORDS, coupling="measured"), "coupling='simulated'"),
+        (
+            lambda: ftlm.equation("D^2 x = q + u - 1*sign(D x); D^2 q = x - q - 2*sign(D q)"),
+            "equations of x and q have friction",
+        ),
+        (lambda: ftlm.equation(WORDS.replace("a q", "a D^2 q")), "order 2 of q is not below alpha"),
+        (lambda: ftlm.flexible_link(form="published", coupling="simulated", friction=True), "form='lagrange'"),
+        (lambda: ftlm.flexible_link(stage="both", coupling="simulated", friction=True), "one stage"),
+    ],
+)
+def test_what_is_not_followed_is_refused(make, said: str) -> None:
+    with pytest.raises(ModelError, match=said):
+        make()
+
+
+def test_highest_orders_that_cancel_are_refused() -> None:
+    # D^2 q = - D^2 x and D^2 x = - D^2 q + …: of a body that may stick the latter is refused, of two others the matrix.
+    three = "D^2 x = q + u - 1*sign(D x); D^2 q = D^2 p - q; D^2 p = D^2 q - 2 p + x"
+    t = np.arange(101) * 0.01
+    run = ftlm.Run.from_arrays(step=0.01, inputs={"u": force(t)}, outputs={"x": 0 * t, "q": 0 * t, "p": 0 * t})
+    with pytest.raises(ModelError, match="leading matrix of the equations is singular"):
+        ftlm.Model(ftlm.equation(three)).simulate(run)
+
+
+def test_a_file_keeps_it(tmp_path) -> None:
+    structure = ftlm.flexible_link(coupling="simulated", friction=True)
+    orders = {"alpha1": 1.95, "gamma1": 0.97, "beta2": 0.05, "mu2": 0.9}
+    values = {"a1": 628.0, "b1": -62.0, "d1": 2.0, "g1": 140.0, "fc1": 12.0, "a2": -235.5, "d2": -0.75}
+    model = ftlm.Model(structure.with_orders(orders).with_coefficients(values), orders=orders)
+    again = ftlm.load_model(model.save(tmp_path / "arm.json"))
+    t = np.arange(301) * 0.008
+    run = ftlm.Run.from_arrays(
+        step=0.008, inputs={"I1": 0.5 * np.sign(np.sin(3.0 * t))}, outputs={"theta11": 0 * t, "theta12": 0 * t}
+    )
+    there, back = model.simulate(run), again.simulate(run)
+    assert np.ptp(there["theta11"]) > 0.05
+    for name in ("theta11", "theta12"):
+        assert np.array_equal(there[name], back[name])
+    assert again.compare(there).fit_percent["theta12"] > 99.99
+
+
+# ----------------------------------------------------------------------------------------------------------- estimates
+
+
+def sampled_arm(seed: int, *, offset: float = 0.0, start=(0.0, 0.0, 0.0, 0.0)) -> ftlm.Run:
+    """The hub and its link under two sinusoids, between events, with 0.3 % of white noise."""
+    rng = np.random.default_rng(seed)
+    times, phases = np.arange(601) * 0.01, rng.uniform(0.0, 2.0 * np.pi, 2)
+
+    def pulled(t):
+        return 6.0 * np.sin(2.1 * t + phases[0]) + 3.0 * np.sin(5.3 * t + phases[1])
+
+    angles, _ = friction.hub_and_link(lambda t: pulled(t) + offset, times, HUB, LINK, 4.0, start=start)
+    angles += 0.003 * np.std(angles, axis=1)[:, None] * rng.standard_normal(angles.shape)
+    return run_of(pulled(times), *angles, 0.01, f"arm {seed}")
+
+
+def near(found, truth) -> None:
+    for name, value in truth.items():
+        assert abs(found.coefficients[name] - value) < 4.0 * found.standard_errors[name], name
+
+
+@pytest.mark.parametrize("seed", [4, pytest.param(6, marks=pytest.mark.slow)])
+def test_both_bodies_are_recovered(seed: int) -> None:
+    found = ftlm.identify(sampled_arm(seed), ftlm.equation(WORDS, initial="rest"), threads=1)
+    near(found, {**TRUTH, "fc": 4.0})
+    assert found.intervals["fc"][1] - found.intervals["fc"][0] < 0.02
+    assert min(found.fit_percent.values()) > 99.5
+    assert found.warnings == ()
+
+
+@pytest.mark.slow
+def test_several_runs_in_motion_with_offsets() -> None:
+    runs = [
+        sampled_arm(0, offset=0.5, start=(0.2, 0.8, 0.02, -0.1)),
+        sampled_arm(1, offset=-0.3, start=(0.0, 0.0, 0.03, 0.0)),
+    ]
+    found = ftlm.identify(runs, ftlm.equation(WORDS, initial="caputo", offset="constant"), threads=1)
+    near(found, {**TRUTH, "fc": 4.0})
+    np.testing.assert_allclose([o["x"]["constant"] for o in found.comparison.offsets], [0.5, -0.3], atol=0.02)
+
+
+@pytest.mark.slow
+def test_the_arm_is_identified_by_the_natural_call() -> None:
+    orders = {"alpha1": 1.95, "gamma1": 0.95, "beta2": 0.08, "mu2": 0.85}
+    free = {"a1": 628.0, "b1": -62.0, "d1": 2.0, "g1": 140.0, "fc1": 12.0, "j1": 0.375}
+    structure = ftlm.flexible_link(coupling="simulated", friction=True)
+    values = {**free, "a2": -628.0 * 0.375, "d2": -2.0 * 0.375}
+    model = ftlm.Model(
+        structure.with_orders(orders).with_coefficients({n: values[n] for n in structure.coefficient_names}),
+        orders=orders,
+    )
+    t, rng = np.arange(1501) * 0.004, np.random.default_rng(0)
+    current = 0.35 * np.sign(np.sin(2.1 * t)) + 0.3 * np.sin(5.3 * t + 0.4)
+    zeros = {"theta11": 0 * t, "theta12": 0 * t}
+    clean = model.simulate(ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=zeros))
+    noisy = {n: clean[n] + 0.003 * np.std(clean[n]) * rng.standard_normal(t.size) for n in zeros}
+    run = ftlm.Run.from_arrays(step=0.004, inputs={"I1": current}, outputs=noisy)
+    found = ftlm.identify(run, structure, threads=1).joint
+    for name, value in zip(found.names, found.values.tolist(), strict=True):
+        assert abs(value - {**orders, **free}[name]) < 4.0 * found.standard_errors[name], name
+
+
+def test_a_hub_that_never_moves_is_refused() -> None:
+    rng, t = np.random.default_rng(0), np.arange(400) * 0.01
+    run = run_of(np.sin(t), 1e-3 * rng.standard_normal(400), 0.1 * np.sin(9.0 * t), 0.01)
+    with pytest.raises(DataError, match="x never moves"):
+        ftlm.identify(run, ftlm.equation(WORDS, initial="caputo"))
+
+
+@pytest.mark.slow
+def test_a_hub_that_slides_one_way_does_not_tell_friction_from_an_offset() -> None:
+    times = np.arange(301) * 0.01
+
+    def pulled(t):
+        return 9.0 + 3.0 * np.sin(4.0 * t)
+
+    angles, v = friction.hub_and_link(pulled, times, HUB, LINK, 3.0)
+    assert np.all(v >= 0.0)
+    angles += 1e-3 * np.random.default_rng(0).standard_normal(angles.shape)
+    words = WORDS.replace("a q + d D q - b D x", "30 q + 0.4 D q - 1.5 D x").replace("k q - e D q", "90 q - 1.2 D q")
+    found = ftlm.identify(
+        run_of(pulled(times), *angles, 0.01), ftlm.equation(words, initial="rest", offset="constant"), threads=1
+    )
+    assert any("velocity of x never changes its sign" in w for w in found.warnings)
