@@ -101,8 +101,8 @@ def structure(text: str, filtered: Sequence[str], offset: bool) -> ftlm.Structur
     )
 
 
-#: Beyond the stages: the torque of link 2's spring in place of its acceleration, the -1 of a rigid gauge, and
-#: what was best while a deflection that drives was filtered twice.
+#: Beyond the stages: the torque of link 2's spring in place of its acceleration, the -1 of a rigid gauge, what was best
+#: while a deflection that drives was filtered twice, and the rate of the other deflection, an observer's gain.
 OTHERS = [
     ("spring torque of link 2, gauge, b = -1", "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21"
      " + q theta22 + s theta21 + r theta11", ("theta12", "theta22"), False),
@@ -114,6 +114,14 @@ OTHERS = [
      " + q theta22 + s theta21 + r theta11", ("theta12",), False),
     ("theta22 filtered twice, a spring-pot", "D^2 theta12 = a D^beta theta12 + d D theta12 + b D^2 theta11"
      " + p D^2 theta21 + q theta22 + s theta21 + r theta11", ("theta12",), False),
+    ("hub angle, rate of theta22", "D^2 theta12 = a theta12 + d D theta12 - D^2 theta11 + p D^2 theta21 + q D^2 theta22"
+     " + w D theta22 + e theta11", ("theta12", "theta22"), True),
+    ("the same, b free", "D^2 theta12 = a theta12 + d D theta12 + b D^2 theta11 + p D^2 theta21 + q D^2 theta22"
+     " + w D theta22 + e theta11", ("theta12", "theta22"), True),
+    ("offset, rate of theta12", "D^2 theta22 = a theta22 + d D theta22 - D^2 theta21 + p D^2 theta11 + q D^2 theta12"
+     " + w D theta12", ("theta12", "theta22"), True),
+    ("the same, b free", "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12"
+     " + w D theta12", ("theta12", "theta22"), True),
     ("gain, no offset, no hub angle", "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11"
      " + q D^2 theta12", ("theta12", "theta22"), False),
     ("gain, no hub angle", "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12",
@@ -244,6 +252,9 @@ def rival() -> Iterator[str]:
 FIVE = ("lqg_30", "lqg_20", "lqg_10", "lqg_minus10", "lqg_minus20")
 SINGLE = {
     "whole": ("{a} + {d} + b {h} + r theta11", "whole", False),
+    "whole, offset, b = -1": ("{a} + {d} - {h} + r theta11", "whole", True),
+    "D^mu, offset, b = -1": ("{a} + {d} - {h} + r theta11", "D^mu damping", True),
+    "D^beta, offset, b = -1": ("{a} + {d} - {h} + r theta11", "D^beta elasticity", True),
     "whole, offset": ("{a} + {d} + b {h} + r theta11", "whole", True),
     "D^mu": ("{a} + {d} + b {h} + r theta11", "D^mu damping", False),
     "D^mu, offset": ("{a} + {d} + b {h} + r theta11", "D^mu damping", True),
