@@ -2,8 +2,8 @@
 
 ``python benches/arm.py recovery [--seeds 20] [--first 0] [--levels 20,40,60,80]`` fits stage 1 and stage 2 under
 square, sine and multisine currents with both angles following from the current, and says how far the truth lies from
-each estimate. ``measured``, ``orders``, ``steps``, ``left-out`` and ``rival`` are the real runs, see
-``arm_measured.py``. Each row is printed as soon as it is known.
+each estimate. ``measured``, ``orders``, ``gains``, ``hubs``, ``steps``, ``left-out`` and ``rival`` are the real runs,
+see ``arm_measured.py``. Each row is printed as soon as it is known.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
 
 import ftlm
-from arm_measured import gains, left_out, measured, orders, rival, steps
+from arm_measured import gains, hubs, left_out, measured, orders, rival, steps
 from lagrange import INPUTS, clean_run, structure, truth
 from plants import with_noise
 from results import append, heading
@@ -64,7 +64,8 @@ def recovery(seeds: range, levels: list[float]) -> None:
 
 
 SECTIONS: dict[str, Callable[[], Iterator[str]]] = {
-    "measured": measured, "orders": orders, "gains": gains, "steps": steps, "left-out": left_out, "rival": rival,
+    "measured": measured, "orders": orders, "gains": gains, "hubs": hubs, "steps": steps,
+    "left-out": left_out, "rival": rival,
 }  # fmt: skip
 
 

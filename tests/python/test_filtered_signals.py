@@ -209,12 +209,34 @@ def test_the_arm_of_real_files_is_its_deflections():
     arm = StructureOptions().structure("arm")
     assert str(arm).splitlines() == [
         "D^2 theta12 = a2 D^beta2 theta12 - 1.0 D^2 theta11 + d2 D^1 theta12 + p2 D^2 theta21 + q2 D^2 theta22"
-        " + e2 theta11 + f2 theta21 + c",
+        " + w2 D^1 theta22 + e2 theta11 + f2 theta21 + c",
         "D^2 theta22 = a4 D^beta4 theta22 - 1.0 D^2 theta21 + d4 D^1 theta22 + p4 D^2 theta11 + q4 D^2 theta12"
-        " + e4 theta21 + f4 theta11 + c",
+        " + w4 D^1 theta12 + e4 theta21 + f4 theta11 + c",
     ]
     assert (arm.coupling, arm.coefficient_law) == ("measured", ())
     assert arm.sensor_filter == ftlm.SensorFilter.low_pass(["theta12", "theta22"])
     assert StructureOptions().structure("arm:2").outputs == ("theta22",)
+    with pytest.raises(ftlm.ModelError, match="cross_damping=True follows the other deflection as it was measured"):
+        ftlm.flexible_link(cross_damping=True)
     with pytest.raises(ftlm.ModelError, match="hub=False leaves the deflection to the measured hub"):
         ftlm.flexible_link(hub=False, form="published")
+
+
+def single(count: int, names: tuple[str, ...]) -> ftlm.Run:
+    rng = np.random.default_rng(count)
+    return ftlm.Run.from_arrays(step=0.01, inputs={}, outputs={n: rng.standard_normal(50) for n in names})
+
+
+def test_a_link_whose_other_stage_was_not_measured_is_alone(capsys):
+    both, alone = single(1, ("theta11", "theta12", "theta21", "theta22")), single(2, ("theta11", "theta12"))
+    options = StructureOptions()
+    assert options.measured("arm:1", [both]) == options.structure("arm:1")
+    assert options.measured("arm", [alone]) == options.structure("arm")
+    # One run with stage 2 is enough: the other lacks signals, and is refused for that.
+    assert options.measured("arm:1", [alone, both]) == options.structure("arm:1")
+    assert capsys.readouterr().err == ""
+    made = options.measured("arm:1", [alone, alone])
+    assert "no run has theta21 or theta22: arm:1 is a link alone" in capsys.readouterr().err
+    assert str(made) == "D^2 theta12 = a2 theta12 - 1.0 D^2 theta11 + d2 D^mu2 theta12 + e2 theta11 + c"
+    assert made.sensor_filter == ftlm.SensorFilter.low_pass(["theta12"])
+    assert options.measured("arm:2", [alone]) == options.structure("arm:2")

@@ -265,6 +265,8 @@ def test_no_message_of_a_command_names_an_argument_of_python():
         ("time= and step=: both are given", "--time and --sampling: both are given"),
         ("Raise prior_covariance or use method='least-squares'", "Raise --k0 or use --method least-squares"),
         ("name the columns with inputs= and outputs= (commands: -u and -y)", "name the columns with -u and -y"),
+        ("being zeroed; use slice(1.004, None)", "being zeroed; use --slice 1.004:"),
+        ("use slice(1.1, 19.5) instead", "use --slice 1.1:19.5 instead"),
         ("-u m=3 is not there", "-u m=3 is not there"),
         ("'m=3.csv' does not exist", "'m=3.csv' does not exist"),
         ("M = 2048, p = 7", "M = 2048, p = 7"),

@@ -125,7 +125,7 @@ def flexible_link(
     *,
     stage: Literal[1, 2, "both"] = 1, form: Form | None = None, input_order: InputOrder | None = None,
     coupling: Literal["simulated", "measured"] | None = None, cross_stage: CrossStage = False, friction: bool = False,
-    cross_sensitivity: bool = False, hub: bool = True,
+    cross_sensitivity: bool = False, cross_damping: bool = False, hub: bool = True,
     laws: Sequence[Law] = ("orders", "coefficients"),
     parameters: Literal["effective", "table-3"] = "effective",
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
@@ -171,6 +171,11 @@ def flexible_link(
         Adds hub angles as they are (order 0) to the deflection's equation: strain gauges and cables make a measured
         deflection follow the hub's angle. e_2 theta_11 in that of theta_12, and with ``cross_stage="inertial"``
         f_2 theta_21.
+    cross_damping
+        Adds the rate of the other link's deflection, w_2 D theta_22 in the equation of theta_12, with
+        ``cross_stage="inertial"`` and measured coupling. No dissipation of the arm: it damps what a link does against
+        the other one, as the gain of an observer would, so that a free run is not thrown off by what little is
+        wrong with what drives it (docs/arm.md has what that is worth).
     hub
         False leaves the hub's equation out: a deflection driven by the measured hub, whose friction nobody knows. No
         ratio of inertias is left to tie coefficients, and no other equation to tell the link's spring from its damper:
@@ -234,6 +239,11 @@ def flexible_link(
             "hub=False leaves the deflection to the measured hub: it needs form='lagrange' and coupling='measured', "
             "and knows no friction=True"
         )
+    if cross_damping and (cross_stage != "inertial" or coupling == "simulated"):
+        raise ModelError(
+            "cross_damping=True follows the other deflection as it was measured; use it with cross_stage='inertial' "
+            "and coupling='measured'"
+        )
     stages: tuple[int, ...] = (1, 2) if stage == "both" else (stage,)
     equations: list[Equation] = []
     coefficient_law: list[tuple[str, float, tuple[str, ...]]] = []
@@ -246,6 +256,8 @@ def flexible_link(
             made = (replace(made[0], coulomb=Friction(f"fc{j}", -1.0)), made[1])
         if cross_stage:
             made = _pushed(made, j, laws, stage == "both") if cross_stage == "inertial" else _twisted(made, j)
+        if cross_damping:
+            made = (made[0], _added(made[1], [Term(f"theta{3 - j}2", Order(1.0), f"w{2 * j}")]))
         if cross_sensitivity:
             made = (made[0], _followed(made[1], j, other=cross_stage == "inertial"))
         equations += made if hub else made[1:]

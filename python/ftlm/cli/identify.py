@@ -75,9 +75,10 @@ def identify(
 ) -> None:  # fmt: skip
     """Identify a model: orders on a lattice, coefficients, both errors, warnings in words."""
     check_free(out, report, force=force, words=COMMAND)
-    wanted = shape.structure(structure)
+    shape.structure(structure)
     begin = None if start is None else load_model(start)
     runs = reading.runs(files)
+    wanted = shape.measured(structure, runs)
     # The slice is of the runs that are identified from.
     others = replace(reading, sliced=None).runs([validation]) if validation is not None else []
     with resumable(store, "the same command"), Progress("searching orders", quiet=as_json) as progress:
@@ -109,8 +110,9 @@ def search(
     as_json: Json = False,
 ) -> None:  # fmt: skip
     """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
-    wanted = shape.structure(structure)
+    shape.structure(structure)
     runs = reading.runs(files)
+    wanted = shape.measured(structure, runs)
     parts = wanted.parts() or {e.output: wanted.equation(e.output) for e in wanted.equations}
     lattice = options.lattice() or Lattice()
     check_named(lattice, wanted)

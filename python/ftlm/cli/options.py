@@ -129,6 +129,9 @@ class StructureOptions:
     cross_sensitivity: Annotated[
         bool, Option("--cross-sensitivity", help="Deflections follow hub angles through gauge and cable, too.")
     ] = False
+    cross_damping: Annotated[
+        bool, Option("--cross-damping", help="With --inertial: the rate of the other deflection, an observer's gain.")
+    ] = False
     friction: Annotated[bool, Option("--friction", help="Add a Coulomb term.")] = False
     laws: Annotated[
         Literal["none", "orders", "velocities"] | None,
@@ -169,12 +172,12 @@ class StructureOptions:
         Option(help="Unknown constant (and ramp) in each equation, one a run; default what the equation says."),
     ] = None
 
-    def structure(self, text: str) -> Structure:
-        """The structure that `text` names, with what the options say of it."""
+    def structure(self, text: str, *, alone: bool = False) -> Structure:
+        """The structure that `text` names, with what the options say of it; alone, a link has no other stage."""
         if text.startswith("flexible-link"):
             built = self._flexible_link(text)
         elif re.fullmatch(r"arm(:\w*)?", text):
-            built = self._arm(text)
+            built = self._arm(text, alone)
         else:
             built = equation(text, sensor_filter=self._sensor())
             self._check_equation(len(built.equations))
@@ -191,6 +194,17 @@ class StructureOptions:
             saturation=ranges("--saturation", self.saturation), dead_zone=ranges("--dead-zone", self.dead_zone)
         )
         return built.with_orders(numbers("--order", self.orders)).with_coefficients(numbers("--fixed", self.fixed))
+
+    def measured(self, text: str, runs: Sequence[Run]) -> Structure:
+        """The structure that `text` names for runs: a link of the arm alone where no run has the other stage."""
+        stage = re.fullmatch("arm:([12])", text)
+        if stage is not None:
+            other = f"theta{3 - int(stage[1])}"
+            if not any(name.startswith(other) for run in runs for name in run.signals):
+                absent = f"no run has {other}1 or {other}2"
+                print(f"ftlm: {absent}: {text} is a link alone, the other locked", file=sys.stderr)
+                return self.structure(text, alone=True)
+        return self.structure(text)
 
     def given(self) -> list[str]:
         """Options that say something."""
@@ -217,7 +231,8 @@ class StructureOptions:
         """Whether options are given that only the flexible link has."""
         return {
             "--cross-stage": self.cross_stage, "--inertial": self.inertial,
-            "--cross-sensitivity": self.cross_sensitivity, "--friction": self.friction,
+            "--cross-sensitivity": self.cross_sensitivity, "--cross-damping": self.cross_damping,
+            "--friction": self.friction,
             "--laws": self.laws is not None, "--form": self.form is not None,
             "--input-order": self.input_order is not None, "--stock-filter": self.stock_filter,
         }  # fmt: skip
@@ -234,11 +249,12 @@ class StructureOptions:
         except ValueError:
             raise ModelError(f"--low-pass {self.low_pass!r} is not HZ or HZ:DAMPING, such as 2:0.9") from None
 
-    def _arm(self, text: str) -> Structure:
-        """Deflections of the arm that exists: whole orders but that of the link's elasticity, driven by all angles.
+    def _arm(self, text: str, alone: bool) -> Structure:
+        """Deflections of the arm that exists, driven by all angles: whole orders but that of the links' elasticity.
 
-        What reads a deflection is a gauge, whose zero is each run's own. A spring-pot that is nearly a spring remembers
-        next to nothing: runs start with the link's angle and velocity, unless a history is asked for.
+        Of a link alone that of its damping instead, the one that earned its place on runs that it never saw. What reads
+        a deflection is a gauge, whose zero is each run's own. A spring-pot that is nearly a spring remembers next to
+        nothing: runs start with the link's angle and velocity, unless a history is asked for.
         """
         given = self._of_the_link() | {"--coupling": self.coupling is not None}
         given |= {"--filtered": bool(self.filtered), "--low-pass": self.low_pass is not None}
@@ -253,11 +269,13 @@ class StructureOptions:
         if stage is None:
             raise ModelError(f"--structure {text!r} is not known; use arm:1, :2 or :both")
         built = flexible_link(
-            stage=stage, hub=False, cross_stage="inertial", cross_sensitivity=True, sensor_filter="stock",
+            stage=stage, hub=False, cross_stage=False if alone else "inertial", cross_sensitivity=True,
+            cross_damping=not alone, sensor_filter="stock",
             laws=("orders", "coefficients", "velocities"), offset="constant",
         )  # fmt: skip
         built = replace(built, initial="caputo")
-        return built.with_orders({n: 1.0 for n in built.order_names if n.startswith("mu")})
+        whole = ("beta", 0.0) if alone else ("mu", 1.0)
+        return built.with_orders({n: whole[1] for n in built.order_names if n.startswith(whole[0])})
 
     def _flexible_link(self, text: str) -> Structure:
         stages: dict[str, Literal[1, 2, "both"]] = {"1": 1, "2": 2, "both": "both"}
@@ -276,7 +294,7 @@ class StructureOptions:
         return flexible_link(
             stage=stage, form=self.form, input_order=self.input_order, coupling=self.coupling,
             cross_stage="inertial" if self.inertial else self.cross_stage, cross_sensitivity=self.cross_sensitivity,
-            friction=self.friction,
+            cross_damping=self.cross_damping, friction=self.friction,
             laws=laws[self.laws or "none"],
             sensor_filter="stock" if self.stock_filter else None,
         )  # fmt: skip

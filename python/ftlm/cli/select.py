@@ -43,6 +43,9 @@ def select(
         made = [shape.structure(text) for text in structures]
         candidates = made[0] if len(made) == 1 else made
     runs = reading.runs(files)
+    if structures != ["auto"]:
+        made = [shape.measured(text, runs) for text in structures]
+        candidates = made[0] if len(made) == 1 else made
     # The slice is of the runs that are fitted to.
     of_its_own = validation not in (None, "runs", "blocks")
     judges = replace(reading, sliced=None).runs([str(validation)]) if of_its_own else validation

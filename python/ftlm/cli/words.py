@@ -16,6 +16,7 @@ OPTIONS = {
     "coupling": "--coupling", "initial": "--initial", "laws": "--laws", "form": "--form",
     "input_order": "--input-order",
     "friction": "--friction", "cross_stage": "--cross-stage", "cross_sensitivity": "--cross-sensitivity",
+    "cross_damping": "--cross-damping",
     "tolerance": "--tolerance", "lags": "--lags",
     "delay": "--delay", "force": "--force", "offset": "--offset", "reference": "--reference", "start": "--start",
     "validation": "--validation",
@@ -23,6 +24,8 @@ OPTIONS = {
 }  # fmt: skip
 #: ``force=True (--force)``, where the option stands beside the argument already.
 _BESIDE = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")
+#: What a run is cut by, whose ends a command takes joined by a colon.
+_CUT = re.compile(r"\bslice\((\S+), (?:None|(\S+?))\)")
 _COMMANDS = re.compile(r" \(commands: [^)]*\)")
 #: ``-u m=3`` is a name that a user gave, not an argument.
 _ARGUMENT = re.compile(r"(--?[\w-]+ )?(?<![^\s(])(" + "|".join(OPTIONS) + r")=(?:'([^']*)'|([\w.+-]+))?(?![\w{])")
@@ -33,6 +36,7 @@ def in_options(text: str) -> str:
     """Return a message in which the options of the command line stand for the arguments of Python."""
     text = text.replace("inputs={name: column}", "-u NAME=COLUMN").replace("outputs={name: column}", "-y NAME=COLUMN")
     text = text.replace("in a columns file", "in a file for --columns")
+    text = _CUT.sub(lambda found: f"--slice {found[1]}:{found[2] or ''}", text)
     text = _BESIDE.sub(r"\1", _COMMANDS.sub("", text))
     return _BARE.sub(lambda found: OPTIONS[found[1]], _ARGUMENT.sub(_as_option, text))
 

@@ -135,7 +135,7 @@ def _findings(run: Measured, structure: Structure | None) -> Iterator[Finding]:
     inputs = [n for n in run.inputs if n in moving]
     outputs = [n for n in run.outputs if n in moving]
     for name in outputs:
-        yield from _dead(run, name)
+        yield from dead(run, name)
     usual = []
     for name in outputs:
         wraps = list(_wraps(run, name))
@@ -195,7 +195,8 @@ def _constant(run: Measured, name: str) -> Finding:
     )  # fmt: skip
 
 
-def _dead(run: Measured, name: str) -> Iterator[Finding]:
+def dead(run: Measured, name: str) -> Iterator[Finding]:
+    """Say where an output without gaps stands still although it changes from row to row elsewhere."""
     y = run[name]
     still = np.diff(y) == 0
     starts, lengths = _stretches(still)

@@ -107,12 +107,22 @@ def steadied(best: Attempt, grid: Grid, reached: Sequence[Attempt]) -> tuple[Att
             continue
     if not ends:
         return best, grid, Growth(kept=True, excess=math.inf)
-    # Where free runs begin to grow a descent stands at a wall, which is no optimum.
-    other = held.finer.ranked([a for a in ends if a.converged] or ends)[0]
+    other = nearest_stable(held, ends)
     excess = math.sqrt(other.level / best.level) - 1.0 if best.level > 0 else math.inf
     if forced(grid, best, other):
         return best, grid, Growth(kept=True, excess=excess)
     return other, held, Growth(kept=False, excess=excess, at_limit=not other.converged)
+
+
+def nearest_stable(grid: Grid, ends: Sequence[Attempt]) -> Attempt:
+    """The end that a growing optimum is compared with.
+
+    Where free runs begin to grow a descent stands at a wall, which is no optimum: one of those is taken instead, but
+    for where the runs refuse all of them for the wall.
+    """
+    ranked = grid.finer.ranked(ends)
+    settled = [a for a in ranked if a.converged and not forced(grid, ranked[0], a)]
+    return (settled or ranked)[0]
 
 
 def forced(grid: Grid, best: Attempt, other: Attempt) -> bool:

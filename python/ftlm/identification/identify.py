@@ -24,7 +24,7 @@ from ftlm.identification.judged import Task
 from ftlm.identification.offsets import with_decided_offset
 from ftlm.identification.reference import by_reference, driven_by
 from ftlm.identification.result import Identification
-from ftlm.identification.warnings import discretisation, growing, one_sided, unexcited, unslowed
+from ftlm.identification.warnings import discretisation, growing, one_sided, silent, unexcited, unslowed
 from ftlm.judge.comparison import Comparison, compared_samples, free_runs
 from ftlm.judge.criteria import InformationCriteria, information_criteria
 from ftlm.judge.metrics import finite
@@ -226,7 +226,8 @@ def judged(fit: Fit) -> Identification:
     free = free_runs(model, runs)
     comparison = compared_samples(model, runs, free, m=model.m or default_m(runs, power_of_two=False))
     warnings = [*comparison.warnings, *fit.warnings]
-    warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings] + unexcited(runs, fit.task.structure)
+    warnings += [f"run {r.name}: {w}" for r in runs for w in r.warnings]
+    warnings += silent(runs, fit.task.structure) + unexcited(runs, fit.task.structure)
     warnings += (
         discretisation(model, comparison) + growing(model) + one_sided(model, free) + unslowed(model, runs, free)
     )

@@ -11,7 +11,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.statistics import ROUNDING, is_white, robust_deviation
-from ftlm.data.advice import excitation_for
+from ftlm.data.advice import dead, excitation_for
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
@@ -248,6 +248,12 @@ def unexcited(runs: Sequence[Run], structure: Structure) -> list[str]:
     """Say so where no run alone has inputs rich enough for the free numbers of an equation."""
     lacking = [{f.signal: f.sentence for f in excitation_for(run, structure)} for run in runs]
     return [sentence for output, sentence in lacking[0].items() if all(output in other for other in lacking)]
+
+
+def silent(runs: Sequence[Run], structure: Structure) -> list[str]:
+    """Say where a measured channel was off: a fit takes what it shows then for motion."""
+    channels = [(r.bridged(), n) for r in runs for n in r.outputs if n in structure.signals]
+    return [f"run {run.name}: {found.sentence}" for run, name in channels for found in dead(run, name)]
 
 
 def broken_law(model: Model) -> list[str]:
