@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.data.structures import History
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
@@ -18,10 +17,8 @@ from ftlm.fit.starts import delayed_attempts
 
 #: Samples a run of the coarse fits that compare starts; the best ones continue on all samples.
 COARSE_SAMPLES = 1200
-#: Evaluations of every coarse fit, those that are on the same way down told apart after the first few; then of those
-#: that are ahead: one in RUNNERS, but not fewer than FEWEST.
+#: Evaluations of every coarse fit, then of those that are ahead: one in RUNNERS, but not fewer than FEWEST.
 FIRST_LAP = 15
-FIRST_LOOK = 6
 SECOND_LAP = 60
 RUNNERS = 3
 FEWEST = 8
@@ -33,9 +30,6 @@ FINALISTS = 3
 CONTENDER = 3.0
 #: Two costs closer than this share are the same optimum.
 SAME_COST = 1e-3
-#: Two points are on the same way down whose costs differ by less than this share, orders by less than the second, and
-#: coefficients and numbers of inputs that are searched by less than the third of themselves and of their interval.
-SAME_WAY = (0.2, 0.03, 0.05)
 
 
 @dataclass(frozen=True)
@@ -72,48 +66,6 @@ class Laps:
                 raise
         return sorted(ended, key=lambda a: a.level)
 
-    def first(
-        self, grid: Grid, runners: Sequence[Attempt], problem: FreeProblem | None = None, evaluations: int = FIRST_LAP
-    ) -> list[Attempt]:
-        """The same of the first laps: of runners that come to be on the same way down only the best goes on."""
-        asked = problem or grid.problem
-        look = apart(asked, self.run(grid, unlike(asked, runners), FIRST_LOOK, problem))
-        going = [a for a in look if a.outcome["status"] == "exhausted"]
-        ended = self.run(grid, going, evaluations - FIRST_LOOK, problem)
-        return apart(asked, sorted(ended + [a for a in look if a not in going], key=lambda a: a.level))
-
-
-def searched(problem: FreeProblem, attempt: Attempt) -> tuple[Floats, Floats, Floats]:
-    """Orders, the coefficients that a descent does not solve for, and numbers of inputs."""
-    own = np.delete(np.array(attempt.coefficients, dtype=float), list(problem.linear))
-    return np.array(attempt.orders, dtype=float), own, np.array(attempt.inputs, dtype=float)
-
-
-def unlike(problem: FreeProblem, runners: Sequence[Attempt]) -> list[Attempt]:
-    """Starts without those that differ from an earlier one in nothing that is searched."""
-    kept: dict[tuple[float, ...], Attempt] = {}
-    for runner in runners:
-        kept.setdefault(tuple(float(f"{v:.6g}") for part in searched(problem, runner) for v in part.tolist()), runner)
-    return list(kept.values())
-
-
-def apart(problem: FreeProblem, reached: Sequence[Attempt]) -> list[Attempt]:
-    """Attempts, best first, without those that are on the same way down as a better one."""
-    cost, turned, share = SAME_WAY
-    kept: list[tuple[Attempt, tuple[Floats, Floats, Floats]]] = []
-    widths = np.array([high - low for low, high in (item.bounds for item in problem.inputs)])
-    for attempt in reached:
-        here = orders, own, inputs = searched(problem, attempt)
-        if not any(
-            attempt.level <= (1.0 + cost) * k.level
-            and np.all(np.abs(orders - a) <= turned)
-            and np.all(np.abs(own - b) <= share * np.maximum(np.abs(own), np.abs(b)))
-            and np.all(np.abs(inputs - c) <= share * widths)
-            for k, (a, b, c) in kept
-        ):
-            kept.append((attempt, here))
-    return [attempt for attempt, _ in kept]
-
 
 def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None) -> list[Attempt]:
     """Coarse fits from all starts, best first, every output weighing alike; noise alone leaves `floor` per residual."""
@@ -126,12 +78,12 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
     starts = delayed_attempts(runs, problem, threads)
     laps = Laps(len(starts), threads, progress)
     coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
-    reached = laps.first(coarse, starts)
+    reached = laps.run(coarse, starts, FIRST_LAP)
     # A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its
     # own: once more from the same starts, on half the step.
     while coarse.every < FINEST and (not reached or coarse.matters(reached[0])):
         coarse = coarse.finer
-        reached = laps.first(coarse, starts)
+        reached = laps.run(coarse, starts, FIRST_LAP)
     # Whatever a simpler equation reaches, this one reaches too: it starts there with the term's coefficient at 0, or
     # with a pole too fast to see.
     others: list[Simpler | LowerOrder | Whole] = [*simpler(problem), *lower_orders(problem, runs)]
@@ -144,9 +96,8 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
             continue
         if isinstance(less, Whole) or (isinstance(less, Simpler) and less.driven):
             # Driven by the measurement, or at given orders, most starts lead to one optimum: the nearest ones will do.
-            runners = laps.run(coarse, unlike(less.problem, runners), 2, less.problem)
-            runners = apart(less.problem, runners)[: FINALISTS if isinstance(less, Whole) else FEWEST]
-        ended = laps.first(coarse, runners, less.problem)
+            runners = laps.run(coarse, runners, 1, less.problem)[: FINALISTS if isinstance(less, Whole) else FEWEST]
+        ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
         ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
         reached = sorted(reached + [less.embedded(a, problem) for a in ended[:1]], key=lambda a: a.level)
     if reached and problem.structure.coupling == "measured" and problem.structure.offset != "none":

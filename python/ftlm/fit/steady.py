@@ -101,7 +101,8 @@ def steadied(best: Attempt, grid: Grid, reached: Sequence[Attempt]) -> tuple[Att
             continue
         try:
             near = held.descend(start, EVALUATIONS, plain=True, held=turned) if turned else start
-            ends.append(held.descend(near, EVALUATIONS, plain=True))
+            end = held.descend(near, EVALUATIONS, plain=True)
+            ends.append(end if end.converged else along_limit(held, end))
         except FtlmError:
             # No finite free run on this grid; the others have one.
             continue
@@ -112,6 +113,23 @@ def steadied(best: Attempt, grid: Grid, reached: Sequence[Attempt]) -> tuple[Att
     if forced(grid, best, other):
         return best, grid, Growth(kept=True, excess=excess)
     return other, held, Growth(kept=False, excess=excess, at_limit=not other.converged)
+
+
+def along_limit(grid: Grid, end: Attempt) -> Attempt:
+    """The lowest point beside one at the limit of growth: from there on with one own term held after the other.
+
+    A descent stands where a step of all numbers would grow, though the rest may still fall along the limit.
+    """
+    problem = grid.problem
+    searched = [k for k in range(len(problem.coefficients)) if k not in problem.linear]
+    best = end
+    for place in searched:
+        try:
+            there = grid.descend(end, EVALUATIONS, plain=True, held=len(problem.orders) + place)
+        except FtlmError:
+            continue
+        best = min(best, there, key=lambda a: a.level)
+    return replace(best, outcome={**best.outcome, "status": end.outcome["status"]}) if best is not end else end
 
 
 def nearest_stable(grid: Grid, ends: Sequence[Attempt]) -> Attempt:

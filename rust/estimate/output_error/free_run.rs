@@ -3,16 +3,16 @@
 use super::corners::Corners;
 use super::experiment::Experiment;
 use super::feedthrough::{Direct, Early};
-use super::linear::{best_moves, Driven};
+use super::linear::best_moves;
 use super::model::{FreeModel, Point};
-use super::shelf::{Operator, Shelf};
+use super::part::Part;
+use super::shelf::{Shelf, FACTORS};
 use crate::dense;
 use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimate::least_squares;
 use crate::excess::MAX_EXCESS;
 use crate::series::{Buffers, Kernel, Solver, SumOfProducts};
-use std::rc::Rc;
 
 /// Own-output orders closer to α than this make the equation say that the output equals itself.
 const LEAST_INTEGRATION: f64 = 1e-3;
@@ -32,30 +32,6 @@ pub(super) struct Evaluation {
     pub(super) parts: Vec<Part>,
 }
 
-/// What one experiment leaves behind for its sensitivities.
-pub(super) struct Part {
-    /// A of A y = b.
-    pub(super) matrix: Vec<Vec<Vec<f64>>>,
-    /// Spectra of A⁻¹ where initial terms or linear coefficients needed them already.
-    pub(super) inverse: Option<Vec<Vec<Kernel>>>,
-    /// Of each term of each equation.
-    pub(super) operators: Vec<Vec<Rc<Operator>>>,
-    /// Simulated pulse means, initial terms included.
-    pub(super) response: Vec<Vec<f64>>,
-    /// Orthonormal basis of the sampled responses to the initial terms.
-    pub(super) basis: Vec<Vec<f64>>,
-    /// What each coefficient does that the residuals are linear in.
-    pub(super) driven: Vec<Driven>,
-    /// Pulse means of each input with a free number once it acts, and their derivative with respect to it.
-    pub(super) acted: Vec<(Vec<f64>, Vec<f64>)>,
-    /// What feeds through at once.
-    pub(super) direct: Option<Direct>,
-    /// What pulses see too early.
-    pub(super) early: Early,
-    /// Corners near samples that were read at times of their own.
-    pub(super) corners: Option<Corners>,
-}
-
 /// Response of an experiment to an initial term: its equation, weighted samples, pulse means.
 struct Free {
     equation: usize,
@@ -69,9 +45,6 @@ struct Answer {
     residuals: Vec<f64>,
     free: Vec<Free>,
 }
-
-/// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
-pub(super) const FACTORS: usize = 3;
 
 impl FreeModel {
     /// Residuals at a point, the coefficients that are named, in which they are linear, at their best (variable
@@ -97,8 +70,8 @@ impl FreeModel {
             answers.push(self.answer(experiment, shelf, &structures, point, linear, &mut out)?);
         }
         if !linear.is_empty() {
-            let sides = answers.iter().map(|a| (&a.residuals[..], &a.part.driven[..], &a.part.basis[..]));
-            let moves = best_moves(&sides.collect::<Vec<_>>())?;
+            let sides: Vec<(&[f64], &Part)> = answers.iter().map(|a| (&a.residuals[..], &a.part)).collect();
+            let moves = best_moves(&sides)?;
             linear.iter().zip(&moves).for_each(|(&j, by)| out.point.coefficients[j] += by);
             for (answer, experiment) in answers.iter_mut().zip(experiments) {
                 let Part { driven, response, direct, acted, .. } = &mut answer.part;

@@ -4,7 +4,7 @@
 //! rejected step costs no Jacobian. A problem says itself how a point moves: in which coordinates, and within which bounds.
 //! What stands on a bound and is pushed out of it is left out of step and gradient, so that the rest moves on.
 //!
-//! Where Gauss–Newton foretells the fall of the cost badly, what it leaves out is learnt ([`super::curvature`]).
+//! Where Gauss–Newton foretells the fall of the cost badly, what it leaves out is learnt (`curvature`).
 //!
 //! A minimum is where the gradient vanishes, and nothing else is called one: the cosine between the residuals and every
 //! column that is free to move, the relative offset of Dennis & Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.

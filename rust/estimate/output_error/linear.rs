@@ -5,9 +5,9 @@
 
 use super::experiment::Experiment;
 use super::feedthrough::add_slope;
-use super::free_run::{Part, FACTORS};
 use super::model::{Coordinate, FreeModel, Point};
-use super::shelf::Shelf;
+use super::part::{Driven, Part};
+use super::shelf::{Shelf, FACTORS};
 use crate::dense;
 use crate::error::{Error, Result};
 use crate::series::{Buffers, SumOfProducts};
@@ -15,27 +15,6 @@ use crate::small::back_substitute;
 
 /// What is not told from the rest by this share of its column stays where it was: there rounding is as large.
 const UNTOLD: f64 = 1e-7;
-
-/// What a coefficient of 1 more does to an experiment.
-pub(super) struct Driven {
-    /// To its weighted samples.
-    pub(super) samples: Vec<f64>,
-    /// To the pulse means of each output; empty once it was moved.
-    means: Vec<Vec<f64>>,
-}
-
-impl Driven {
-    /// Moves the coefficient: residuals and pulse means follow.
-    pub(super) fn moved(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
-        if by != 0.0 {
-            residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);
-            for (total, more) in response.iter_mut().zip(&self.means) {
-                total.iter_mut().zip(more).for_each(|(y, v)| *y += by * v);
-            }
-        }
-        self.means = Vec::new();
-    }
-}
 
 impl FreeModel {
     /// Coefficients that stand alone, once, and before nothing but what drives from outside.
@@ -110,14 +89,14 @@ impl FreeModel {
 
 /// How far linear coefficients move to where the residuals of all experiments are least, each experiment's initial terms
 /// projected out.
-pub(super) fn best_moves(sides: &[(&[f64], &[Driven], &[Vec<f64>])]) -> Result<Vec<f64>> {
-    let count = sides.first().map_or(0, |(_, driven, _)| driven.len());
+pub(super) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
+    let count = sides.first().map_or(0, |(_, part)| part.driven.len());
     let mut columns: Vec<Vec<f64>> = vec![Vec::new(); count + 1];
-    for (residuals, driven, basis) in sides {
-        for (column, part) in columns.iter_mut().zip(driven.iter().map(|d| &d.samples[..]).chain([*residuals])) {
+    for (residuals, run) in sides {
+        for (column, part) in columns.iter_mut().zip(run.driven.iter().map(|d| &d.samples[..]).chain([*residuals])) {
             let first = column.len();
             column.extend_from_slice(part);
-            project_out(basis, &mut column[first..]);
+            project_out(&run.basis, &mut column[first..]);
         }
     }
     let mut scales = Vec::with_capacity(count);

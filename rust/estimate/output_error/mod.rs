@@ -17,6 +17,7 @@ pub mod input;
 pub mod levenberg_marquardt;
 mod linear;
 pub mod model;
+mod part;
 pub mod poles;
 mod sensitivities;
 mod shelf;

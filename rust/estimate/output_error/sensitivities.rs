@@ -2,10 +2,11 @@
 
 use super::experiment::Experiment;
 use super::feedthrough::add_slope;
-use super::free_run::{inverse_spectra, Evaluation, Part, FACTORS};
+use super::free_run::{inverse_spectra, Evaluation};
 use super::linear::project_out;
 use super::model::{FreeModel, Point};
-use super::shelf::Shelf;
+use super::part::Part;
+use super::shelf::{Shelf, FACTORS};
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel, SumOfProducts};

@@ -1,13 +1,15 @@
 //! What the evaluations of one search have in common: kernels of orders that stay, and their spectra.
 
 use super::experiment::Experiment;
-use super::free_run::FACTORS;
 use super::model::FreeModel;
 use crate::excess::{kernel, kernel_and_slope};
 use crate::series::Kernel;
 use std::cell::OnceCell;
 use std::collections::HashMap;
 use std::rc::Rc;
+
+/// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
+pub(super) const FACTORS: usize = 3;
 
 /// Spectra of longer records are made anew each time: those of all terms together would be many times the record.
 const KEPT_PULSES: usize = 1 << 15;

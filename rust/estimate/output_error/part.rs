@@ -1,0 +1,52 @@
+//! What a free run leaves behind for the derivatives of its residuals.
+
+use super::corners::Corners;
+use super::feedthrough::{Direct, Early};
+use super::shelf::Operator;
+use crate::series::Kernel;
+use std::rc::Rc;
+
+/// What one experiment leaves behind for its sensitivities.
+pub(super) struct Part {
+    /// A of A y = b.
+    pub(super) matrix: Vec<Vec<Vec<f64>>>,
+    /// Spectra of A⁻¹ where initial terms or linear coefficients needed them already.
+    pub(super) inverse: Option<Vec<Vec<Kernel>>>,
+    /// Of each term of each equation.
+    pub(super) operators: Vec<Vec<Rc<Operator>>>,
+    /// Simulated pulse means, initial terms included.
+    pub(super) response: Vec<Vec<f64>>,
+    /// Orthonormal basis of the sampled responses to the initial terms.
+    pub(super) basis: Vec<Vec<f64>>,
+    /// What each coefficient does that the residuals are linear in.
+    pub(super) driven: Vec<Driven>,
+    /// Pulse means of each input with a free number once it acts, and their derivative with respect to it.
+    pub(super) acted: Vec<(Vec<f64>, Vec<f64>)>,
+    /// What feeds through at once.
+    pub(super) direct: Option<Direct>,
+    /// What pulses see too early.
+    pub(super) early: Early,
+    /// Corners near samples that were read at times of their own.
+    pub(super) corners: Option<Corners>,
+}
+
+/// What a coefficient of 1 more does to an experiment.
+pub(super) struct Driven {
+    /// To its weighted samples.
+    pub(super) samples: Vec<f64>,
+    /// To the pulse means of each output; empty once it was moved.
+    pub(super) means: Vec<Vec<f64>>,
+}
+
+impl Driven {
+    /// Moves the coefficient: residuals and pulse means follow.
+    pub(super) fn moved(&mut self, by: f64, residuals: &mut [f64], response: &mut [Vec<f64>]) {
+        if by != 0.0 {
+            residuals.iter_mut().zip(&self.samples).for_each(|(e, v)| *e -= by * v);
+            for (total, more) in response.iter_mut().zip(&self.means) {
+                total.iter_mut().zip(more).for_each(|(y, v)| *y += by * v);
+            }
+        }
+        self.means = Vec::new();
+    }
+}
