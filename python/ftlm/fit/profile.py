@@ -468,8 +468,11 @@ def _middle(start: float, side: float, inside: float, outside: float) -> float:
 
 
 def _slope(attempt: Attempt, i: int) -> float:
-    """Half the derivative of the sum of squares with respect to one number."""
-    return float(np.asarray(attempt.outcome["jacobian"])[i] @ np.asarray(attempt.outcome["residuals"]))
+    """Half the derivative of the sum of squares with respect to one number; 0 where it is beyond the numbers."""
+    # Near where a free run has no value its derivatives overflow: they tell no step.
+    with np.errstate(over="ignore", invalid="ignore"):
+        slope = float(np.asarray(attempt.outcome["jacobian"])[i] @ np.asarray(attempt.outcome["residuals"]))
+    return slope if math.isfinite(slope) else 0.0
 
 
 def _span(attempt: Attempt, i: int) -> tuple[Any, Floats]:
