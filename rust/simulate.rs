@@ -118,24 +118,9 @@ impl<'a> System<'a> {
         self.solve(&rhs)
     }
 
-    /// Columns of the inverse of the matrix: `[j][i]` is what a unit pulse in the error of equation i does to output j.
+    /// Series of the inverse of the matrix, see [`series::Solver::inverse`].
     pub(crate) fn inverse(&self) -> Result<Vec<Vec<Vec<f64>>>> {
-        self.inverse_by(&mut series::Solver::new(&self.matrix)?)
-    }
-
-    fn inverse_by(&self, solver: &mut series::Solver<'_>) -> Result<Vec<Vec<Vec<f64>>>> {
-        let n = self.matrix.len();
-        let mut out = vec![Vec::with_capacity(n); n];
-        for i in 0..n {
-            let mut unit = vec![vec![0.0; self.record.m()]; n];
-            if let Some(first) = unit[i].first_mut() {
-                *first = 1.0;
-            }
-            for (row, response) in out.iter_mut().zip(solver.solve(&unit)?) {
-                row.push(response);
-            }
-        }
-        Ok(out)
+        series::Solver::new(&self.matrix)?.inverse()
     }
 
     /// What a unit of each initial term, an equation and an exponent, does to every output while nothing else drives.
@@ -148,7 +133,7 @@ impl<'a> System<'a> {
         if units.is_empty() {
             return Ok(Vec::new());
         }
-        let inverse = self.inverse_by(solver)?;
+        let inverse = solver.inverse()?;
         if inverse.iter().flatten().any(|series| grows(series)) {
             return units
                 .iter()

@@ -15,7 +15,7 @@ use crate::error::{check_finite, check_length, Error, Result};
 use crate::excess::{kernel_and_slope, MAX_EXCESS};
 use crate::regressors::Record;
 use crate::regularity::check_regular;
-use crate::series::{self, reciprocal, Kernel, Solver};
+use crate::series::{self, Kernel, Solver};
 use crate::small;
 
 /// Equations that follow each other's outputs, one of them with friction of its own output's velocity.
@@ -221,7 +221,7 @@ impl Operators {
         }
         let leading: Vec<f64> = matrix.iter().flatten().map(|a| a.first().copied().unwrap_or(0.0)).collect();
         let leading = small::inverse(&leading, n)?;
-        let inverse = inverse_of(&matrix)?;
+        let inverse = Solver::new(&matrix)?.inverse_spectra(2 * m)?;
         let edges: Vec<Option<Kernel>> = own_edges.iter().map(|e| e.as_deref().map(Kernel::new)).collect();
         let friction = Driver::new(body.equations[sticks].structure.order, m, step, true);
         let mut made = Self {
@@ -293,25 +293,6 @@ impl Operators {
         let moved: f64 = (0..n).map(|j| edge[j] * (0..n).map(|i| self.leading[j * n + i] * rhs[i]).sum::<f64>()).sum();
         turn * kernels[1][0] + edge_slope + moved
     }
-}
-
-/// Spectra of A⁻¹.
-fn inverse_of(matrix: &[Vec<Vec<f64>>]) -> Result<Vec<Vec<Kernel>>> {
-    let n = matrix.len();
-    if let [row] = matrix {
-        return Ok(vec![vec![Kernel::new(&reciprocal(&row[0]))]]);
-    }
-    let m = matrix[0][0].len();
-    let mut rows: Vec<Vec<Kernel>> = (0..n).map(|_| Vec::with_capacity(n)).collect();
-    let mut solver = Solver::new(matrix)?;
-    for j in 0..n {
-        let mut unit = vec![vec![0.0; m]; n];
-        unit[j].first_mut().into_iter().for_each(|first| *first = 1.0);
-        for (row, column) in rows.iter_mut().zip(solver.solve(&unit)?) {
-            row.push(Kernel::new(&column));
-        }
-    }
-    Ok(rows)
 }
 
 /// A free run with all that its derivatives are made of.

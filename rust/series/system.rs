@@ -1,6 +1,7 @@
 //! Quotients of series, and systems of series solved for one right-hand side or for many.
 
 use super::division::Division;
+use super::product::Kernel;
 use crate::error::{check_length, Error, Result};
 use crate::small;
 
@@ -95,5 +96,31 @@ impl<'a> Solver<'a> {
         self.division.restart();
         self.division.run(self.matrix, &self.inverse, &borrowed);
         Ok(self.division.quotients().to_vec())
+    }
+
+    /// Series of A⁻¹: `[j][i]` is what a unit pulse in the error of equation i does to unknown j. n solutions.
+    ///
+    /// # Errors
+    /// As [`Solver::solve`].
+    pub fn inverse(&mut self) -> Result<Vec<Vec<Vec<f64>>>> {
+        let (m, n) = (self.division.terms(), self.matrix.len());
+        let mut rows = vec![Vec::with_capacity(n); n];
+        for i in 0..n {
+            let mut unit = vec![vec![0.0; m]; n];
+            unit[i].first_mut().into_iter().for_each(|first| *first = 1.0);
+            for (row, answer) in rows.iter_mut().zip(self.solve(&unit)?) {
+                row.push(answer);
+            }
+        }
+        Ok(rows)
+    }
+
+    /// Spectra of A⁻¹ for products of up to `total` terms in all factors together, see [`Solver::inverse`].
+    ///
+    /// # Errors
+    /// As [`Solver::solve`].
+    pub fn inverse_spectra(&mut self, total: usize) -> Result<Vec<Vec<Kernel>>> {
+        let spectra = |row: Vec<Vec<f64>>| row.iter().map(|series| Kernel::with_length(series, total)).collect();
+        Ok(self.inverse()?.into_iter().map(spectra).collect())
     }
 }

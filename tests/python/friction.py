@@ -204,3 +204,24 @@ def hub_and_link(
             else:
                 side = float(np.sign(pull(now, state)))
     return angles, rate
+
+
+def slope_errors(at: Callable[[np.ndarray], dict], point: np.ndarray, numbers: int) -> list[float]:
+    """How far the derivatives of `at` are from central differences, each as a share of the difference's norm.
+
+    Behind the numbers, `point` holds initial terms, along which nothing is compared: the fit projects them out.
+    """
+    found = np.asarray(at(point)["jacobian"])
+    columns = []
+    for i in range(point.size):
+        step = np.zeros(point.size)
+        step[i] = 1e-6
+        up, down = (np.asarray(at(point + s)["residuals"]) for s in (step, -step))
+        columns.append((up - down) / 2e-6)
+    states = np.linalg.qr(np.array(columns[numbers:]).T)[0]
+    errors = []
+    for k in range(numbers):
+        expected = columns[k] - states @ (states.T @ columns[k])
+        assert np.linalg.norm(expected) > 1e-6 * np.linalg.norm(columns[k]) > 0
+        errors.append(float(np.linalg.norm(found[k] - expected) / np.linalg.norm(columns[k])))
+    return errors

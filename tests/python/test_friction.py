@@ -217,17 +217,7 @@ def test_derivatives_are_those_of_finite_differences(orders) -> None:
         )  # fmt: skip
 
     point = np.array([*orders, 0.7, 1.1, 0.9, 0.1, 0.2, 0.05, -0.2, 0.4, -0.1])
-    found = np.asarray(at(point)["jacobian"])
-    columns = []
-    for i in range(point.size):
-        step = np.zeros(point.size)
-        step[i] = 1e-6
-        up, down = (np.asarray(at(point + s)["residuals"]) for s in (step, -step))
-        columns.append((up - down) / 2e-6)
-    states = np.linalg.qr(np.array(columns[5:]).T)[0]
-    for k in range(5):
-        expected = columns[k] - states @ (states.T @ columns[k])
-        assert np.linalg.norm(found[k] - expected) < 1e-6 * np.linalg.norm(columns[k])
+    assert max(friction.slope_errors(at, point, 5)) < 1e-6
 
 
 # --------------------------------------------------------------------------------------------------------------- words

@@ -43,19 +43,6 @@ class FreeProblem:
         return [*self.orders, *self.coefficients, *(item.name for item in self.inputs)]
 
     @property
-    def linear(self) -> tuple[int, ...]:
-        """Places of the coefficients that the core solves for at every point: those of what drives from outside."""
-        structure = self.structure
-        if structure.has_friction:
-            return ()
-        coupled = structure.coupling == "simulated"
-        searched = {factor for _, factors in self.products.values() for factor in factors}
-        for item in structure.equations:
-            inner = set(structure.outputs) if coupled else {item.output}
-            searched |= {str(t.coefficient) for t in item.terms if t.signal in inner}
-        return tuple(k for k, name in enumerate(self.coefficients) if name not in searched)
-
-    @property
     def all_bounds(self) -> list[tuple[float, float]]:
         """Bounds of everything that is free; those of coefficients are infinite, but friction takes energy."""
         ends = [item.bounds for item in self.inputs]

@@ -70,15 +70,20 @@ def grows(problem: FreeProblem, attempt: Attempt) -> bool:
     return False
 
 
+def own_terms(problem: FreeProblem) -> dict[str, float]:
+    """Free coefficients before own terms, with the factor that they are multiplied by."""
+    return {
+        t.coefficient: t.factor for e in problem.structure.equations for t in e.terms
+        if t.signal == e.output and isinstance(t.coefficient, str)
+    }  # fmt: skip
+
+
 def dissipative(problem: FreeProblem, attempt: Attempt) -> tuple[Attempt, list[int]]:
     """The point with own terms that all pull back, whose free run dies away up to order 2, and which of them turned.
 
     Those are held where the rest follows first: released at once, what drives would be that of the growing optimum.
     """
-    own = {
-        t.coefficient: t.factor for e in problem.structure.equations for t in e.terms
-        if t.signal == e.output and isinstance(t.coefficient, str)
-    }  # fmt: skip
+    own = own_terms(problem)
     turned = [
         k for k, (n, v) in enumerate(zip(problem.coefficients, attempt.coefficients, strict=True))
         if n in own and v * own[n] > 0.0
@@ -121,14 +126,15 @@ def along_limit(grid: Grid, end: Attempt) -> Attempt:
     A descent stands where a step of all numbers would grow, though the rest may still fall along the limit.
     """
     problem = grid.problem
-    searched = [k for k in range(len(problem.coefficients)) if k not in problem.linear]
+    own = own_terms(problem)
     best = end
-    for place in searched:
+    for place in (k for k, name in enumerate(problem.coefficients) if name in own):
         try:
             there = grid.descend(end, EVALUATIONS, plain=True, held=len(problem.orders) + place)
         except FtlmError:
             continue
         best = min(best, there, key=lambda a: a.level)
+    # Held, it stood still in fewer numbers than the fit has.
     return replace(best, outcome={**best.outcome, "status": end.outcome["status"]}) if best is not end else end
 
 

@@ -12,7 +12,7 @@ use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimate::least_squares;
 use crate::excess::MAX_EXCESS;
-use crate::series::{Buffers, Kernel, Solver, SumOfProducts};
+use crate::series::{Buffers, Solver, SumOfProducts};
 
 /// Own-output orders closer to α than this make the equation say that the output equals itself.
 const LEAST_INTEGRATION: f64 = 1e-3;
@@ -166,7 +166,7 @@ impl FreeModel {
         let mut free = Vec::new();
         let mut basis = Vec::new();
         if out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty() {
-            let made = spectra_of_inverse(&mut solver, n, m)?;
+            let made = solver.inverse_spectra(FACTORS * m)?;
             let mut target = SumOfProducts::with_length(FACTORS * m);
             for (i, list) in out.exponents.iter().enumerate() {
                 for &exponent in list {
@@ -228,25 +228,4 @@ impl FreeModel {
         let of = |weights: &[f64], k: usize| weights.get(k).copied().unwrap_or(0.0);
         (0..self.order_bounds.len()).any(|k| of(&item.order.weights, k) != of(&item.terms[term].1.weights, k))
     }
-}
-
-/// Spectra of the series of A⁻¹, ready for products of [`FACTORS`] series.
-pub(super) fn inverse_spectra(matrix: &[Vec<Vec<f64>>]) -> Result<Vec<Vec<Kernel>>> {
-    let n = matrix.len();
-    let m = matrix.first().and_then(|row| row.first()).map_or(0, Vec::len);
-    spectra_of_inverse(&mut Solver::new(matrix)?, n, m)
-}
-
-fn spectra_of_inverse(solver: &mut Solver<'_>, n: usize, m: usize) -> Result<Vec<Vec<Kernel>>> {
-    let mut rows: Vec<Vec<Kernel>> = (0..n).map(|_| Vec::with_capacity(n)).collect();
-    for j in 0..n {
-        let mut unit = vec![vec![0.0; m]; n];
-        if let Some(first) = unit[j].first_mut() {
-            *first = 1.0;
-        }
-        for (row, series) in rows.iter_mut().zip(solver.solve(&unit)?) {
-            row.push(Kernel::with_length(&series, FACTORS * m));
-        }
-    }
-    Ok(rows)
 }

@@ -4,13 +4,12 @@
 //! only own terms, orders and inputs' numbers are searched: no sign to guess, no valley between what drives alike.
 
 use super::experiment::Experiment;
-use super::feedthrough::add_slope;
 use super::model::{Coordinate, FreeModel, Point};
 use super::part::{Driven, Part};
 use super::shelf::{Shelf, FACTORS};
 use crate::dense;
 use crate::error::{Error, Result};
-use crate::series::{Buffers, SumOfProducts};
+use crate::series::SumOfProducts;
 use crate::small::back_substitute;
 
 /// What is not told from the rest by this share of its column stays where it was: there rounding is as large.
@@ -46,8 +45,7 @@ impl FreeModel {
         point: &Point,
         coefficient: usize,
     ) -> Result<Driven> {
-        let (m, n) = (experiment.record.m(), self.equations.len());
-        let total = FACTORS * m;
+        let (total, n) = (FACTORS * experiment.record.m(), self.equations.len());
         let mut rights: Vec<Option<SumOfProducts>> = (0..n).map(|_| None).collect();
         for (i, equation) in self.equations.iter().enumerate() {
             for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
@@ -59,30 +57,13 @@ impl FreeModel {
                 }
             }
         }
-        let mut target = SumOfProducts::with_length(total);
-        let mut buffers = Buffers::default();
-        let means: Vec<Vec<f64>> = (part.inverse.iter().flatten())
-            .map(|row| {
-                for (right, inverse) in rights.iter().zip(row) {
-                    right.iter().for_each(|right| target.add_product(right, inverse));
-                }
-                let mut means = vec![0.0; m];
-                target.take(&mut means, &mut buffers);
-                means
-            })
-            .collect();
-        let parameter = point.orders.len() + coefficient;
-        let mut samples = experiment.sampled(&means);
-        part.early.correct_slope(self, experiment, point, parameter, &mut samples)?;
-        if let Some(direct) = &part.direct {
-            add_slope(self, experiment, direct, point, parameter, &mut samples);
-        }
-        if let Some(corners) = &part.corners {
-            corners.add_slope(self, experiment, part.direct.as_ref(), point, parameter, &mut samples);
-        }
-        match samples.iter().position(|v| !v.is_finite()) {
+        let rights: Vec<(usize, &SumOfProducts)> =
+            rights.iter().enumerate().filter_map(|(i, right)| right.as_ref().map(|r| (i, r))).collect();
+        let inverse = part.inverse.as_deref().unwrap_or_default();
+        let driven = part.moved_by(point.orders.len() + coefficient, &rights, inverse, (self, experiment, point))?;
+        match driven.samples.iter().position(|v| !v.is_finite()) {
             Some(index) => Err(Error::Diverged { what: "free run".into(), index }),
-            None => Ok(Driven { samples, means }),
+            None => Ok(driven),
         }
     }
 }

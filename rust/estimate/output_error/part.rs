@@ -1,9 +1,12 @@
 //! What a free run leaves behind for the derivatives of its residuals.
 
 use super::corners::Corners;
-use super::feedthrough::{Direct, Early};
-use super::shelf::Operator;
-use crate::series::Kernel;
+use super::experiment::Experiment;
+use super::feedthrough::{add_slope, Direct, Early};
+use super::model::{FreeModel, Point};
+use super::shelf::{Operator, FACTORS};
+use crate::error::Result;
+use crate::series::{Buffers, Kernel, SumOfProducts};
 use std::rc::Rc;
 
 /// What one experiment leaves behind for its sensitivities.
@@ -28,6 +31,41 @@ pub(super) struct Part {
     pub(super) early: Early,
     /// Corners near samples that were read at times of their own.
     pub(super) corners: Option<Corners>,
+}
+
+impl Part {
+    /// What one more of a parameter does to pulse means and weighted samples: `rights` is what it does to the right-hand
+    /// sides of the equations that it moves, `inverse` holds the spectra of A⁻¹. Orders come first among the
+    /// parameters, coefficients next, numbers of inputs last.
+    pub(super) fn moved_by(
+        &self,
+        parameter: usize,
+        rights: &[(usize, &SumOfProducts)],
+        inverse: &[Vec<Kernel>],
+        (model, experiment, point): (&FreeModel, &Experiment, &Point),
+    ) -> Result<Driven> {
+        let m = experiment.record.m();
+        let mut target = SumOfProducts::with_length(FACTORS * m);
+        let mut buffers = Buffers::default();
+        let means: Vec<Vec<f64>> = inverse
+            .iter()
+            .map(|row| {
+                rights.iter().for_each(|&(i, right)| target.add_product(right, &row[i]));
+                let mut means = vec![0.0; m];
+                target.take(&mut means, &mut buffers);
+                means
+            })
+            .collect();
+        let mut samples = experiment.sampled(&means);
+        self.early.correct_slope(model, experiment, point, parameter, &mut samples)?;
+        if let Some(direct) = &self.direct {
+            add_slope(model, experiment, direct, point, parameter, &mut samples);
+        }
+        if let Some(corners) = &self.corners {
+            corners.add_slope(model, experiment, self.direct.as_ref(), point, parameter, &mut samples);
+        }
+        Ok(Driven { samples, means })
+    }
 }
 
 /// What a coefficient of 1 more does to an experiment.

@@ -1,15 +1,14 @@
 //! Derivatives of the residuals: A⁻¹(∂b − ∂A y) as products of three spectra, one inverse transform a parameter and output.
 
 use super::experiment::Experiment;
-use super::feedthrough::add_slope;
-use super::free_run::{inverse_spectra, Evaluation};
+use super::free_run::Evaluation;
 use super::linear::project_out;
 use super::model::{FreeModel, Point};
 use super::part::Part;
 use super::shelf::{Shelf, FACTORS};
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
-use crate::series::{Buffers, Kernel, SumOfProducts};
+use crate::series::{Kernel, Solver, SumOfProducts};
 
 impl FreeModel {
     /// Derivatives of the residuals at an evaluated point with respect to orders, coefficients (plain coordinates),
@@ -55,14 +54,12 @@ impl FreeModel {
         let inverse = match &part.inverse {
             Some(inverse) => inverse,
             None => {
-                made = inverse_spectra(&part.matrix)?;
+                made = Solver::new(&part.matrix)?.inverse_spectra(total)?;
                 &made
             }
         };
         let mut responses: Vec<Option<Kernel>> = part.response.iter().map(|_| None).collect();
         let mut rights: Vec<SumOfProducts> = (0..n).map(|_| SumOfProducts::with_length(total)).collect();
-        let mut target = SumOfProducts::with_length(total);
-        let mut buffers = Buffers::default();
         for (parameter, out) in jacobian.iter_mut().enumerate() {
             let place = parameter.checked_sub(orders.len()).and_then(|c| linear.iter().position(|&j| j == c));
             if let Some(driven) = place.and_then(|k| part.driven.get(k)) {
@@ -120,25 +117,8 @@ impl FreeModel {
                 out.extend(std::iter::repeat_n(0.0, n * experiment.compared()));
                 continue;
             }
-            let means: Vec<Vec<f64>> = inverse
-                .iter()
-                .map(|row| {
-                    for (i, _) in moves.iter().enumerate().filter(|&(_, &moves)| moves) {
-                        target.add_product(&rights[i], &row[i]);
-                    }
-                    let mut means = vec![0.0; m];
-                    target.take(&mut means, &mut buffers);
-                    means
-                })
-                .collect();
-            let mut column = experiment.sampled(&means);
-            part.early.correct_slope(self, experiment, point, parameter, &mut column)?;
-            if let Some(direct) = &part.direct {
-                add_slope(self, experiment, direct, point, parameter, &mut column);
-            }
-            if let Some(corners) = &part.corners {
-                corners.add_slope(self, experiment, part.direct.as_ref(), point, parameter, &mut column);
-            }
+            let moved: Vec<(usize, &SumOfProducts)> = rights.iter().enumerate().filter(|&(i, _)| moves[i]).collect();
+            let mut column = part.moved_by(parameter, &moved, inverse, (self, experiment, point))?.samples;
             project_out(&part.basis, &mut column);
             // Residuals fall where the response rises.
             out.extend(column.iter().map(|v| -v));
