@@ -49,6 +49,7 @@
 pub mod error;
 pub mod means;
 pub mod readings;
+pub mod stop;
 
 pub mod excess;
 pub mod fractional;

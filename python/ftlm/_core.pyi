@@ -221,6 +221,7 @@ def output_error(
     evaluations: int,
     tolerance: float,
     steady: bool = False,
+    stop: Stop | None = None,
 ) -> _Fit: ...
 def grows(alpha: float, own_terms: Sequence[tuple[float, float]]) -> bool: ...
 
@@ -251,6 +252,7 @@ def friction_error(
     states: Sequence[Sequence[float]],
     evaluations: int,
     tolerance: float,
+    stop: Stop | None = None,
 ) -> dict[str, Any]: ...
 
 # ---------------------------------------------------------------------------------------------------------- simulation
@@ -384,6 +386,13 @@ class Guard:
     def bias(self) -> list[float]: ...
     @property
     def missed(self) -> int: ...
+
+@final
+class Stop:
+    def __new__(cls) -> Stop: ...
+    def set(self) -> None: ...
+    @property
+    def is_set(self) -> bool: ...
 
 @final
 class Streaming:

@@ -5,6 +5,7 @@ use crate::dense;
 use crate::error::{check_finite, check_length, Result};
 use crate::estimate::output_error::levenberg_marquardt::{minimise, Problem, Settings, Status};
 use crate::estimate::output_error::Experiment;
+use crate::stop::Stop;
 
 /// Where a fit starts.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -47,6 +48,7 @@ pub struct Fit {
 struct OutputError<'a> {
     model: &'a FrictionModel,
     experiments: &'a [Experiment],
+    stop: &'a Stop,
 }
 
 impl Problem for OutputError<'_> {
@@ -54,6 +56,7 @@ impl Problem for OutputError<'_> {
     type Evaluation = Evaluation;
 
     fn evaluate(&self, point: &Point) -> Result<Evaluation> {
+        self.stop.check()?;
         self.model.evaluate(self.experiments, point)
     }
 
@@ -62,6 +65,7 @@ impl Problem for OutputError<'_> {
     }
 
     fn jacobian(&self, point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
+        self.stop.check()?;
         self.model.jacobian(self.experiments, point, evaluation, true)
     }
 
@@ -143,6 +147,7 @@ struct Begun<'a> {
     orders: &'a [f64],
     coefficients: &'a [f64],
     inputs: &'a [f64],
+    stop: &'a Stop,
 }
 
 impl Begun<'_> {
@@ -161,6 +166,7 @@ impl Problem for Begun<'_> {
     type Evaluation = Evaluation;
 
     fn evaluate(&self, states: &Vec<f64>) -> Result<Evaluation> {
+        self.stop.check()?;
         self.model.evaluate(std::slice::from_ref(self.experiment), &self.at(states))
     }
 
@@ -199,8 +205,9 @@ fn begun(
     coefficients: &[f64],
     inputs: &[f64],
     experiment: &Experiment,
+    stop: &Stop,
 ) -> Vec<f64> {
-    let problem = Begun { model, experiment, orders, coefficients, inputs };
+    let problem = Begun { model, experiment, orders, coefficients, inputs, stop };
     let plain = model.first_states(orders, experiment, 0.0);
     let mut best = (f64::INFINITY, plain.clone());
     for share in BEGUN {
@@ -224,6 +231,20 @@ fn begun(
 /// A start whose free run is not finite ([`crate::error::Error::Diverged`]); a model that names what is not there,
 /// experiments that do not fit it ([`FrictionModel::check`]).
 pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, settings: Settings) -> Result<Fit> {
+    fit_until(model, experiments, start, settings, &Stop::default())
+}
+
+/// [`fit`], until it is told to stop.
+///
+/// # Errors
+/// As [`fit`]; [`Error::Interrupted`].
+pub fn fit_until(
+    model: &FrictionModel,
+    experiments: &[Experiment],
+    start: &Start,
+    settings: Settings,
+    stop: &Stop,
+) -> Result<Fit> {
     model.check(experiments)?;
     check_length("orders", model.order_bounds.len(), start.orders.len())?;
     check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
@@ -242,12 +263,12 @@ pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, set
     let count = model.states(&orders).0.len();
     let mut states = start.states.clone();
     if states.len() != experiments.len() || states.iter().any(|s| s.len() != count) {
-        states = experiments.iter().map(|e| begun(model, &orders, &coefficients, &inputs, e)).collect();
+        states = experiments.iter().map(|e| begun(model, &orders, &coefficients, &inputs, e, stop)).collect();
     }
     for values in &states {
         check_finite("states of the start", values)?;
     }
-    let problem = OutputError { model, experiments };
+    let problem = OutputError { model, experiments, stop };
     let found = minimise(&problem, Point { orders, coefficients, inputs, states }, settings)?;
     let numbers = found.point.orders.len() + found.point.coefficients.len() + found.point.inputs.len();
     let mut basis = Vec::new();

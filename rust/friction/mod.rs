@@ -19,6 +19,6 @@ pub mod online;
 mod states;
 
 pub use dynamics::{Body, Motion};
-pub use fit::{fit, Fit, Start};
+pub use fit::{fit, fit_until, Fit, Start};
 pub use law::Law;
 pub use model::{FreeLaw, FrictionModel};

@@ -6,6 +6,7 @@ use pyo3::types::PyDict;
 
 use super::arrays::{initial, record, records, rows, stacked, structure, vector, InitialArg, RecordArg, StructureArg};
 use super::errors::{attached, detached};
+use super::search::watch::{leavable, StopFlag};
 use crate::equation::{AffineOrder, Initial};
 use crate::error::{check_finite, Error};
 use crate::estimate::least_squares::Estimate;
@@ -13,9 +14,20 @@ use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::estimate::streaming::Streaming as StreamingFit;
 use crate::estimate::{iv as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint};
 use crate::readings::Readings;
+use crate::regressors::Record;
 
 /// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
 pub type EstimateTuple = (Vec<f64>, Vec<Vec<f64>>, Vec<f64>, Vec<(usize, usize)>);
+
+/// Pulses of all records together.
+pub fn pulses(records: &[Record]) -> usize {
+    records.iter().map(Record::m).sum()
+}
+
+/// Pulses of all experiments together, each as often as it is evaluated at most.
+pub fn evaluated(experiments: &[joint::Experiment], evaluations: usize) -> usize {
+    experiments.iter().map(|e| e.record.m()).sum::<usize>().saturating_mul(evaluations)
+}
 
 fn tuple(estimate: Estimate) -> EstimateTuple {
     (estimate.coefficients, estimate.initial, estimate.exponents, estimate.dropped)
@@ -34,7 +46,8 @@ pub fn least_squares(
     let records = records(&runs)?;
     let structure = structure(equation, inputs.len(), &inputs)?;
     let initial = initial(terms)?;
-    Ok(tuple(detached(py, || batch::fit(&records, &structure, &fixed, &initial))?))
+    let points = pulses(&records);
+    Ok(tuple(leavable(py, points, None, move |_| batch::fit(&records, &structure, &fixed, &initial))?))
 }
 
 #[pyfunction]
@@ -54,13 +67,17 @@ pub fn multi_innovation<'py>(
     let records = records(&runs)?;
     let structure = structure(equation, inputs.len(), &inputs)?;
     let initial = initial(terms)?;
+    let points = pulses(&records);
     let innovation = Innovation { length, prior_covariance, rows: if haar { Rows::Haar } else { Rows::Time } };
     if recursion {
-        let (estimate, trace) =
-            detached(py, || stepwise::recursion(&records, &structure, &fixed, &initial, &innovation))?;
+        let (estimate, trace) = leavable(py, points, None, move |_| {
+            stepwise::recursion(&records, &structure, &fixed, &initial, &innovation)
+        })?;
         return Ok((tuple(estimate), Some(stacked(py, &trace)?)));
     }
-    let estimate = detached(py, || stepwise::closed_form(&records, &structure, &fixed, &initial, &innovation))?;
+    let estimate = leavable(py, points, None, move |_| {
+        stepwise::closed_form(&records, &structure, &fixed, &initial, &innovation)
+    })?;
     Ok((tuple(estimate), None))
 }
 
@@ -84,11 +101,15 @@ pub fn instrumental_variables(
         equations.into_iter().map(|e| structure(e, inputs.len(), &inputs)).collect::<PyResult<Vec<_>>>()?;
     let initial = initial(terms)?;
     let settings = instruments::Settings { iterations, tolerance };
-    let fit = detached(py, || {
+    let points = pulses(&measured) * iterations.max(1);
+    let fit = leavable(py, points, None, move |stop| {
         let at_rest = initial == Initial::Rest;
         let measured = measured
             .into_iter()
-            .map(|r| instruments::with_projections(r, &inputs, at_rest))
+            .map(|r| {
+                stop.check()?;
+                instruments::with_projections(r, &inputs, at_rest)
+            })
             .collect::<Result<Vec<_>, _>>()?;
         instruments::fit(&measured, &structures, &fixed, &initial, settings)
     })?;
@@ -218,7 +239,7 @@ pub(super) fn free_inputs(inputs: &[FreeInputArg]) -> PyResult<Vec<joint::FreeIn
 #[pyfunction]
 #[pyo3(signature = (
     runs, laws, order_bounds, coordinates, coupled, terms, start_orders, start_coefficients, inputs, evaluations, tolerance,
-    steady=false,
+    steady=false, stop=None,
 ))]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
 pub fn output_error<'py>(
@@ -235,6 +256,7 @@ pub fn output_error<'py>(
     evaluations: usize,
     tolerance: f64,
     steady: bool,
+    stop: Option<&StopFlag>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
     let equations = laws.into_iter().map(free_equation).collect();
@@ -248,8 +270,9 @@ pub fn output_error<'py>(
     let model =
         joint::FreeModel { equations, order_bounds, coordinates, inputs: free, coupled, initial: initial(terms)? };
     let settings = joint::Settings { evaluations, tolerance };
-    let fitted = if steady { joint::fit_steady } else { joint::fit };
-    let fit = detached(py, || fitted(&model, &experiments, &start, settings))?;
+    let points = evaluated(&experiments, evaluations);
+    let fit =
+        leavable(py, points, stop, move |stop| joint::fit_until(&model, &experiments, &start, settings, steady, stop))?;
     let dict = PyDict::new(py);
     dict.set_item("orders", fit.point.orders)?;
     dict.set_item("coefficients", fit.point.coefficients)?;

@@ -5,11 +5,11 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::arrays::{initial, record, stacked, structure, InitialArg, RecordArg, StructureArg};
-use super::errors::detached;
 use super::estimate::{
-    coordinates, experiment, free_equation, free_inputs, status, ExperimentArg, FreeEquationArg, FreeInputArg,
-    MonomialArg,
+    coordinates, evaluated, experiment, free_equation, free_inputs, status, ExperimentArg, FreeEquationArg,
+    FreeInputArg, MonomialArg,
 };
+use super::search::watch::{leavable, StopFlag};
 use crate::equation::Equation;
 use crate::estimate::output_error as joint;
 use crate::friction::law::Phase;
@@ -34,7 +34,7 @@ pub fn friction_respond<'py>(
         .map(|(arg, coefficients)| Ok(Equation { structure: structure(arg, record.len(), &inputs)?, coefficients }))
         .collect::<PyResult<_>>()?;
     let body = Body { equations, sticks, friction };
-    let motion = detached(py, || body.run(&record, &terms))?;
+    let motion = leavable(py, record.m(), None, move |_| body.run(&record, &terms))?;
     let dict = PyDict::new(py);
     dict.set_item("outputs", stacked(py, &motion.outputs)?)?;
     dict.set_item("velocity", PyArray1::from_vec(py, motion.velocity))?;
@@ -45,6 +45,10 @@ pub fn friction_respond<'py>(
 }
 
 #[pyfunction]
+#[pyo3(signature = (
+    runs, laws, sticks, strength, order_bounds, names, terms, orders, coefficients, inputs, states, evaluations,
+    tolerance, stop=None,
+))]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
 pub fn friction_error<'py>(
     py: Python<'py>,
@@ -61,6 +65,7 @@ pub fn friction_error<'py>(
     states: Vec<Vec<f64>>,
     evaluations: usize,
     tolerance: f64,
+    stop: Option<&StopFlag>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
     let [coulomb, stribeck, speed] = strength.map(|(factor, powers)| joint::Monomial { factor, powers });
@@ -75,7 +80,9 @@ pub fn friction_error<'py>(
     };
     let start = Start { orders, coefficients, inputs: inputs.iter().map(|input| input.3).collect(), states };
     let settings = joint::Settings { evaluations, tolerance };
-    let fit = detached(py, || friction::fit(&model, &experiments, &start, settings))?;
+    let points = evaluated(&experiments, evaluations);
+    let fit =
+        leavable(py, points, stop, move |stop| friction::fit_until(&model, &experiments, &start, settings, stop))?;
     let dict = PyDict::new(py);
     dict.set_item("orders", fit.orders)?;
     dict.set_item("coefficients", fit.coefficients)?;

@@ -43,6 +43,9 @@ mod _core {
     };
 
     #[pymodule_export]
+    use super::search::watch::StopFlag;
+
+    #[pymodule_export]
     use super::virtual_arm::{fractional_memory, Guard, VirtualArm};
 
     #[pymodule_init]

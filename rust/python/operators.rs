@@ -114,7 +114,7 @@ pub fn series_multiply<'py>(
 ) -> PyResult<Array<'py>> {
     let (a, b) = (vector("a", &a)?, vector("b", &b)?);
     check_points("m", m)?;
-    let product = leavable(py, m, move |_| {
+    let product = leavable(py, m, None, move |_| {
         Ok(if naive { series::multiply_naive(&a, &b, m) } else { series::multiply(&a, &b, m) })
     })?;
     Ok(PyArray1::from_vec(py, product))
@@ -129,7 +129,7 @@ pub fn series_divide<'py>(
     naive: bool,
 ) -> PyResult<Array<'py>> {
     let (n, d) = (vector("numerator", &numerator)?, vector("divisor", &divisor)?);
-    let quotient = leavable(py, n.len(), move |_| {
+    let quotient = leavable(py, n.len(), None, move |_| {
         check_length("divisor", n.len(), d.len())?;
         if naive {
             series::divide_naive(&n, &d)
@@ -156,9 +156,9 @@ pub fn fractional_integral<'py>(
     };
     let all = rows(&x);
     let points = all.iter().map(Vec::len).sum();
-    let out = leavable(py, points, move |control| {
+    let out = leavable(py, points, None, move |stop| {
         let integral = |row: &Vec<f64>| {
-            control.check_stop()?;
+            stop.check()?;
             fractional::fractional_integral(row, order, step, rule)
         };
         all.iter().map(integral).collect()
@@ -183,10 +183,10 @@ pub fn fractional_derivative<'py>(
     };
     let (all, starts) = (rows(&x), rows(&initial));
     let points = all.iter().map(Vec::len).sum();
-    let out = leavable(py, points, move |control| {
+    let out = leavable(py, points, None, move |stop| {
         check_length("initial", all.len(), starts.len())?;
         let derivative = |(row, start): (&Vec<f64>, &Vec<f64>)| {
-            control.check_stop()?;
+            stop.check()?;
             fractional::fractional_derivative(row, order, step, definition, start)
         };
         all.iter().zip(&starts).map(derivative).collect()

@@ -7,6 +7,7 @@ use super::arrays::{
     equations, initial, record, rows, stacked, structure, vector, EquationArg, InitialArg, RecordArg, StructureArg,
 };
 use super::errors::detached;
+use super::search::watch::leavable;
 use crate::readings::Readings;
 use crate::simulate::{self, OutputFilter};
 
@@ -21,7 +22,7 @@ pub fn respond<'py>(
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let record = record(&run)?;
     let equations = equations(model, record.len(), &inputs)?;
-    let outputs = detached(py, || simulate::respond(&equations, &record, &terms))?;
+    let outputs = leavable(py, record.m(), None, move |_| simulate::respond(&equations, &record, &terms))?;
     stacked(py, &outputs)
 }
 
@@ -37,7 +38,8 @@ pub fn respond_and_units<'py>(
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>)> {
     let record = record(&run)?;
     let equations = equations(model, record.len(), &inputs)?;
-    let (driven, units) = detached(py, || simulate::respond_and_units(&equations, &record, &units))?;
+    let (driven, units) =
+        leavable(py, record.m(), None, move |_| simulate::respond_and_units(&equations, &record, &units))?;
     Ok((stacked(py, &driven)?, stacked(py, &units.concat())?))
 }
 
@@ -55,7 +57,7 @@ pub fn respond_with_initial<'py>(
     let equations = equations(model, record.len(), &inputs)?;
     let initial = initial(terms)?;
     let filter = filter.map(|(series, applies)| Ok::<_, PyErr>((vector("filter", &series)?, applies))).transpose()?;
-    let response = detached(py, || {
+    let response = leavable(py, record.m(), None, move |_| {
         let filter = filter.as_ref().map(|(series, applies)| OutputFilter { series, applies });
         simulate::respond_with_initial(&equations, &record, &initial, filter)
     })?;
@@ -74,7 +76,8 @@ pub fn equation_error<'py>(
     let record = record(&run)?;
     let equations = equations(vec![equation], record.len(), &inputs)?;
     let initial = initial(terms)?;
-    Ok(PyArray1::from_vec(py, detached(py, || simulate::equation_error(&equations[0], &record, &initial))?))
+    let found = leavable(py, record.m(), None, move |_| simulate::equation_error(&equations[0], &record, &initial))?;
+    Ok(PyArray1::from_vec(py, found))
 }
 
 #[pyfunction]
@@ -104,7 +107,8 @@ pub fn trace_errors<'py>(
     let record = record(&run)?;
     let structure = structure(equation, record.len(), &inputs)?;
     let rows = rows(&trace);
-    Ok(PyArray1::from_vec(py, detached(py, || simulate::trace_errors(&structure, &record, &rows))?))
+    let found = leavable(py, record.m(), None, move |_| simulate::trace_errors(&structure, &record, &rows))?;
+    Ok(PyArray1::from_vec(py, found))
 }
 
 #[pyfunction]

@@ -13,6 +13,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
+from ftlm.base.threads import stop
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
@@ -173,7 +174,7 @@ def descend(
     outcome = _core.output_error(
         experiments, problem.laws(signals), bounds, coordinates, structure.coupling == "simulated",
         initial_tuple(structure.initial, structure.offset, states), attempt.orders, attempt.coefficients,
-        inputs, evaluations, tolerance, steady,
+        inputs, evaluations, tolerance, steady, stop(),
     )  # fmt: skip
     numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
     return Attempt(numbers[0], numbers[1], attempt.origin, outcome, numbers[2])
@@ -190,7 +191,7 @@ def _with_friction(
     return _core.friction_error(
         experiments, problem.laws(structure.signals), structure.sticks, problem.strength(), bounds, coordinates,
         initial_tuple(structure.initial, structure.offset), attempt.orders, attempt.coefficients, inputs, known,
-        evaluations, tolerance,
+        evaluations, tolerance, stop(),
     )  # fmt: skip
 
 

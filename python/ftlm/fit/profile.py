@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
@@ -18,6 +17,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
+from ftlm.base.threads import pool
 from ftlm.data.run import Run
 from ftlm.fit.extrapolation import feasible
 from ftlm.fit.grid import Attempt, Grid
@@ -414,7 +414,7 @@ def _ends(
     out: dict[tuple[str, float], End | _LowerError | None] = dict.fromkeys(asked)
     took = dict.fromkeys(asked, 0)
     left = asked
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    with pool(max(threads, 1)) as workers:
         try:
             while left:
                 share = LAP * REFITS * 2 if most is None else (most - sum(took.values())) // len(left)
@@ -422,7 +422,9 @@ def _ends(
                     break
                 # In whole rounds, so that what an end may take does not depend on the number of threads.
                 allowed = [took[o] + share for o in left]
-                asked_now = [pool.submit(followed, one, most_now) for one, most_now in zip(left, allowed, strict=True)]
+                asked_now = [
+                    workers.submit(followed, one, most_now) for one, most_now in zip(left, allowed, strict=True)
+                ]
                 for one, future in zip(left, asked_now, strict=True):
                     found = future.result()
                     if isinstance(found, int):
@@ -431,14 +433,13 @@ def _ends(
                     out[one], took[one] = found, found.evaluations
                     if isinstance(found, _LowerError):
                         stop.set()
-                        pool.shutdown(cancel_futures=True)
+                        workers.shutdown(cancel_futures=True)
                         return out, sum(took.values())
                     if progress is not None:
                         progress(sum(e is not None for e in out.values()), len(asked))
                 left = [o for o in left if out[o] is None]
         except BaseException:
             stop.set()
-            pool.shutdown(cancel_futures=True)
             raise
     return out, sum(took.values())
 

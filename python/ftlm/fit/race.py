@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
+from ftlm.base.threads import pool
 from ftlm.data.structures import History
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
@@ -54,16 +54,12 @@ class Laps:
                 return None
 
         ended = []
-        with ThreadPoolExecutor(self.threads) as pool:
-            try:
-                for done, attempt in enumerate(pool.map(tried, runners)):
-                    if attempt is not None:
-                        ended.append(attempt)
-                    if self.progress is not None:
-                        self.progress(min(done, self.starts - 1), self.starts)
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        with pool(self.threads) as workers:
+            for done, attempt in enumerate(workers.map(tried, runners)):
+                if attempt is not None:
+                    ended.append(attempt)
+                if self.progress is not None:
+                    self.progress(min(done, self.starts - 1), self.starts)
         return sorted(ended, key=lambda a: a.level)
 
 
@@ -94,9 +90,18 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
         except ModelError:
             # At whole orders two of its terms have become one.
             continue
-        if isinstance(less, Whole) or (isinstance(less, Simpler) and less.driven):
-            # Driven by the measurement, or at given orders, most starts lead to one optimum: the nearest ones will do.
-            runners = laps.run(coarse, runners, 1, less.problem)[: FINALISTS if isinstance(less, Whole) else FEWEST]
+        if isinstance(less, Simpler) and less.driven:
+            # What drives is solved for at every point, with a term less as well: own terms alone are told apart, so the
+            # nearest starts will do, and their way goes on in the whole problem.
+            runners = laps.run(coarse, runners, 1, less.problem)[:FINALISTS]
+            ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
+            reached = sorted(
+                reached + laps.run(coarse, [less.embedded(a, problem) for a in ended[:1]], 1), key=lambda a: a.level
+            )
+            continue
+        if isinstance(less, Whole):
+            # At given orders most starts lead to one optimum.
+            runners = laps.run(coarse, runners, 1, less.problem)[:FINALISTS]
         ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
         ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
         reached = sorted(reached + [less.embedded(a, problem) for a in ended[:1]], key=lambda a: a.level)

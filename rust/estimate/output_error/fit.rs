@@ -7,6 +7,7 @@ use super::levenberg_marquardt::{minimise, Problem, Settings, Status};
 use super::model::{Coordinate, FreeModel, Point};
 use super::shelf::Shelf;
 use crate::error::{check_finite, check_length, Error, Result};
+use crate::stop::Stop;
 use std::cell::RefCell;
 
 /// The optimum and what describes it.
@@ -41,6 +42,8 @@ struct OutputError<'a> {
     linear: Vec<usize>,
     /// What evaluations share, by experiment.
     shelves: RefCell<Vec<Shelf>>,
+    /// What ends the search between two computations.
+    stop: &'a Stop,
 }
 
 impl Problem for OutputError<'_> {
@@ -48,6 +51,7 @@ impl Problem for OutputError<'_> {
     type Evaluation = Evaluation;
 
     fn evaluate(&self, point: &Point) -> Result<Evaluation> {
+        self.stop.check()?;
         self.model.evaluate(self.experiments, &mut self.shelves.borrow_mut(), point, &self.linear)
     }
 
@@ -64,6 +68,7 @@ impl Problem for OutputError<'_> {
     }
 
     fn jacobian(&self, _point: &Point, evaluation: &Evaluation) -> Result<Vec<Vec<f64>>> {
+        self.stop.check()?;
         self.model.jacobian(self.experiments, &mut self.shelves.borrow_mut(), &self.linear, evaluation)
     }
 
@@ -174,7 +179,7 @@ fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
 /// # }
 /// ```
 pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
-    fit_within(model, experiments, start, settings, false)
+    fit_until(model, experiments, start, settings, false, &Stop::default())
 }
 
 /// The same, but from a start whose free run does not grow no step leads to one that does.
@@ -185,15 +190,20 @@ pub fn fit(model: &FreeModel, experiments: &[Experiment], start: &Point, setting
 /// # Errors
 /// As [`fit`].
 pub fn fit_steady(model: &FreeModel, experiments: &[Experiment], start: &Point, settings: Settings) -> Result<Fit> {
-    fit_within(model, experiments, start, settings, true)
+    fit_until(model, experiments, start, settings, true, &Stop::default())
 }
 
-fn fit_within(
+/// [`fit`], or where `steady` [`fit_steady`], until it is told to stop.
+///
+/// # Errors
+/// As [`fit`]; [`Error::Interrupted`].
+pub fn fit_until(
     model: &FreeModel,
     experiments: &[Experiment],
     start: &Point,
     settings: Settings,
     steady: bool,
+    stop: &Stop,
 ) -> Result<Fit> {
     check_length("orders", model.order_bounds.len(), start.orders.len())?;
     check_length("coefficients", model.coordinates.len(), start.coefficients.len())?;
@@ -209,7 +219,8 @@ fn fit_within(
     // Solved for, they need no coordinate that keeps a sign.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
     let shelves = RefCell::new(experiments.iter().map(|_| Shelf::default()).collect());
-    let found = minimise(&OutputError { model: &model, experiments, steady, linear, shelves }, point, settings)?;
+    let problem = OutputError { model: &model, experiments, steady, linear, shelves, stop };
+    let found = minimise(&problem, point, settings)?;
     Ok(Fit {
         point: found.point,
         cost: found.cost,

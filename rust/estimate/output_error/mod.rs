@@ -23,7 +23,7 @@ mod sensitivities;
 mod shelf;
 
 pub use experiment::{Experiment, Instant, OwnTimes};
-pub use fit::{fit, fit_steady, Fit};
+pub use fit::{fit, fit_steady, fit_until, Fit};
 pub use input::{FreeInput, InputLaw};
 pub use levenberg_marquardt::{Settings, Status};
 pub use model::{Coordinate, FreeEquation, FreeModel, Monomial, Point};

@@ -2,15 +2,15 @@
 
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::mpsc::{channel, RecvTimeoutError};
-use std::sync::Arc;
 use std::time::Duration;
 
 use pyo3::prelude::*;
 
-use super::super::errors::{caught, detached};
+use super::super::errors::{attached, caught, detached};
 use super::arguments::checkpoint_of;
 use crate::error::Error;
 use crate::search::control::Control;
+use crate::stop::Stop;
 
 /// How often Python is asked for signals: well under the half second after which Ctrl-C must have ended a search.
 const LOOK: Duration = Duration::from_millis(50);
@@ -73,33 +73,64 @@ pub fn saved<T: Send>(
     Ok(result)
 }
 
-/// Signals shorter than this take less time than Python's signals are asked for, and no thread.
+/// Work on fewer points, each as often as it is gone through, takes less time than Python's signals are asked for, and no
+/// thread.
 const SHORT: usize = 1 << 17;
 
-/// Runs `work` on `points` values so that Ctrl-C returns at once: transforms of millions of points cannot be stopped, so
-/// their thread is left behind. It ends where `work` next looks at whether it was told to stop, and touches no Python.
+/// A flag that ends what was given it: [`leavable`] work on other threads than the one that Ctrl-C interrupts.
+#[pyclass(module = "ftlm._core", frozen, name = "Stop")]
+#[derive(Clone, Default)]
+pub struct StopFlag(Stop);
+
+#[pymethods]
+impl StopFlag {
+    #[new]
+    fn new() -> PyResult<Self> {
+        attached(|| Ok(Self::default()))
+    }
+
+    /// Ends what was given this flag, now and later.
+    fn set(&self) -> PyResult<()> {
+        attached(|| {
+            self.0.set();
+            Ok(())
+        })
+    }
+
+    /// Whether it was set.
+    #[getter]
+    fn is_set(&self) -> PyResult<bool> {
+        attached(|| Ok(self.0.is_set()))
+    }
+}
+
+/// Runs `work` on `points` values so that Ctrl-C, or a flag that is set, returns at once: transforms of millions of points
+/// cannot be stopped, so their thread is left behind. It ends where `work` next looks at whether it was told to stop, and
+/// touches no Python.
 pub fn leavable<T: Send + 'static>(
     py: Python<'_>,
     points: usize,
-    work: impl FnOnce(&Control) -> Result<T, Error> + Send + 'static,
+    flag: Option<&StopFlag>,
+    work: impl FnOnce(&Stop) -> Result<T, Error> + Send + 'static,
 ) -> PyResult<T> {
+    let stop = flag.cloned().unwrap_or_default().0;
     if points < SHORT {
-        return detached(py, || work(&Control::default()));
+        return detached(py, || work(&stop));
     }
     py.detach(|| {
-        let control = Arc::new(Control::default());
         let (send, receive) = channel();
-        let shared = Arc::clone(&control);
+        let told = stop.clone();
         // One that is left behind has nobody to send to.
-        std::thread::spawn(move || drop(send.send(caught(|| work(&shared)))));
+        std::thread::spawn(move || drop(send.send(caught(|| work(&told)))));
         loop {
             match receive.recv_timeout(LOOK) {
                 Ok(result) => return result.map_err(PyErr::from),
                 Err(RecvTimeoutError::Timeout) => {
                     if let Err(error) = Python::attach(|py| py.check_signals()) {
-                        control.stop.store(true, Ordering::Relaxed);
+                        stop.set();
                         return Err(error);
                     }
+                    stop.check()?;
                 }
                 Err(RecvTimeoutError::Disconnected) => {
                     let what = "a computing thread ended without a result".into();
