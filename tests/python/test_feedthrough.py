@@ -7,7 +7,9 @@ from dataclasses import replace
 import mpmath
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.signal import dlsim, lsim, lti
+from scipy.special import gamma
 
 import ftlm
 import loops
@@ -98,3 +100,23 @@ def test_the_relaxation_of_the_cell_is_the_series_of_mittag_leffler() -> None:
                 np.testing.assert_allclose(
                     loops.relaxation(t[:3], alpha, rate, integral=integral), exact, rtol=1e-9, atol=1e-12
                 )
+
+
+@pytest.mark.parametrize("excess", [0.3, 0.6, 0.9, 0.99])
+def test_a_ramp_that_starts_with_a_jump_is_differentiated_more_often_than_the_output(excess: float) -> None:
+    """y' = -2 y + D^(1 + e) u answers with D^e u and its convolution with an exponential, both by their closed forms."""
+    jump, slope, rows = 0.17, 0.5, 401
+    t = 0.01 * np.arange(rows)
+    still = ftlm.Run.from_arrays(
+        step=0.01, inputs={"u": jump + slope * t}, outputs={"y": 0.0 * t}, intersample={"u": "foh"}
+    )
+    made = ftlm.equation("D y = -2 y + b D^g u", fixed={"b": 1.0}).with_orders({"g": 1.0 + excess})
+    samples = ftlm.Model(replace(made, initial="rest")).simulate(still)["y"]
+    jumps, ramps = jump / gamma(1.0 - excess), slope / gamma(2.0 - excess)
+    for k in (1, 2, 5, 20, 100, 399, 400):
+        end = t[k]
+        now = jumps * end**-excess + ramps * end ** (1.0 - excess)
+        kink = quad(lambda s, e=end: np.exp(-2.0 * (e - s)), 0.0, end, weight="alg", wvar=(-excess, 0.0))[0]
+        rest = quad(lambda s, e=end: np.exp(-2.0 * (e - s)) * s ** (1.0 - excess), 0.0, end)[0]
+        exact = now - 2.0 * (jumps * kink + ramps * rest)
+        assert samples[k] == pytest.approx(exact, abs=2e-6), k
