@@ -104,7 +104,7 @@ def test_the_relaxation_of_the_cell_is_the_series_of_mittag_leffler() -> None:
 
 @pytest.mark.parametrize("excess", [0.3, 0.6, 0.9, 0.99])
 def test_a_ramp_that_starts_with_a_jump_is_differentiated_more_often_than_the_output(excess: float) -> None:
-    """y' = -2 y + D^(1 + e) u answers with D^e u and its convolution with an exponential, both by their closed forms."""
+    """y' = -2 y + D^(1 + e) u answers with D^e u and its convolution with an exponential, by their closed forms."""
     jump, slope, rows = 0.17, 0.5, 401
     t = 0.01 * np.arange(rows)
     still = ftlm.Run.from_arrays(

@@ -342,8 +342,8 @@ def _read(
             return np.asarray(begun + gain[:, None] * now)
         later = 1.5 * rest[:, every - 1 :: every] - 0.5 * rest[:, every - 2 :: every]
         if any(t.order.constant > e.order.constant + GRAIN for e in model.equations for t in e.terms):
-            # A term above its equation's order differentiates, nearly as Tustin's rule does at one above: pulses carry a
-            # part that changes its sign from one to the next, which only those on both sides of an instant take away.
+            # A term above its equation's order differentiates, nearly as Tustin's rule does at one above: pulses carry
+            # a part that changes its sign from one to the next, which those on both sides of an instant take away.
             later[:, :-1] = 0.5 * (rest[:, every - 1 : -1 : every] + rest[:, every::every])
             later[:, -1] = rest[:, -1] + 0.5 * rest[:, -2] - 0.5 * rest[:, -3]
         return np.concatenate([(gain * start)[:, None], later], axis=1) + gain[:, None] * now
