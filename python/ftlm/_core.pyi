@@ -15,6 +15,7 @@ __all__ = [
     "OrderSearch",
     "Points",
     "StageSearch",
+    "Stop",
     "Streaming",
     "VirtualArm",
     "__version__",

@@ -6,7 +6,7 @@ use pyo3::types::PyDict;
 
 use super::arrays::{initial, record, records, rows, stacked, structure, vector, InitialArg, RecordArg, StructureArg};
 use super::errors::{attached, detached};
-use super::search::watch::{leavable, StopFlag};
+use super::search::watch::{leavable, Stop};
 use crate::equation::{AffineOrder, Initial};
 use crate::error::{check_finite, Error};
 use crate::estimate::least_squares::Estimate;
@@ -256,7 +256,7 @@ pub fn output_error<'py>(
     evaluations: usize,
     tolerance: f64,
     steady: bool,
-    stop: Option<&StopFlag>,
+    stop: Option<&Stop>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
     let equations = laws.into_iter().map(free_equation).collect();

@@ -9,7 +9,7 @@ use super::estimate::{
     coordinates, evaluated, experiment, free_equation, free_inputs, status, ExperimentArg, FreeEquationArg,
     FreeInputArg, MonomialArg,
 };
-use super::search::watch::{leavable, StopFlag};
+use super::search::watch::{leavable, Stop};
 use crate::equation::Equation;
 use crate::estimate::output_error as joint;
 use crate::friction::law::Phase;
@@ -65,7 +65,7 @@ pub fn friction_error<'py>(
     states: Vec<Vec<f64>>,
     evaluations: usize,
     tolerance: f64,
-    stop: Option<&StopFlag>,
+    stop: Option<&Stop>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
     let [coulomb, stribeck, speed] = strength.map(|(factor, powers)| joint::Monomial { factor, powers });

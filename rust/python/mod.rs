@@ -43,7 +43,7 @@ mod _core {
     };
 
     #[pymodule_export]
-    use super::search::watch::StopFlag;
+    use super::search::watch::Stop;
 
     #[pymodule_export]
     use super::virtual_arm::{fractional_memory, Guard, VirtualArm};

@@ -10,7 +10,7 @@ use super::super::errors::{attached, caught, detached};
 use super::arguments::checkpoint_of;
 use crate::error::Error;
 use crate::search::control::Control;
-use crate::stop::Stop;
+use crate::stop;
 
 /// How often Python is asked for signals: well under the half second after which Ctrl-C must have ended a search.
 const LOOK: Duration = Duration::from_millis(50);
@@ -78,12 +78,12 @@ pub fn saved<T: Send>(
 const SHORT: usize = 1 << 17;
 
 /// A flag that ends what was given it: [`leavable`] work on other threads than the one that Ctrl-C interrupts.
-#[pyclass(module = "ftlm._core", frozen, name = "Stop")]
+#[pyclass(module = "ftlm._core", frozen)]
 #[derive(Clone, Default)]
-pub struct StopFlag(Stop);
+pub struct Stop(stop::Stop);
 
 #[pymethods]
-impl StopFlag {
+impl Stop {
     #[new]
     fn new() -> PyResult<Self> {
         attached(|| Ok(Self::default()))
@@ -110,8 +110,8 @@ impl StopFlag {
 pub fn leavable<T: Send + 'static>(
     py: Python<'_>,
     points: usize,
-    flag: Option<&StopFlag>,
-    work: impl FnOnce(&Stop) -> Result<T, Error> + Send + 'static,
+    flag: Option<&Stop>,
+    work: impl FnOnce(&stop::Stop) -> Result<T, Error> + Send + 'static,
 ) -> PyResult<T> {
     let stop = flag.cloned().unwrap_or_default().0;
     if points < SHORT {
