@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -13,7 +13,8 @@ from ftlm.data.structures import Structure
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
 from ftlm.selection.candidates import Change, Inside, signature, worded
-from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, numbers_of, spread
+from ftlm.selection.screen import Screened, screened
+from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, numbers_of, refined, spread
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -27,6 +28,9 @@ PATIENCE = 2
 BETTER = 0.005
 #: Two predictions are alike where what they leave over differs by no more than this share.
 SAME = 0.01
+#: Subsets that were screened are fitted where what they leave over is within this share of the best's, at most so many,
+#: and the best of each number of terms.
+NEAR, LEADING = 0.03, 8
 #: Changes of a step that are judged on unseen runs: the best by criterion.
 JUDGED = 2
 
@@ -53,29 +57,46 @@ class Work:
     trials: list[Trial] = field(default_factory=list)
 
     def each(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
-        """Work done for each item, in their order."""
+        """Work done for each item, in their order, and told."""
         self.known += len(items)
         out = []
+        for made in self._in_order(work, items):
+            out.append(made)
+            self.done += 1
+            if self.progress is not None:
+                self.progress(self.done, self.known)
+        return out
+
+    def spread(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+        """The same of work that is no candidate's fit."""
+        return list(self._in_order(work, items))
+
+    def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item]) -> Iterator[Made]:
         with ThreadPoolExecutor(self.threads) as pool:
             try:
-                for made in pool.map(work, items):
-                    out.append(made)
-                    self.done += 1
-                    if self.progress is not None:
-                        self.progress(self.done, self.known)
+                yield from pool.map(work, items)
             except BaseException:
                 pool.shutdown(cancel_futures=True)
                 raise
-        return out
 
-    def judge(self, name: str, structure: Structure, joint: JointFit | FtlmError) -> Trial:
+    def judge(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
         """A fitted candidate on what it never saw."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
         try:
-            return judged(name, structure, self.folds, joint)
+            return judged(name, structure, self.folds, joint, fine=fine)
         except FtlmError as error:
             return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
+
+    def refined(self, trial: Trial) -> Trial:
+        """A candidate whose numbers do not depend on the step of the grid."""
+        if trial.fine:
+            return trial
+        try:
+            return refined(trial, self.folds)
+        except FtlmError:
+            # On a finer grid it has no finite free run: it stays what it was judged as.
+            return trial
 
     def fitted(
         self, structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
@@ -116,8 +137,14 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
 
     Each whole value of the highest orders is a root of its own: what is best among the simplest need not be what the
     best grows from. Where several signals drive, one may stand for all the others: the best is also come to from above,
-    from everything at whole orders, one thing less at a time.
+    from everything at whole orders, one thing less at a time. Where so many signals drive that subsets can be screened,
+    growth begins with the best of them all.
     """
+    subsets = screened(inside, work.folds, work)
+    found = _from_subsets(inside, work, subsets)
+    if found:
+        # What was screened is not fitted again because it is one thing more, or less, than something.
+        return _finished(inside, work, found, {signature(inside.build(s.change.variant)) for s in subsets})
     changes = _new(inside, inside.skeletons(), set())
     joints = work.each(lambda c: work.fitted(inside.build(c.variant), []), changes)
     roots: dict[tuple[float | None, ...], list[tuple[Change, JointFit | FtlmError]]] = {}
@@ -136,11 +163,39 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
     joined = [values_of(j) for c, j in zip(changes, joints, strict=True) if not isinstance(j, FtlmError)]
     from_above = _downwards(inside, work, first[1], joined, tried)
     ends += [] if from_above is None else [from_above]
+    return _finished(inside, work, ends, tried)
+
+
+def _finished(inside: Inside, work: Work, ends: Sequence[tuple[Trial, Fitted]], tried: set[str]) -> list[Trial]:
+    """What is as good as the best, and what is left of it when one thing after another is taken away."""
     least = min(_rank(trial) for trial, _ in ends)
     for trial, at in ends:
         if (trial.grows, trial.score) <= (least[0], least[1] + SAME):
             _pruned(inside, work, trial, at, tried)
     return work.trials
+
+
+def _from_subsets(inside: Inside, work: Work, subsets: Sequence[Screened]) -> list[tuple[Trial, Fitted]]:
+    """The best subsets fitted and judged, and what the best of them grows to when its orders become free."""
+    if not subsets:
+        return []
+    ahead = [s for s in subsets if s.score <= subsets[0].score + NEAR][:LEADING]
+    by_size: dict[int, Screened] = {}
+    for one in subsets:
+        by_size.setdefault(len(one.start), one)
+    ahead += [s for s in by_size.values() if s not in ahead]
+
+    def from_lattice(subset: Screened) -> JointFit | FtlmError:
+        return work.fitted(inside.build(subset.change.variant), [subset.start], refine=False)
+
+    joints = work.each(from_lattice, ahead)
+    steps = _by_criterion(inside, work, [(s.change, j) for s, j in zip(ahead, joints, strict=True)])
+    if not steps:
+        return []
+    ends = list(zip(_judged(inside, work, steps), steps, strict=True))
+    tried = {signature(inside.build(s.change.variant)) for s in subsets}
+    first = min(ends, key=lambda end: _rank(end[0]))
+    return [first, _upwards(inside, work, first[1], tried, first[0])]
 
 
 def _rank(trial: Trial) -> tuple[bool, float]:
@@ -153,11 +208,12 @@ def values_of(joint: JointFit) -> dict[str, float]:
     return dict(zip(joint.names, joint.values.tolist(), strict=True))
 
 
-def _upwards(inside: Inside, work: Work, chosen: Fitted, tried: set[str]) -> tuple[Trial, Fitted]:
+def _upwards(
+    inside: Inside, work: Work, chosen: Fitted, tried: set[str], judged_already: Trial | None = None
+) -> tuple[Trial, Fitted]:
     """One thing more after another, as long as prediction gets better; the best of the way."""
-    best = work.judge(_name(inside, chosen), inside.build(chosen.change.variant), chosen.joint)
+    best = judged_already or _judged(inside, work, [chosen])[0]
     best_at, idle = chosen, 0
-    work.trials.append(best)
     tried.add(_key(inside, chosen.change))
     while idle < PATIENCE:
         larger = _new(inside, inside.larger(chosen.change.variant), tried)
@@ -274,7 +330,7 @@ def listed(candidates: Mapping[str, Structure], work: Work) -> list[Trial]:
 
     def one(item: tuple[str, Structure]) -> Trial:
         name, structure = item
-        return work.judge(name, structure, work.fitted(structure, []))
+        return work.judge(name, structure, work.fitted(structure, []), fine=True)
 
     work.trials += work.each(one, list(candidates.items()))
     return work.trials

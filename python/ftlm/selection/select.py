@@ -115,16 +115,20 @@ def _chosen(work: Work, folds: Folds) -> Selection:
     if not there:
         why = next((f"; {t.name}: {t.failed}" for t in work.trials), "")
         raise ConvergenceError(f"no candidate can be fitted to {folds.words}{why}")
-    scatter = min(spread(t.joint) for t in there if t.joint is not None)
-    scored = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in work.trials]
     kept: dict[str, Trial] = {}
-    for trial in scored:
+    for trial in work.trials:
         key = signature(trial.structure)
         if key not in kept or trial.score < kept[key].score:
             kept[key] = trial
     ranked = sorted(kept.values(), key=lambda t: (t.failed is not None, t.grows, t.score, t.numbers, t.name))
     best = ranked[0]
-    winner = _winner([t for t in ranked if t.failed is None and t.grows == best.grows and _as_good(t, best)])
+    near = [k for k, t in enumerate(ranked) if t.failed is None and t.grows == best.grows and _as_good(t, best)]
+    # What the grid leaves is a fraction of an order, and to a criterion of thousands of samples a fraction counts.
+    for k, trial in zip(near, work.spread(work.refined, [ranked[k] for k in near]), strict=True):
+        ranked[k] = trial
+    scatter = min(spread(t.joint) for t in ranked if t.joint is not None)
+    ranked = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in ranked]
+    best, winner = ranked[0], _winner([ranked[k] for k in near])
     found = identify(list(folds.runs), _as_judged(winner, folds), threads=work.threads)
     warnings = []
     if winner.joint is not None and found.joint is not None and found.joint.noise:
