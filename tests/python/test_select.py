@@ -1,6 +1,7 @@
 """Structures chosen by what they predict: the true one among those inside a richer one, and words where none can be."""
 
 import json
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,8 @@ import ftlm
 from ftlm.cli.app import app
 from ftlm.selection.automatic import automatic
 from ftlm.selection.candidates import Inside, Variant, named
-from ftlm.selection.trial import Folds, masked
+from ftlm.selection.growth import Abandoned, Work, duration, listed
+from ftlm.selection.trial import Folds, Trial, masked
 
 RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
 
@@ -171,10 +173,17 @@ def test_words_where_nothing_can_be_chosen(runs):
         ftlm.select(runs, [second, "D y = u"])
     with pytest.raises(ftlm.ModelError, match="are the same structure; leave one out"):
         named({"one": second, "two": ftlm.equation("D^2 y = d D y + a y + b u")})
+    renamed = ftlm.equation("D^2 y = k y + c D y + g u")
+    with pytest.raises(ftlm.ModelError, match="the same structure but for the names of their numbers; leave one out"):
+        ftlm.select(runs, {"one": second, "two": renamed})
+    with pytest.raises(ftlm.ModelError, match="candidates 'any, offset' and 'constant' are the same structure; leave"):
+        ftlm.select(runs, {"any": replace(second, offset="auto"), "constant": replace(second, offset="constant")})
+    with pytest.raises(ftlm.ModelError, match=r"validation = \[\] has no run to validate on"):
+        ftlm.select(runs, second, validation=[])
     with pytest.raises(ftlm.ModelError, match="candidates = 'D y = u'; use 'auto'"):
         ftlm.select(runs, "D y = u")
     with pytest.raises(ftlm.ModelError, match="10001 candidates are more than 10000"):
-        ftlm.select(runs, {str(k): ftlm.equation(f"D^{1 + k * 1e-5:.6f} y = a y + b u") for k in range(10_001)})
+        ftlm.select(runs, [second] * 10_001)
     with pytest.raises(ftlm.DataError, match="has 40 rows, too few to be cut into 4 blocks"):
         ftlm.select(runs[0].slice(0, 0.8), second)
     with pytest.raises(ftlm.ModelError, match="motor 1 is one of those that are fitted to, which judges nothing"):
@@ -182,8 +191,73 @@ def test_words_where_nothing_can_be_chosen(runs):
     idle = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(300)}, outputs={"y": 1e-3 * np.sin(np.arange(300.0))})
     with pytest.raises(ftlm.DataError, match="u is 0 throughout"):
         ftlm.select(idle, replace(second, initial="rest"))
+    still = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(300)}, outputs={"y": np.zeros(300)})
+    for candidates in ("auto", second, [second]):
+        with pytest.raises(ftlm.DataError, match="'y' of run 'run': constant, every row is 0.0"):
+            ftlm.select(still, candidates)
     with pytest.raises(ftlm.DataError, match="signal"):
         ftlm.select(runs, ftlm.equation("D^2 z = a z + b u"))
+
+
+def test_who_stops_it_has_the_word_back_while_threads_still_compute(runs):
+    """By the order of events: the word is back before the second item ends, and the fourth never begins."""
+    free, entered, begun = threading.Event(), threading.Event(), []
+
+    def item(number):
+        begun.append(number)
+        if number == 1:
+            entered.set()
+        if number == 0:
+            assert entered.wait(60)
+        else:
+            assert free.wait(60)
+        return number
+
+    def stop(done, known):
+        raise KeyboardInterrupt
+
+    work = Work(Folds.of(runs, "runs"), 2, stop)
+    with pytest.raises(KeyboardInterrupt):
+        work.each(item, list(range(20)))
+    assert not free.is_set()
+    assert work.stopped.is_set()
+    free.set()
+    # The thread of the first item may have taken up a third; nothing else ever begins.
+    assert set(begun) <= {0, 1, 2}
+    with pytest.raises(Abandoned):
+        work.alive()
+
+
+def test_a_stopped_fit_ends_at_its_next_start(runs):
+    work = Work(Folds.of(runs, "runs"), 1)
+    work.stopped.set()
+    structure = ftlm.equation("D^2 y = d D y + a y + b u")
+    with pytest.raises(Abandoned):
+        work.fitted(structure, [])
+    with pytest.raises(Abandoned):
+        work.fitted(structure, [{"d": -5.0, "a": -40.0, "b": 40.0}])
+    work.stopped.clear()
+    joint = work.fitted(structure, [{"d": -5.0, "a": -40.0, "b": 40.0}])
+    work.stopped.set()
+    with pytest.raises(Abandoned):
+        work.judge("second order", structure, joint)
+
+
+def test_many_candidates_are_told_how_long_they_take(runs):
+    ticks = iter([0.0, 3.0])
+
+    def judge(name, structure, joint, *, fine):
+        return Trial(name, structure, 1, failed="not asked")
+
+    work = Work(Folds.of(runs, "runs"), 2, clock=lambda: next(ticks))
+    work.fitted = lambda structure, starts: None
+    work.judge = judge
+    candidates = {str(k): ftlm.equation(f"D^{1 + k * 1e-4:.6f} y = a y + b u") for k in range(202)}
+    with pytest.warns(
+        UserWarning, match="202 candidates: the first 2 took 3 s, so the other 200 take about 5 min on 2"
+    ):
+        assert len(listed(candidates, work)) == 202
+    assert [duration(s) for s in (0.123, 119.0, 121.0, 7300.0)] == ["0.12 s", "1.2e+02 s", "2 min", "2 h"]
 
 
 def test_the_page_and_the_figures(chosen, tmp_path):

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
@@ -31,8 +34,14 @@ SAME = 0.01
 #: Subsets that were screened are fitted where what they leave over is within this share of the best's, at most so many,
 #: and the best of each number of terms.
 NEAR, LEADING = 0.03, 8
+#: Candidates of a list from which on the time that they take is estimated first.
+MANY = 200
 #: Changes of a step that are judged on unseen runs: the best by criterion.
 JUDGED = 2
+
+
+class Abandoned(BaseException):
+    """Ends work in a thread whose result nobody waits for; no failure of a candidate."""
 
 
 @dataclass
@@ -47,44 +56,59 @@ class Work:
         Candidates at a time; what comes out does not depend on it.
     progress
         Called with (candidates fitted, candidates known of so far).
+    clock
+        Seconds that pass.
     """
 
     folds: Folds
     threads: int
     progress: Callable[[int, int], None] | None = None
+    clock: Callable[[], float] = time.perf_counter
     done: int = 0
     known: int = 0
+    stopped: threading.Event = field(default_factory=threading.Event)
     trials: list[Trial] = field(default_factory=list)
 
     def each(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
         """Work done for each item, in their order, and told."""
         self.known += len(items)
-        out = []
-        for made in self._in_order(work, items):
-            out.append(made)
-            self.done += 1
-            if self.progress is not None:
-                self.progress(self.done, self.known)
-        return out
+        return self._in_order(work, items, self._told)
 
     def spread(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
         """The same of work that is no candidate's fit."""
-        return list(self._in_order(work, items))
+        return self._in_order(work, items, lambda: None)
 
-    def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item]) -> Iterator[Made]:
-        with ThreadPoolExecutor(self.threads) as pool:
-            try:
-                yield from pool.map(work, items)
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+    def _told(self) -> None:
+        self.done += 1
+        if self.progress is not None:
+            self.progress(self.done, self.known)
+
+    def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item], told: Callable[[], None]) -> list[Made]:
+        pool = ThreadPoolExecutor(self.threads)
+        out: list[Made] = []
+        try:
+            for made in pool.map(work, items):
+                out.append(made)
+                told()
+        except BaseException:
+            # Whoever stops this has the word back at once; what still computes ends at its next start or fold.
+            self.stopped.set()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+        pool.shutdown()
+        return out
+
+    def alive(self, *_: int) -> None:
+        """Nothing, or the end of what nobody waits for any more."""
+        if self.stopped.is_set():
+            raise Abandoned
 
     def judge(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
         """A fitted candidate on what it never saw."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
         try:
-            return judged(name, structure, self.folds, joint, fine=fine)
+            return judged(name, structure, self.folds, joint, fine=fine, alive=self.alive)
         except FtlmError as error:
             return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
 
@@ -103,7 +127,7 @@ class Work:
     ) -> JointFit | FtlmError:
         """A fit on all runs, or why there is none."""
         try:
-            return fit(self.folds.runs, structure, starts, refine=refine)
+            return fit(self.folds.runs, structure, starts, refine=refine, alive=self.alive)
         except FtlmError as error:
             return error
 
@@ -332,5 +356,26 @@ def listed(candidates: Mapping[str, Structure], work: Work) -> list[Trial]:
         name, structure = item
         return work.judge(name, structure, work.fitted(structure, []), fine=True)
 
-    work.trials += work.each(one, list(candidates.items()))
+    items = list(candidates.items())
+    if len(items) > MANY:
+        begun = work.clock()
+        work.trials += work.each(one, items[: work.threads])
+        took = work.clock() - begun
+        rest = len(items) - work.threads
+        warnings.warn(
+            f"{len(items)} candidates: the first {work.threads} took {duration(took)}, so the other {rest} take about "
+            f"{duration(took * rest / work.threads)} on {work.threads} threads; Ctrl-C ends it, and a structure whose "
+            "inside is searched needs far fewer fits",
+            UserWarning, stacklevel=3,
+        )  # fmt: skip
+        items = items[work.threads :]
+    work.trials += work.each(one, items)
     return work.trials
+
+
+def duration(seconds: float) -> str:
+    """Seconds, minutes or hours, in two figures."""
+    for unit, size in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.2g} s"

@@ -72,8 +72,8 @@ def select(
     DataError
         Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing.
     ModelError
-        No candidates, two that are the same, more than 10 000, words that are not known, one run where several are
-        needed, a validation run that is fitted to.
+        No candidates, two that are the same but for the names of their numbers, more than 10 000, no validation run,
+        words that are not known, one run where several are needed, a validation run that is fitted to.
     ConvergenceError
         No candidate that can be fitted.
 
@@ -81,30 +81,33 @@ def select(
     -----
     Initial terms are those of whole orders (none from rest, else level and velocity, Caputo's) unless the structure
     says otherwise: with a history, which has more terms the more orders are free, candidates could not be compared.
-    Growth costs one fit for each thing that may be added, at each step.
+    Growth costs one fit for each thing that may be added, at each step. Where three or more terms drive one equation
+    and whole runs judge, every subset of them at whole orders is fitted and judged in closed form first, on a lattice
+    of the own coefficients, and growth begins with the best. Of a list of more than 200 candidates a ``UserWarning``
+    says, after the first ones, how long the rest takes. Ctrl-C returns at once; threads end with the descent that they
+    are in.
     """
     # Checked here as identify checks it: threads is a whole number, at least 1.
     workers = Settings.check(coefficients="least-squares", threads=threads).threads
     several = [runs] if isinstance(runs, Run) else list(runs)
     folds = Folds.of(runs, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
     work = Work(folds, workers, progress)
-    every = named(candidates) if not isinstance(candidates, (str, Structure)) else {}
-    if len(every) > MOST:
+    if not isinstance(candidates, (str, Structure)) and len(candidates) > MOST:
         raise ModelError(
-            f"{len(every)} candidates are more than {MOST}; give one structure instead, whose inside is grown step by "
-            "step"
+            f"{len(candidates)} candidates are more than {MOST}; give one structure instead, whose inside is grown "
+            "step by step"
         )
-    for structure in [candidates] if isinstance(candidates, Structure) else every.values():
+    every = named(candidates) if not isinstance(candidates, (str, Structure)) else {}
+    if isinstance(candidates, str) and candidates != "auto":
+        raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
+    searched = automatic(folds.runs) if isinstance(candidates, str) else []
+    searched += [candidates] if isinstance(candidates, Structure) else []
+    for structure in (*searched, *every.values()):
         # Refused here, once, and not as a failure of every candidate.
         prepare(folds.runs, replace(structure.as_given(), offset="none"), None, power_of_two=False, gaps=True)
-    if isinstance(candidates, str):
-        if candidates != "auto":
-            raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
-        for structure in automatic(folds.runs):
-            grown(Inside(structure), work)
-    elif isinstance(candidates, Structure):
-        grown(Inside(candidates), work)
-    else:
+    for structure in searched:
+        grown(Inside(structure), work)
+    if every:
         listed(every, work)
     return _chosen(work, folds)
 
