@@ -14,6 +14,7 @@ from ftlm.cli.app import app
 from ftlm.selection.automatic import automatic
 from ftlm.selection.candidates import Inside, Variant, named
 from ftlm.selection.growth import Abandoned, Work, duration, listed
+from ftlm.selection.select import _as_good
 from ftlm.selection.trial import Folds, Trial, masked
 
 RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
@@ -193,7 +194,7 @@ def test_words_where_nothing_can_be_chosen(runs):
         ftlm.select(idle, replace(second, initial="rest"))
     still = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(300)}, outputs={"y": np.zeros(300)})
     for candidates in ("auto", second, [second]):
-        with pytest.raises(ftlm.DataError, match="'y' of run 'run': constant, every row is 0.0"):
+        with pytest.raises(ftlm.DataError, match="'y' of run 'run': constant, every row is 0"):
             ftlm.select(still, candidates)
     with pytest.raises(ftlm.DataError, match="signal"):
         ftlm.select(runs, ftlm.equation("D^2 z = a z + b u"))
@@ -258,6 +259,22 @@ def test_many_candidates_are_told_how_long_they_take(runs):
     ):
         assert len(listed(candidates, work)) == 202
     assert [duration(s) for s in (0.123, 119.0, 121.0, 7300.0)] == ["0.12 s", "1.2e+02 s", "2 min", "2 h"]
+
+
+def test_predictions_are_alike_where_folds_do_not_tell_them_apart():
+    """Scores of one seed of a plant whose true structure a single standard error refused for one with three more."""
+
+    def trial(*scores):
+        return Trial("", ftlm.equation("D y = a y + b u"), 1, scores=scores)
+
+    best = trial(-3.7766, -4.4820, -4.7931, -4.8312)
+    assert _as_good(trial(-3.7169, -4.4811, -4.7930, -4.8305), best)
+    # However much the folds scatter, beyond 5 % nothing is alike; nor what is a little worse in each of them.
+    assert not _as_good(trial(-3.5, -4.4811, -4.7930, -4.8305), best)
+    assert not _as_good(trial(-3.76, -4.467, -4.777, -4.815), best)
+    # Two folds tell no scatter: 1 %.
+    assert _as_good(trial(-3.76, -4.48), trial(-3.7766, -4.4820))
+    assert not _as_good(trial(-3.75, -4.48), trial(-3.7766, -4.4820))
 
 
 def test_the_page_and_the_figures(chosen, tmp_path):

@@ -182,8 +182,10 @@ class Inside:
                         if term.coefficient in droppable:
                             continue
                         return None
-                    # The first own term that is not the elasticity is taken for damping.
-                    value = 1.0 if own and 1.0 in places else places[0]
+                    # Of own terms whose orders are sought the last is taken for damping, those before it stand below.
+                    later = item.terms[item.terms.index(term) + 1 :]
+                    below = any(t.signal == item.output and t.order.is_single for t in later)
+                    value = 1.0 if own and 1.0 in places and not (below and 0.0 in places) else places[0]
                     whole[name] = value
                     taken |= {value} if own else set()
                 elif own and not term.order.names and term.order.constant >= (highest or 0.0):

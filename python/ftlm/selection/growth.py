@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import threading
 import time
 import warnings
@@ -15,7 +16,7 @@ from ftlm.base.errors import FtlmError
 from ftlm.data.structures import Structure
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
-from ftlm.selection.candidates import Change, Inside, signature, worded
+from ftlm.selection.candidates import Change, Inside, Variant, signature, worded
 from ftlm.selection.screen import Screened, screened
 from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, numbers_of, refined, spread
 
@@ -36,6 +37,8 @@ SAME = 0.01
 NEAR, LEADING = 0.03, 8
 #: Candidates of a list from which on the time that they take is estimated first.
 MANY = 200
+#: ln of the multiple of the best's residuals beyond which no root of an equation that keeps its terms is grown.
+DOMINATED = math.log(2.0)
 #: Changes of a step that are judged on unseen runs: the best by criterion.
 JUDGED = 2
 
@@ -162,13 +165,15 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
     Each whole value of the highest orders is a root of its own: what is best among the simplest need not be what the
     best grows from. Where several signals drive, one may stand for all the others: the best is also come to from above,
     from everything at whole orders, one thing less at a time. Where so many signals drive that subsets can be screened,
-    growth begins with the best of them all.
+    growth begins with the best of them all; where no term may be left out, everything free is a root beside.
     """
     subsets = screened(inside, work.folds, work)
     found = _from_subsets(inside, work, subsets)
     if found:
         # What was screened is not fitted again because it is one thing more, or less, than something.
         return _finished(inside, work, found, {signature(inside.build(s.change.variant)) for s in subsets})
+    if not inside.droppable:
+        return _from_everything(inside, work)
     changes = _new(inside, inside.skeletons(), set())
     joints = work.each(lambda c: work.fitted(inside.build(c.variant), []), changes)
     roots: dict[tuple[float | None, ...], list[tuple[Change, JointFit | FtlmError]]] = {}
@@ -197,6 +202,31 @@ def _finished(inside: Inside, work: Work, ends: Sequence[tuple[Trial, Fitted]], 
         if (trial.grows, trial.score) <= (least[0], least[1] + SAME):
             _pruned(inside, work, trial, at, tried)
     return work.trials
+
+
+def _from_everything(inside: Inside, work: Work) -> list[Trial]:
+    """Equations that keep their terms, under a law or coupled: from the whole orders up, and from all orders free down.
+
+    Growth from whole orders is left out where these leave over far more than all orders free do on unseen runs.
+    """
+    structure = inside.structure
+    full = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
+    changes = _new(inside, [*inside.skeletons(), Change(worded(inside.build(full)), full)], set())
+    joints = work.each(lambda c: work.fitted(inside.build(c.variant), []), changes)
+    pairs = list(zip(changes, joints, strict=True))
+    roots = _by_criterion(inside, work, [p for p in pairs if p[0].variant != full])[:1]
+    roots += _by_criterion(inside, work, [p for p in pairs if p[0].variant == full])
+    if not roots:
+        work.trials += [work.judge(c.words, inside.build(c.variant), j) for c, j in pairs]
+        return work.trials
+    first = _judged(inside, work, roots)
+    tried = {_key(inside, r.change) for r in roots}
+    least = min(trial.score for trial in first)
+    ends = [
+        _upwards(inside, work, at, tried, trial)
+        for trial, at in zip(first, roots, strict=True) if trial.score <= least + DOMINATED
+    ]  # fmt: skip
+    return _finished(inside, work, ends, tried)
 
 
 def _from_subsets(inside: Inside, work: Work, subsets: Sequence[Screened]) -> list[tuple[Trial, Fitted]]:
@@ -326,7 +356,7 @@ def _by_criterion(inside: Inside, work: Work, pairs: Sequence[tuple[Change, Join
 def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]) -> None:
     """One thing less after another, as long as prediction is no worse."""
     while True:
-        changes = _new(inside, inside.smaller(at.change.variant), tried)
+        changes = [c for c in _new(inside, inside.smaller(at.change.variant), tried) if _beside(c, at)]
         steps = _tried(inside, work, at, changes)
         tried |= {_key(inside, c) for c in changes}
         found = _judged(inside, work, steps[:JUDGED])
@@ -334,6 +364,12 @@ def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]
         if not better:
             return
         best, at = min(better, key=lambda pair: _rank(pair[0]))
+
+
+def _beside(change: Change, at: Fitted) -> bool:
+    """Whether orders that become whole move to the next whole number on either side of their estimate."""
+    values = values_of(at.joint)
+    return all(abs(v - values[n]) < 1.0 for n, v in change.variant.whole if n in values)
 
 
 def _key(inside: Inside, change: Change) -> str:

@@ -22,8 +22,9 @@ from ftlm.solve.records import prepare
 
 #: Schwarz criteria closer than this tell nothing; doi:10.1080/01621459.1995.10476572.
 ALIKE = 2.0
-#: Folds from which on the scatter over them says something.
-FOLDS = 3
+#: Folds from which on the scatter over them says something, one-sided 95 % quantiles of Student's t from there on, and the
+#: most that counts as alike whatever the scatter.
+FOLDS, STUDENT_95, MOST_ALIKE = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81), 0.05
 #: Candidates of a list beyond which somebody has made a mistake.
 MOST = 10_000
 
@@ -42,8 +43,8 @@ def select(
     a term, a free order or an offset more at a time, each fitted by output error from the last optimum, the two most
     promising by Schwarz's criterion judged by free runs on what they were not fitted to; where two steps in a row
     predict no better, it is pruned, one thing less at a time. A list of candidates is judged whole, each from automatic
-    starts. Chosen is, among those that predict as well as the best (what is left over is within 1 %, or within the
-    standard error of the difference over three or more folds), the one with the least Schwarz criterion, samples
+    starts. Chosen is, among those that predict as well as the best (what is left over is within 1 %, or, up to 5 %,
+    three or more folds do not tell the difference from 0 at 95 %), the one with the least Schwarz criterion, samples
     counted as the colour of the residuals lets them; of those alike in that the one with the fewest and best determined
     numbers.
 
@@ -152,10 +153,16 @@ def _chosen(work: Work, folds: Folds) -> Selection:
 
 
 def _as_good(trial: Trial, best: Trial) -> bool:
-    """Whether a candidate predicts like the best: within 1 %, or within what the difference scatters over folds."""
+    """Whether a candidate predicts like the best: within 1 %, or up to 5 % if folds do not tell the difference from 0.
+
+    The best is the luckiest of many: a single standard error would refuse a true structure for it in one case of ten.
+    """
     apart = np.array(trial.scores) - np.array(best.scores)
-    scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size) if apart.size >= FOLDS else 0.0
-    return trial.score - best.score <= max(SAME, scatter)
+    if apart.size < FOLDS:
+        return trial.score - best.score <= SAME
+    scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
+    quantile = STUDENT_95[min(apart.size - FOLDS, len(STUDENT_95) - 1)]
+    return trial.score - best.score <= max(SAME, min(quantile * scatter, MOST_ALIKE))
 
 
 def _winner(near: Sequence[Trial]) -> Trial:
