@@ -22,8 +22,8 @@ from ftlm.solve.records import prepare
 
 #: Schwarz criteria closer than this tell nothing; doi:10.1080/01621459.1995.10476572.
 ALIKE = 2.0
-#: Folds from which on the scatter over them says something, one-sided 95 % quantiles of Student's t from there on, and the
-#: most that counts as alike whatever the scatter.
+#: Folds from which on the scatter over them says something, one-sided 95 % quantiles of Student's t from there on, and
+#: the most that counts as alike whatever the scatter.
 FOLDS, STUDENT_95, MOST_ALIKE = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81), 0.05
 #: Candidates of a list beyond which somebody has made a mistake.
 MOST = 10_000
