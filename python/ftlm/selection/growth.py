@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 from ftlm.base.errors import FtlmError
+from ftlm.base.threads import pool
 from ftlm.data.structures import Structure
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
@@ -43,10 +42,6 @@ DOMINATED = math.log(2.0)
 JUDGED = 2
 
 
-class Abandoned(BaseException):
-    """Ends work in a thread whose result nobody waits for; no failure of a candidate."""
-
-
 @dataclass
 class Work:
     """How candidates are tried, and who is told.
@@ -69,7 +64,6 @@ class Work:
     clock: Callable[[], float] = time.perf_counter
     done: int = 0
     known: int = 0
-    stopped: threading.Event = field(default_factory=threading.Event)
     trials: list[Trial] = field(default_factory=list)
 
     def each(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
@@ -87,31 +81,19 @@ class Work:
             self.progress(self.done, self.known)
 
     def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item], told: Callable[[], None]) -> list[Made]:
-        pool = ThreadPoolExecutor(self.threads)
         out: list[Made] = []
-        try:
-            for made in pool.map(work, items):
+        with pool(self.threads) as workers:
+            for made in workers.map(work, items):
                 out.append(made)
                 told()
-        except BaseException:
-            # Whoever stops this has the word back at once; what still computes ends at its next start or fold.
-            self.stopped.set()
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
-        pool.shutdown()
         return out
-
-    def alive(self, *_: int) -> None:
-        """Nothing, or the end of what nobody waits for any more."""
-        if self.stopped.is_set():
-            raise Abandoned
 
     def judge(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
         """A fitted candidate on what it never saw."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
         try:
-            return judged(name, structure, self.folds, joint, fine=fine, alive=self.alive)
+            return judged(name, structure, self.folds, joint, fine=fine)
         except FtlmError as error:
             return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
 
@@ -130,7 +112,7 @@ class Work:
     ) -> JointFit | FtlmError:
         """A fit on all runs, or why there is none."""
         try:
-            return fit(self.folds.runs, structure, starts, refine=refine, alive=self.alive)
+            return fit(self.folds.runs, structure, starts, refine=refine)
         except FtlmError as error:
             return error
 

@@ -22,6 +22,8 @@ from ftlm.solve.records import prepare
 
 #: Schwarz criteria closer than this tell nothing; doi:10.1080/01621459.1995.10476572.
 ALIKE = 2.0
+#: Difference of Schwarz criteria that is very strong evidence; the same source.
+STRONG = 10.0
 #: Folds from which on the scatter over them says something, one-sided 95 % quantiles of Student's t from there on, and
 #: the most that counts as alike whatever the scatter.
 FOLDS, STUDENT_95, MOST_ALIKE = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81), 0.05
@@ -85,8 +87,7 @@ def select(
     Growth costs one fit for each thing that may be added, at each step. Where three or more terms drive one equation
     and whole runs judge, every subset of them at whole orders is fitted and judged in closed form first, on a lattice
     of the own coefficients, and growth begins with the best. Of a list of more than 200 candidates a ``UserWarning``
-    says, after the first ones, how long the rest takes. Ctrl-C returns at once; threads end with the descent that they
-    are in.
+    says, after the first ones, how long the rest takes.
     """
     # Checked here as identify checks it: threads is a whole number, at least 1.
     workers = Settings.check(coefficients="least-squares", threads=threads).threads
@@ -125,6 +126,8 @@ def _chosen(work: Work, folds: Folds) -> Selection:
         if key not in kept or trial.score < kept[key].score:
             kept[key] = trial
     ranked = sorted(kept.values(), key=lambda t: (t.failed is not None, t.grows, t.score, t.numbers, t.name))
+    scatter = min(spread(t.joint) for t in there if t.joint is not None)
+    ranked = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in ranked]
     best = ranked[0]
     near = [k for k, t in enumerate(ranked) if t.failed is None and t.grows == best.grows and _as_good(t, best)]
     # What the grid leaves is a fraction of an order, and to a criterion of thousands of samples a fraction counts.
@@ -156,13 +159,16 @@ def _as_good(trial: Trial, best: Trial) -> bool:
     """Whether a candidate predicts like the best: within 1 %, or up to 5 % if folds do not tell the difference from 0.
 
     The best is the luckiest of many: a single standard error would refuse a true structure for it in one case of ten.
+    Where one block alone says what the others cannot, leaving it out costs the truth far more than 5 %: very strong
+    evidence on all samples lets it stand beside.
     """
     apart = np.array(trial.scores) - np.array(best.scores)
     if apart.size < FOLDS:
         return trial.score - best.score <= SAME
     scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
     quantile = STUDENT_95[min(apart.size - FOLDS, len(STUDENT_95) - 1)]
-    return trial.score - best.score <= max(SAME, min(quantile * scatter, MOST_ALIKE))
+    told = trial.score - best.score <= quantile * scatter and _bic(trial) <= _bic(best) - STRONG
+    return told or trial.score - best.score <= max(SAME, min(quantile * scatter, MOST_ALIKE))
 
 
 def _winner(near: Sequence[Trial]) -> Trial:

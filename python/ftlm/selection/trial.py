@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -239,25 +239,16 @@ def decided(structure: Structure, runs: Sequence[Run]) -> Structure:
     return replace(structure, initial="rest" if start == "rest" else "caputo")
 
 
-def _always(*_: int) -> None:
-    """Nobody stops it."""
-
-
 def fit(
-    runs: Sequence[Run], structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True,
-    alive: Callable[..., None] = _always,
-) -> JointFit:  # fmt: skip
-    """The lowest of the fits from some starts, or from an automatic start where there are none.
-
-    Asked between starts whether it is still alive, it ends by what that raises.
-    """
+    runs: Sequence[Run], structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
+) -> JointFit:
+    """The lowest of the fits from some starts, or from an automatic start where there are none."""
     asked = decided(structure, runs)
     if not starts:
-        return fit_output_error(runs, asked, refine=refine, progress=alive)
+        return fit_output_error(runs, asked, refine=refine)
     ends: list[JointFit] = []
     last: FtlmError | None = None
     for start in starts:
-        alive()
         try:
             ends.append(fit_output_error(runs, asked, start=start, refine=refine))
         except FtlmError as error:
@@ -281,10 +272,7 @@ def model_of(structure: Structure, joint: JointFit, runs: Sequence[Run]) -> Mode
     return Model(made, orders=joint.orders)
 
 
-def judged(
-    name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False,
-    alive: Callable[..., None] = _always,
-) -> Trial:  # fmt: skip
+def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
     """A candidate fitted on all runs, fitted anew for each fold from there, and judged on what was left out."""
     model = model_of(structure, joint, folds.runs)
     estimation = compare(model, list(folds.runs)).fit_percent
@@ -293,7 +281,7 @@ def judged(
     validation: dict[str, dict[str, float]] = {}
     for fold in folds.parts:
         runs = fold.seen(structure.outputs)
-        own = joint if runs is folds.runs else fit(runs, structure, [start], alive=alive)
+        own = joint if runs is folds.runs else fit(runs, structure, [start])
         validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
     fits = [max(v, LOST) if math.isfinite(v) else LOST for part in validation.values() for v in part.values()]
     scores = tuple(math.log(max(1.0 - v / 100.0, 1e-12)) for v in fits)
