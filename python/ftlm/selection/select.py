@@ -47,8 +47,8 @@ def select(
     predict no better, it is pruned, one thing less at a time. A list of candidates is judged whole, each from automatic
     starts. Chosen is, among those that predict as well as the best (what is left over is within 1 %, or, up to 5 %,
     three or more folds do not tell the difference from 0 at 95 %), the one with the least Schwarz criterion, samples
-    counted as the colour of the residuals lets them; of those alike in that the one with the fewest and best determined
-    numbers.
+    counted as the colour of the residuals lets them; of those alike in that the one with the fewest numbers, of the
+    lowest order, best determined.
 
     Parameters
     ----------
@@ -172,10 +172,18 @@ def _as_good(trial: Trial, best: Trial) -> bool:
 
 
 def _winner(near: Sequence[Trial]) -> Trial:
-    """Of those that predict alike, the one with the least criterion; of those alike in that, the best determined."""
+    """Of those that predict alike, the one with the least criterion; of those alike in that, the best determined.
+
+    From rest an equation differentiated throughout is the same equation: of these it is the one of the lowest order.
+    """
     least = min(_bic(t) for t in near)
     alike = [t for t in near if _bic(t) <= least + ALIKE]
-    return min(alike, key=lambda t: (t.numbers, t.looseness, t.score))
+    return min(alike, key=lambda t: (t.numbers, _whole_order(t), t.looseness, t.score))
+
+
+def _whole_order(trial: Trial) -> int:
+    """The highest orders to the next whole number, all equations together."""
+    return sum(round(e.order.partly(trial.values).constant) for e in trial.structure.equations)
 
 
 def _bic(trial: Trial) -> float:
