@@ -1,6 +1,8 @@
 """Structures chosen by what they predict: the true one among those inside a richer one, and words where none can be."""
 
 import json
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,10 +11,13 @@ from scipy import signal
 from typer.testing import CliRunner
 
 import ftlm
+from ftlm.base.threads import stop
 from ftlm.cli.app import app
 from ftlm.selection.automatic import automatic
 from ftlm.selection.candidates import Inside, Variant, named
-from ftlm.selection.trial import Folds, masked
+from ftlm.selection.growth import Work, duration, listed
+from ftlm.selection.select import _as_good
+from ftlm.selection.trial import Folds, Trial, masked
 
 RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
 
@@ -171,10 +176,17 @@ def test_words_where_nothing_can_be_chosen(runs):
         ftlm.select(runs, [second, "D y = u"])
     with pytest.raises(ftlm.ModelError, match="are the same structure; leave one out"):
         named({"one": second, "two": ftlm.equation("D^2 y = d D y + a y + b u")})
+    renamed = ftlm.equation("D^2 y = k y + c D y + g u")
+    with pytest.raises(ftlm.ModelError, match="the same structure but for the names of their numbers; leave one out"):
+        ftlm.select(runs, {"one": second, "two": renamed})
+    with pytest.raises(ftlm.ModelError, match="candidates 'any, offset' and 'constant' are the same structure; leave"):
+        ftlm.select(runs, {"any": replace(second, offset="auto"), "constant": replace(second, offset="constant")})
+    with pytest.raises(ftlm.ModelError, match=r"validation = \[\] has no run to validate on"):
+        ftlm.select(runs, second, validation=[])
     with pytest.raises(ftlm.ModelError, match="candidates = 'D y = u'; use 'auto'"):
         ftlm.select(runs, "D y = u")
     with pytest.raises(ftlm.ModelError, match="10001 candidates are more than 10000"):
-        ftlm.select(runs, {str(k): ftlm.equation(f"D^{1 + k * 1e-5:.6f} y = a y + b u") for k in range(10_001)})
+        ftlm.select(runs, [second] * 10_001)
     with pytest.raises(ftlm.DataError, match="has 40 rows, too few to be cut into 4 blocks"):
         ftlm.select(runs[0].slice(0, 0.8), second)
     with pytest.raises(ftlm.ModelError, match="motor 1 is one of those that are fitted to, which judges nothing"):
@@ -182,8 +194,98 @@ def test_words_where_nothing_can_be_chosen(runs):
     idle = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(300)}, outputs={"y": 1e-3 * np.sin(np.arange(300.0))})
     with pytest.raises(ftlm.DataError, match="u is 0 throughout"):
         ftlm.select(idle, replace(second, initial="rest"))
+    still = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(300)}, outputs={"y": np.zeros(300)})
+    for candidates in ("auto", second, [second]):
+        with pytest.raises(ftlm.DataError, match="'y' of run 'run': constant, every row is 0"):
+            ftlm.select(still, candidates)
     with pytest.raises(ftlm.DataError, match="signal"):
         ftlm.select(runs, ftlm.equation("D^2 z = a z + b u"))
+
+
+def test_who_stops_it_ends_what_threads_compute(runs):
+    """By the order of events: the second item computes until it is told to end, and nothing new begins after that."""
+    entered, begun, ended = threading.Event(), [], []
+
+    def item(number):
+        begun.append(number)
+        if number == 0:
+            assert entered.wait(60)
+            return number
+        entered.set()
+        # The core asks the same flag at every evaluation.
+        assert wait_for(stop())
+        ended.append(number)
+        raise KeyboardInterrupt
+
+    def wait_for(flag):
+        return any(flag.is_set or time.sleep(0.001) for _ in range(60_000))
+
+    def interrupt(done, known):
+        raise KeyboardInterrupt
+
+    work = Work(Folds.of(runs, "runs"), 2, interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        work.each(item, list(range(20)))
+    # The thread of the first item may have taken up a third before.
+    assert set(begun) <= {0, 1, 2}
+    assert sorted(ended) == sorted(begun)[1:]
+
+
+def test_fits_on_threads_end_with_the_flag(runs):
+    work = Work(Folds.of(runs, "runs"), 1)
+    structure = ftlm.equation("D^2 y = d D y + a y + b u")
+    start = {"d": -5.0, "a": -40.0, "b": 40.0}
+
+    def stopped(call):
+        def item(_):
+            stop().set()
+            return call()
+
+        with pytest.raises(KeyboardInterrupt):
+            work.spread(item, [0])
+
+    joint = work.fitted(structure, [start])
+    stopped(lambda: work.fitted(structure, []))
+    stopped(lambda: work.fitted(structure, [start]))
+    stopped(lambda: work.judge("second order", structure, joint))
+
+
+def test_many_candidates_are_told_how_long_they_take(runs):
+    ticks = iter([0.0, 3.0])
+
+    def judge(name, structure, joint, *, fine):
+        return Trial(name, structure, 1, failed="not asked")
+
+    work = Work(Folds.of(runs, "runs"), 2, clock=lambda: next(ticks))
+    work.fitted = lambda structure, starts: None
+    work.judge = judge
+    candidates = {str(k): ftlm.equation(f"D^{1 + k * 1e-4:.6f} y = a y + b u") for k in range(202)}
+    with pytest.warns(
+        UserWarning, match="202 candidates: the first 2 took 3 s, so the other 200 take about 5 min on 2"
+    ):
+        assert len(listed(candidates, work)) == 202
+    assert [duration(s) for s in (0.123, 119.0, 121.0, 7300.0)] == ["0.12 s", "1.2e+02 s", "2 min", "2 h"]
+
+
+def test_predictions_are_alike_where_folds_do_not_tell_them_apart():
+    """Scores of one seed of a plant whose true structure a single standard error refused for one with three more."""
+
+    def trial(*scores, bic=0.0):
+        return Trial("", ftlm.equation("D y = a y + b u"), 1, scores=scores, bic=bic)
+
+    best = trial(-3.7766, -4.4820, -4.7931, -4.8312)
+    assert _as_good(trial(-3.7169, -4.4811, -4.7930, -4.8305), best)
+    # However much the folds scatter, beyond 5 % nothing is alike; nor what is a little worse in each of them.
+    assert not _as_good(trial(-3.5, -4.4811, -4.7930, -4.8305), best)
+    assert not _as_good(trial(-3.76, -4.467, -4.777, -4.815), best)
+    # Another seed: the truth without the one block that tells it is far off there, but very likely on all samples.
+    best = trial(-3.7591, -4.5182, -4.7539, -4.8769, bic=-14235.6)
+    assert _as_good(trial(-3.2813, -4.5247, -4.7543, -4.8814, bic=-14254.4), best)
+    assert not _as_good(trial(-3.2813, -4.5247, -4.7543, -4.8814, bic=-14240.0), best)
+    assert not _as_good(trial(-3.2813, -4.1247, -4.3543, -4.4814, bic=-14254.4), best)
+    # Two folds tell no scatter: 1 %.
+    assert _as_good(trial(-3.76, -4.48), trial(-3.7766, -4.4820))
+    assert not _as_good(trial(-3.75, -4.48), trial(-3.7766, -4.4820))
 
 
 def test_the_page_and_the_figures(chosen, tmp_path):

@@ -182,8 +182,10 @@ class Inside:
                         if term.coefficient in droppable:
                             continue
                         return None
-                    # The first own term that is not the elasticity is taken for damping.
-                    value = 1.0 if own and 1.0 in places else places[0]
+                    # Of own terms whose orders are sought the last is taken for damping, those before it stand below.
+                    later = item.terms[item.terms.index(term) + 1 :]
+                    below = any(t.signal == item.output and t.order.is_single for t in later)
+                    value = 1.0 if own and 1.0 in places and not (below and 0.0 in places) else places[0]
                     whole[name] = value
                     taken |= {value} if own else set()
                 elif own and not term.order.names and term.order.constant >= (highest or 0.0):
@@ -294,7 +296,7 @@ def named(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str
     Raises
     ------
     ModelError
-        No candidate, something that is none, or two that are the same.
+        No candidate, something that is none, or two that are the same but for the names of their numbers.
     """
     items = (
         list(structures.items())
@@ -303,17 +305,12 @@ def named(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str
     )
     if not items:
         raise ModelError("there are no candidates; give structures, or one structure whose inside is searched")
-    seen: dict[str, str] = {}
-    for place, (name, structure) in enumerate(items):
+    for place, (_, structure) in enumerate(items):
         if not isinstance(structure, Structure):
             raise ModelError(
                 f"candidate {place} of {len(items)} is {type(structure).__name__}; use ftlm.equation(…) or "
                 "ftlm.flexible_link(…)"
             )
-        key = repr(structure)
-        if key in seen:
-            raise ModelError(f"candidates {seen[key]!r} and {name!r} are the same structure; leave one out")
-        seen[key] = name
     if len({n for n, _ in items}) < len(items):
         # The same words, told apart by what words do not say.
         items = [(f"{n} ({k + 1})", s) for k, (n, s) in enumerate(items)]
@@ -324,4 +321,22 @@ def named(structures: Sequence[Structure] | Mapping[str, Structure]) -> dict[str
             out |= {name: replace(structure, offset="none"), f"{name}, offset": replace(structure, offset="constant")}
         else:
             out[name] = structure
+    seen: dict[str, str] = {}
+    for name, structure in out.items():
+        other = seen.setdefault(_content(structure), name)
+        if other != name:
+            only = "" if repr(out[other]) == repr(structure) else " but for the names of their numbers"
+            raise ModelError(f"candidates {other!r} and {name!r} are the same structure{only}; leave one out")
     return out
+
+
+def _content(structure: Structure) -> str:
+    """All that a candidate is, whatever its numbers are called and in which order its terms stand."""
+    if structure.has_order_law or structure.coefficient_law:
+        return repr(structure)
+    rest = (
+        sorted((v[0], v[-1], len(v)) for v in structure.order_values.values()), sorted(structure.delay.items()),
+        sorted(structure.free_delays.items()), structure.limits, structure.sensor_filter,
+        [e.friction for e in structure.equations],
+    )  # fmt: skip
+    return f"{signature(structure)} {rest!r}"

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import itertools
+import math
+import time
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import TypeVar
 
 from ftlm.base.errors import FtlmError
+from ftlm.base.threads import pool
 from ftlm.data.structures import Structure
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
-from ftlm.selection.candidates import Change, Inside, signature, worded
-from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, numbers_of, spread
+from ftlm.selection.candidates import Change, Inside, Variant, signature, worded
+from ftlm.selection.screen import Screened, screened
+from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, numbers_of, refined, spread
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -27,6 +31,13 @@ PATIENCE = 2
 BETTER = 0.005
 #: Two predictions are alike where what they leave over differs by no more than this share.
 SAME = 0.01
+#: Subsets that were screened are fitted where what they leave over is within this share of the best's, at most so many,
+#: and the best of each number of terms.
+NEAR, LEADING = 0.03, 8
+#: Candidates of a list from which on the time that they take is estimated first.
+MANY = 200
+#: ln of the multiple of the best's residuals beyond which no root of an equation that keeps its terms is grown.
+DOMINATED = math.log(2.0)
 #: Changes of a step that are judged on unseen runs: the best by criterion.
 JUDGED = 2
 
@@ -43,39 +54,58 @@ class Work:
         Candidates at a time; what comes out does not depend on it.
     progress
         Called with (candidates fitted, candidates known of so far).
+    clock
+        Seconds that pass.
     """
 
     folds: Folds
     threads: int
     progress: Callable[[int, int], None] | None = None
+    clock: Callable[[], float] = time.perf_counter
     done: int = 0
     known: int = 0
     trials: list[Trial] = field(default_factory=list)
 
     def each(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
-        """Work done for each item, in their order."""
+        """Work done for each item, in their order, and told."""
         self.known += len(items)
-        out = []
-        with ThreadPoolExecutor(self.threads) as pool:
-            try:
-                for made in pool.map(work, items):
-                    out.append(made)
-                    self.done += 1
-                    if self.progress is not None:
-                        self.progress(self.done, self.known)
-            except BaseException:
-                pool.shutdown(cancel_futures=True)
-                raise
+        return self._in_order(work, items, self._told)
+
+    def spread(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+        """The same of work that is no candidate's fit."""
+        return self._in_order(work, items, lambda: None)
+
+    def _told(self) -> None:
+        self.done += 1
+        if self.progress is not None:
+            self.progress(self.done, self.known)
+
+    def _in_order(self, work: Callable[[Item], Made], items: Sequence[Item], told: Callable[[], None]) -> list[Made]:
+        out: list[Made] = []
+        with pool(self.threads) as workers:
+            for made in workers.map(work, items):
+                out.append(made)
+                told()
         return out
 
-    def judge(self, name: str, structure: Structure, joint: JointFit | FtlmError) -> Trial:
+    def judge(self, name: str, structure: Structure, joint: JointFit | FtlmError, *, fine: bool = False) -> Trial:
         """A fitted candidate on what it never saw."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
         try:
-            return judged(name, structure, self.folds, joint)
+            return judged(name, structure, self.folds, joint, fine=fine)
         except FtlmError as error:
             return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
+
+    def refined(self, trial: Trial) -> Trial:
+        """A candidate whose numbers do not depend on the step of the grid."""
+        if trial.fine:
+            return trial
+        try:
+            return refined(trial, self.folds)
+        except FtlmError:
+            # On a finer grid it has no finite free run: it stays what it was judged as.
+            return trial
 
     def fitted(
         self, structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
@@ -116,8 +146,16 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
 
     Each whole value of the highest orders is a root of its own: what is best among the simplest need not be what the
     best grows from. Where several signals drive, one may stand for all the others: the best is also come to from above,
-    from everything at whole orders, one thing less at a time.
+    from everything at whole orders, one thing less at a time. Where so many signals drive that subsets can be screened,
+    growth begins with the best of them all; where no term may be left out, everything free is a root beside.
     """
+    subsets = screened(inside, work.folds, work)
+    found = _from_subsets(inside, work, subsets)
+    if found:
+        # What was screened is not fitted again because it is one thing more, or less, than something.
+        return _finished(inside, work, found, {signature(inside.build(s.change.variant)) for s in subsets})
+    if not inside.droppable:
+        return _from_everything(inside, work)
     changes = _new(inside, inside.skeletons(), set())
     joints = work.each(lambda c: work.fitted(inside.build(c.variant), []), changes)
     roots: dict[tuple[float | None, ...], list[tuple[Change, JointFit | FtlmError]]] = {}
@@ -136,11 +174,64 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
     joined = [values_of(j) for c, j in zip(changes, joints, strict=True) if not isinstance(j, FtlmError)]
     from_above = _downwards(inside, work, first[1], joined, tried)
     ends += [] if from_above is None else [from_above]
+    return _finished(inside, work, ends, tried)
+
+
+def _finished(inside: Inside, work: Work, ends: Sequence[tuple[Trial, Fitted]], tried: set[str]) -> list[Trial]:
+    """What is as good as the best, and what is left of it when one thing after another is taken away."""
     least = min(_rank(trial) for trial, _ in ends)
     for trial, at in ends:
         if (trial.grows, trial.score) <= (least[0], least[1] + SAME):
             _pruned(inside, work, trial, at, tried)
     return work.trials
+
+
+def _from_everything(inside: Inside, work: Work) -> list[Trial]:
+    """Equations that keep their terms, under a law or coupled: from the whole orders up, and from all orders free down.
+
+    Growth from whole orders is left out where these leave over far more than all orders free do on unseen runs.
+    """
+    structure = inside.structure
+    full = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
+    changes = _new(inside, [*inside.skeletons(), Change(worded(inside.build(full)), full)], set())
+    joints = work.each(lambda c: work.fitted(inside.build(c.variant), []), changes)
+    pairs = list(zip(changes, joints, strict=True))
+    roots = _by_criterion(inside, work, [p for p in pairs if p[0].variant != full])[:1]
+    roots += _by_criterion(inside, work, [p for p in pairs if p[0].variant == full])
+    if not roots:
+        work.trials += [work.judge(c.words, inside.build(c.variant), j) for c, j in pairs]
+        return work.trials
+    first = _judged(inside, work, roots)
+    tried = {_key(inside, r.change) for r in roots}
+    least = min(trial.score for trial in first)
+    ends = [
+        _upwards(inside, work, at, tried, trial)
+        for trial, at in zip(first, roots, strict=True) if trial.score <= least + DOMINATED
+    ]  # fmt: skip
+    return _finished(inside, work, ends, tried)
+
+
+def _from_subsets(inside: Inside, work: Work, subsets: Sequence[Screened]) -> list[tuple[Trial, Fitted]]:
+    """The best subsets fitted and judged, and what the best of them grows to when its orders become free."""
+    if not subsets:
+        return []
+    ahead = [s for s in subsets if s.score <= subsets[0].score + NEAR][:LEADING]
+    by_size: dict[int, Screened] = {}
+    for one in subsets:
+        by_size.setdefault(len(one.start), one)
+    ahead += [s for s in by_size.values() if s not in ahead]
+
+    def from_lattice(subset: Screened) -> JointFit | FtlmError:
+        return work.fitted(inside.build(subset.change.variant), [subset.start], refine=False)
+
+    joints = work.each(from_lattice, ahead)
+    steps = _by_criterion(inside, work, [(s.change, j) for s, j in zip(ahead, joints, strict=True)])
+    if not steps:
+        return []
+    ends = list(zip(_judged(inside, work, steps), steps, strict=True))
+    tried = {signature(inside.build(s.change.variant)) for s in subsets}
+    first = min(ends, key=lambda end: _rank(end[0]))
+    return [first, _upwards(inside, work, first[1], tried, first[0])]
 
 
 def _rank(trial: Trial) -> tuple[bool, float]:
@@ -153,11 +244,12 @@ def values_of(joint: JointFit) -> dict[str, float]:
     return dict(zip(joint.names, joint.values.tolist(), strict=True))
 
 
-def _upwards(inside: Inside, work: Work, chosen: Fitted, tried: set[str]) -> tuple[Trial, Fitted]:
+def _upwards(
+    inside: Inside, work: Work, chosen: Fitted, tried: set[str], judged_already: Trial | None = None
+) -> tuple[Trial, Fitted]:
     """One thing more after another, as long as prediction gets better; the best of the way."""
-    best = work.judge(_name(inside, chosen), inside.build(chosen.change.variant), chosen.joint)
+    best = judged_already or _judged(inside, work, [chosen])[0]
     best_at, idle = chosen, 0
-    work.trials.append(best)
     tried.add(_key(inside, chosen.change))
     while idle < PATIENCE:
         larger = _new(inside, inside.larger(chosen.change.variant), tried)
@@ -246,7 +338,7 @@ def _by_criterion(inside: Inside, work: Work, pairs: Sequence[tuple[Change, Join
 def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]) -> None:
     """One thing less after another, as long as prediction is no worse."""
     while True:
-        changes = _new(inside, inside.smaller(at.change.variant), tried)
+        changes = [c for c in _new(inside, inside.smaller(at.change.variant), tried) if _beside(c, at)]
         steps = _tried(inside, work, at, changes)
         tried |= {_key(inside, c) for c in changes}
         found = _judged(inside, work, steps[:JUDGED])
@@ -254,6 +346,12 @@ def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]
         if not better:
             return
         best, at = min(better, key=lambda pair: _rank(pair[0]))
+
+
+def _beside(change: Change, at: Fitted) -> bool:
+    """Whether orders that become whole move to the next whole number on either side of their estimate."""
+    values = values_of(at.joint)
+    return all(abs(v - values[n]) < 1.0 for n, v in change.variant.whole if n in values)
 
 
 def _key(inside: Inside, change: Change) -> str:
@@ -274,7 +372,28 @@ def listed(candidates: Mapping[str, Structure], work: Work) -> list[Trial]:
 
     def one(item: tuple[str, Structure]) -> Trial:
         name, structure = item
-        return work.judge(name, structure, work.fitted(structure, []))
+        return work.judge(name, structure, work.fitted(structure, []), fine=True)
 
-    work.trials += work.each(one, list(candidates.items()))
+    items = list(candidates.items())
+    if len(items) > MANY:
+        begun = work.clock()
+        work.trials += work.each(one, items[: work.threads])
+        took = work.clock() - begun
+        rest = len(items) - work.threads
+        warnings.warn(
+            f"{len(items)} candidates: the first {work.threads} took {duration(took)}, so the other {rest} take about "
+            f"{duration(took * rest / work.threads)} on {work.threads} threads; Ctrl-C ends it, and a structure whose "
+            "inside is searched needs far fewer fits",
+            UserWarning, stacklevel=3,
+        )  # fmt: skip
+        items = items[work.threads :]
+    work.trials += work.each(one, items)
     return work.trials
+
+
+def duration(seconds: float) -> str:
+    """Seconds, minutes or hours, in two figures."""
+    for unit, size in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2.0 * size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.2g} s"

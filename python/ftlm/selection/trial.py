@@ -111,6 +111,10 @@ class Folds:
             Runs that do not fit together, or that are too short to be cut.
         """
         every = tuple(as_runs(runs))
+        if not isinstance(validation, (str, Run)) and not validation:
+            raise ModelError(
+                "validation = [] has no run to validate on; give one that is not fitted to, or use 'runs' or 'blocks'"
+            )
         if not isinstance(validation, str):
             others = as_runs(validation)
             as_runs([*every, *others])
@@ -182,6 +186,8 @@ class Trial:
         Why there are no figures; None where there are.
     joint
         The fit on all runs.
+    fine
+        Whether its grid was refined until it no longer mattered.
     """
 
     name: str
@@ -197,6 +203,7 @@ class Trial:
     grows: bool = False
     failed: str | None = None
     joint: JointFit | None = field(default=None, repr=False)
+    fine: bool = False
 
     @property
     def score(self) -> float:
@@ -265,7 +272,7 @@ def model_of(structure: Structure, joint: JointFit, runs: Sequence[Run]) -> Mode
     return Model(made, orders=joint.orders)
 
 
-def judged(name: str, structure: Structure, folds: Folds, joint: JointFit) -> Trial:
+def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fine: bool = False) -> Trial:
     """A candidate fitted on all runs, fitted anew for each fold from there, and judged on what was left out."""
     model = model_of(structure, joint, folds.runs)
     estimation = compare(model, list(folds.runs)).fit_percent
@@ -278,13 +285,27 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit) -> Tr
         validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
     fits = [max(v, LOST) if math.isfinite(v) else LOST for part in validation.values() for v in part.values()]
     scores = tuple(math.log(max(1.0 - v / 100.0, 1e-12)) for v in fits)
-    intervals = joint.intervals
-    idle = tuple(n for n in joint.coefficients if intervals[n][0] <= 0.0 <= intervals[n][1])
     return Trial(
         name, structure, numbers_of(structure, joint, folds), dict(estimation), validation, scores,
-        values=start, errors=joint.standard_errors, idle=idle, grows=grows,
-        joint=joint,
+        values=start, errors=joint.standard_errors, idle=idle(joint), grows=grows,
+        joint=joint, fine=fine,
     )  # fmt: skip
+
+
+def refined(trial: Trial, folds: Folds) -> Trial:
+    """A candidate fitted on all runs on grids so fine that its numbers no longer depend on them."""
+    joint = fit(folds.runs, trial.structure, [trial.values])
+    estimation = compare(model_of(trial.structure, joint, folds.runs), list(folds.runs)).fit_percent
+    return replace(
+        trial, joint=joint, estimation=dict(estimation), errors=joint.standard_errors, idle=idle(joint), fine=True,
+        values=dict(zip(joint.names, joint.values.tolist(), strict=True)),
+    )  # fmt: skip
+
+
+def idle(joint: JointFit) -> tuple[str, ...]:
+    """Coefficients that the runs do not tell from 0."""
+    intervals = joint.intervals
+    return tuple(n for n in joint.coefficients if intervals[n][0] <= 0.0 <= intervals[n][1])
 
 
 def numbers_of(structure: Structure, joint: JointFit, folds: Folds) -> int:
