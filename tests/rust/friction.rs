@@ -169,6 +169,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
         initial: Initial::Rest,
+        filtered: vec![],
     };
     let start = Start { orders: vec![2.0], coefficients: vec![0.7, 1.2, 0.5], inputs: vec![], states: vec![] };
     let found =
