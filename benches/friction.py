@@ -1,10 +1,10 @@
 """A body that sticks, measured: recovery with intervals, cost of a free run, hubs of real arms.
 
 ``python benches/friction.py recovery [--seeds 20]``, ``stribeck [--seeds 20]``, ``speed``, ``measured``,
-``measured-stribeck``, ``coupled [--seeds 20]``, ``coupled-measured``, ``coupled-steps``. Truth of the recovery is a
-cart in closed form between its events (tests/python/friction.py) with offsets a run, that of ``stribeck`` a sledge on a
-spring that sticks and slips, that of ``coupled`` a hub that sticks with a link that rings, both followed from the
-current alone; real runs are those of ``FTLM_DATA``.
+``measured-stribeck``, ``coupled [--seeds 20]``, ``coupled-measured``. Truth of the recovery is a cart in closed form
+between its events (tests/python/friction.py) with offsets a run, that of ``stribeck`` a sledge on a spring that sticks
+and slips, that of ``coupled`` a hub that sticks with a link that rings, both followed from the current alone; real runs
+are those of ``FTLM_DATA``.
 """
 
 from __future__ import annotations
@@ -42,8 +42,6 @@ ARM_TRUTH = {"a": 30.0, "d": 0.4, "b": 1.5, "g": 1.0, "fc": 4.0, "k": 90.0, "e":
 FITTED = ("30", "20", "minus10", "minus20")
 JUDGED = ("10", "minus30", "0_return", "5", "minus5")
 SEEN = ("30", "20", "minus10", "minus30")
-#: Of the single stage's amplifier [A].
-LIMIT = 0.94
 SATURATES = "sat(I1, 0.3:3)"
 
 
@@ -166,26 +164,6 @@ def coupled_measured() -> None:
         told(replace(arm1, initial="caputo"), [runs["psf"]], runs)
 
 
-def coupled_steps() -> None:
-    """Hub and link of the single stage from the current alone, fitted on four steps, the deflection behind its filter.
-
-    Beside it the same as if there were no filter.
-    """
-    folder = DATA / "two_link_steps"
-    runs = {}
-    for name in (*FITTED, *JUDGED):
-        run = run_of(folder / f"lqr_{name}.csv", "Im1_cmd_A", name=name)
-        runs[name] = ftlm.Run.from_arrays(
-            step=run.step, inputs={"I1": np.clip(run["I1"], -LIMIT, LIMIT)},
-            outputs={n: run[n] for n in ("theta11", "theta12")}, name=name,
-        )  # fmt: skip
-    whole = {"alpha1": 2.0, "gamma1": 1.0, "beta2": 0.0, "mu2": 1.0}
-    for sensor in ("stock", None):
-        arm1 = ftlm.flexible_link(coupling="simulated", friction=True, offset="constant", sensor_filter=sensor)
-        print(f"{sensor or 'no'} filter:", flush=True)
-        told(replace(arm1.with_orders(whole), initial="caputo"), [runs[n] for n in FITTED], runs)
-
-
 def speed() -> None:
     """A free run of order 1.8 with friction, at one strength and falling, beside the linear one."""
     rng = np.random.default_rng(0)
@@ -270,9 +248,7 @@ def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm
               f"offset {there.offsets[0]['theta11']['constant']:+.3f}", flush=True)  # fmt: skip
 
 
-WHAT = (
-    "recovery", "stribeck", "speed", "measured", "measured-stribeck", "coupled", "coupled-measured", "coupled-steps",
-)  # fmt: skip
+WHAT = ("recovery", "stribeck", "speed", "measured", "measured-stribeck", "coupled", "coupled-measured")
 
 
 def main() -> None:
@@ -284,7 +260,7 @@ def main() -> None:
     {
         "recovery": lambda: recovery(asked.seeds), "stribeck": lambda: stribeck(asked.seeds), "speed": speed,
         "measured": measured, "measured-stribeck": measured_stribeck, "coupled": lambda: coupled(asked.seeds),
-        "coupled-measured": coupled_measured, "coupled-steps": coupled_steps,
+        "coupled-measured": coupled_measured,
     }[asked.what]()  # fmt: skip
 
 
