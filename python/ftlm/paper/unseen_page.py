@@ -98,7 +98,7 @@ def places_table(found: UnseenOrders) -> Table | None:
         return None
     return Table(
         "Does the order earn its place?",
-        ("order", "without the rate", "with it"),
+        ("order", "without rate", "with rate"),
         rows,
         headings=headings,
         note="The rate of the other deflection stands in a link's equation as the gain of an observer would. An order "
