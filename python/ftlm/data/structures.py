@@ -36,8 +36,8 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     It belongs to signals, inputs and outputs alike, for it commutes with every linear equation. Where an equation is
     driven by a filtered signal, all of its signals are taken behind the filter: a filtered one as it was measured, any
     other one put through it, the output that the equation is compared with included. A free run in which all outputs
-    follow from unfiltered signals is the machine's own motion, and only its filtered outputs pass the filter before they
-    are compared; so it always is where a body has friction. See :attr:`Structure.behind_filter`.
+    follow from unfiltered signals is the machine's own motion, and only its filtered outputs pass the filter before
+    they are compared; so it always is where a body has friction. See :attr:`Structure.behind_filter`.
 
     Parameters
     ----------
