@@ -9,7 +9,7 @@ use super::integrals::{edge_kernel, product, Driver, Integrated};
 use super::law::{Law, Phase};
 use super::march::March;
 use super::online::Heads;
-use super::states::{Forcing, Link};
+use super::states::{add_impulses, parted, Forcing, Link};
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::excess::{kernel_and_slope, MAX_EXCESS};
@@ -111,6 +111,9 @@ impl Body {
 
     /// Free run with given initial terms, (exponent, coefficient) pairs of powers of t by equation. O(n² m log² m).
     ///
+    /// The exponents −1, −2, … are an impulse and its derivatives in the output alone, which move no body: through a filter
+    /// that the output passes they become what it still held when the run began.
+    ///
     /// # Errors
     /// As [`Body::check`]; [`Error::Diverged`] where the run leaves the range of numbers, [`Error::LeadingZero`] where the
     /// grid makes the equations unsolvable.
@@ -133,13 +136,15 @@ impl Body {
     pub fn run(&self, record: &Record, initial: &[Vec<(f64, f64)>]) -> Result<Motion> {
         self.check(record.len())?;
         check_length("initial terms", self.equations.len(), initial.len())?;
-        for terms in initial {
+        let (powers, impulses) = parted(initial);
+        for terms in &powers {
             let (exponents, values): (Vec<f64>, Vec<f64>) = terms.iter().copied().unzip();
             check_finite("coefficients of the initial terms", &values)?;
             Initial::Powers(exponents).check()?;
         }
-        let forcing = Forcing::of(initial, &self.links(), self.sticks, record.m(), record.step())?;
-        let run = Run::new(self, &Operators::new(self, record)?, &forcing)?;
+        let forcing = Forcing::of(&powers, &self.links(), self.sticks, record.m(), record.step())?;
+        let mut run = Run::new(self, &Operators::new(self, record)?, &forcing)?;
+        add_impulses(&mut run.outputs, &impulses, record.step());
         Ok(Motion { outputs: run.outputs, velocity: run.march.edges, force: run.march.force, phases: run.march.phases })
     }
 

@@ -3,7 +3,7 @@
 use super::dynamics::{at_rest, Body, Operators, Run};
 use super::integrals::{product, Integrated};
 use super::law::Law;
-use super::states::{together, Forcing, State};
+use super::states::{add_impulses, parted, together, Forcing, State};
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimate::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
@@ -60,8 +60,10 @@ pub struct FrictionModel {
     pub order_bounds: Vec<(f64, f64)>,
     /// Coordinate of each free coefficient.
     pub coordinates: Vec<Coordinate>,
-    /// Initial terms of each record, and offsets.
+    /// Initial terms of each record, offsets, and free motions of the filter that outputs pass.
     pub initial: Initial,
+    /// Which outputs pass the filter of every experiment before they are compared; empty: none.
+    pub filtered: Vec<bool>,
 }
 
 /// Values of all that is free.
@@ -147,8 +149,12 @@ impl FrictionModel {
         for experiment in experiments {
             experiment.check()?;
             check_length("outputs", self.equations.len(), experiment.samples.len())?;
-            if experiment.filter.is_some() || experiment.own.is_some() {
-                return refuse("friction behind a filter, or with samples at times of their own", "leave them out");
+            if experiment.own.is_some() {
+                return refuse("friction with samples at times of their own", "leave them out");
+            }
+            let passes = experiment.filter.as_ref().map_or(&[][..], |(_, applies)| applies);
+            if passes != self.filtered {
+                return refuse("experiments whose outputs pass other filters than the model's", "give them all alike");
             }
         }
         self.initial.check()
@@ -181,7 +187,7 @@ impl FrictionModel {
             alpha.iter().zip(own).any(|(a, w)| (a - w).abs() > 0.0)
         };
         let body = self.body(orders, &vec![0.0; self.coordinates.len()]);
-        (State::all(&body.equations, &self.initial, moves), body.equations)
+        (State::all(&body.equations, &self.initial, &self.filtered, moves), body.equations)
     }
 
     /// States of a run as its first samples have them: where the bodies are and how fast, a constant beside friction as
@@ -211,7 +217,7 @@ impl FrictionModel {
 
     fn forcing(&self, orders: &[f64], coefficients: &[f64], values: &[f64], record: &Record) -> Result<Forcing> {
         let links = self.body(orders, coefficients).links();
-        let powers = self.powers(orders, coefficients, values);
+        let (powers, _) = parted(&self.powers(orders, coefficients, values));
         Forcing::of(&powers, &links, self.sticks, record.m(), record.step())
     }
 
@@ -243,7 +249,10 @@ impl FrictionModel {
             let run = Run::new(&body, &operators, &forcing)?;
             let mut residuals = experiment.measured();
             out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
-            let sampled = experiment.sampled(&run.outputs);
+            let mut outputs = run.outputs.clone();
+            let (_, impulses) = parted(&self.powers(&point.orders, &point.coefficients, values));
+            add_impulses(&mut outputs, &impulses, experiment.record.step());
+            let sampled = experiment.sampled(&outputs);
             residuals.iter_mut().zip(sampled).for_each(|(e, v)| *e -= v);
             out.residuals.extend(residuals);
             out.parts.push(Part { operators, run, bent });
@@ -302,6 +311,16 @@ impl FrictionModel {
         moved: &Moved,
     ) -> Result<Vec<Vec<f64>>> {
         let (operators, motion, record) = (&part.operators, &part.run, &experiment.record);
+        if let Moved::State(_, state) = *moved {
+            if let Some(State::Power(i, e)) = self.states(&point.orders).0.get(state).filter(|s| s.is_impulse()) {
+                // What a filter still holds moves no body.
+                let mut slopes = vec![vec![0.0; record.m()]; self.equations.len()];
+                let mut own = vec![Vec::new(); self.equations.len()];
+                own[*i].push((*e, 1.0));
+                add_impulses(&mut slopes, &own, record.step());
+                return Ok(slopes);
+            }
+        }
         let Moves { alphas, terms: moves, friction: friction_moves } = self.moves(point, moved);
         let b = self.sticks;
         let mut total = self.forcing_slope(point, &point.states[run], record, moved)?;

@@ -184,13 +184,19 @@ pub(super) enum State {
     },
     /// A constant on the right-hand side, or a ramp (1).
     Offset(usize, u32),
-    /// A power of t that was asked for.
+    /// A power of t that was asked for; −1, −2, …: an impulse that the filter of an output gets, and its derivatives.
     Power(usize, f64),
 }
 
 impl State {
-    /// Those of a run; `free` says of which term of an equation the integration moves with an order.
-    pub(super) fn all(equations: &[Equation], initial: &Initial, free: impl Fn(usize, usize) -> bool) -> Vec<Self> {
+    /// Those of a run; `free` says of which term of an equation the integration moves with an order. Each output that
+    /// passes a filter before it is compared (`filtered`, empty: none does) has the free motions of the filter besides.
+    pub(super) fn all(
+        equations: &[Equation],
+        initial: &Initial,
+        filtered: &[bool],
+        free: impl Fn(usize, usize) -> bool,
+    ) -> Vec<Self> {
         let followed = |signal: usize| equations.iter().any(|e| e.structure.output == signal);
         let mut all: Vec<Self> = Vec::new();
         for (i, Equation { structure, .. }) in equations.iter().enumerate() {
@@ -218,7 +224,15 @@ impl State {
             let offsets = initial.offset_exponents(structure.order).len();
             all.extend((0..offsets).filter_map(|k| u32::try_from(k).ok()).map(|k| Self::Offset(i, k)));
         }
+        for i in (0..equations.len()).filter(|&i| filtered.get(i).is_some_and(|&passes| passes)) {
+            all.extend(initial.impulses().map(|e| Self::Power(i, e)));
+        }
         all
+    }
+
+    /// Whether it moves no body, only the filter of an output.
+    pub(super) fn is_impulse(&self) -> bool {
+        matches!(self, Self::Power(_, e) if *e <= -1.0 && e.fract() == 0.0)
     }
 
     /// The powers of t that a unit of it is, on the level of the outputs: equation, exponent, coefficient.
@@ -243,6 +257,22 @@ impl State {
             }
             Self::Offset(i, more) => vec![(i, equations[i].structure.order + f64::from(more), 1.0)],
             Self::Power(i, exponent) => vec![(i, exponent, 1.0)],
+        }
+    }
+}
+
+/// Powers of t that move bodies, and impulses that only the filters of their outputs get, by equation.
+#[allow(clippy::type_complexity)]
+pub(super) fn parted(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
+    powers.iter().map(|own| own.iter().partition(|(e, _)| !(*e <= -1.0 && e.fract() == 0.0))).unzip()
+}
+
+/// Adds impulses and their derivatives to pulse means of outputs.
+pub(super) fn add_impulses(outputs: &mut [Vec<f64>], impulses: &[Vec<(f64, f64)>], step: f64) {
+    for (output, own) in outputs.iter_mut().zip(impulses) {
+        for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
+            let means = power_means(exponent, output.len(), step);
+            output.iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
         }
     }
 }

@@ -77,6 +77,10 @@ pub fn friction_error<'py>(
         order_bounds,
         coordinates: coordinates(&names)?,
         initial: initial(terms)?,
+        filtered: experiments
+            .first()
+            .and_then(|e| e.filter.as_ref())
+            .map_or_else(Vec::new, |(_, passes)| passes.clone()),
     };
     let start = Start { orders, coefficients, inputs: inputs.iter().map(|input| input.3).collect(), states };
     let settings = joint::Settings { evaluations, tolerance };

@@ -156,8 +156,12 @@ def exact_cart(
 def hub_and_link(
     force: Callable[[float], float], times: np.ndarray, hub: tuple[float, float, float], link: tuple[float, float],
     friction: float, more: float = 0.0, speed: float = 1.0, start: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
+    low_pass: tuple[float, float] | None = None, held: Sequence[float] = (0.0, 0.0, 0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """A hub on dry friction that carries an elastic link, between its events: angles, and the hub's velocity.
+
+    With a low pass of second order (corner [rad/s], damping ratio) two more rows are both angles behind it, each with
+    two states of its own that start at `held`.
 
     D^2 x = a q + d Dq + b Dx + F - (f + fs exp(-(Dx/vs)^2)) sgn(Dx), D^2 q = - D^2 x - k q - c Dq, with (a, d, b) of
     the hub and (k, c) of the link; the start is (x, Dx, q, Dq). Angles have shape (2, times). While the hub rests
@@ -165,9 +169,17 @@ def hub_and_link(
     """
     (a, d, b), (k, c) = hub, link
     most, now, end = friction + more, 0.0, float(times[-1])
-    state = np.array(start, dtype=float)
-    angles, rate = np.zeros((2, times.size)), np.zeros(times.size)
-    angles[:, 0], rate[0] = state[[0, 2]], state[1]
+    state = np.array([*start, *held] if low_pass else start, dtype=float)
+    shown = [0, 2, 4, 6] if low_pass else [0, 2]
+    angles, rate = np.zeros((len(shown), times.size)), np.zeros(times.size)
+    angles[:, 0], rate[0] = state[shown], state[1]
+
+    def behind(x: np.ndarray) -> list[float]:
+        if low_pass is None:
+            return []
+        corner, damping = low_pass
+        pairs = ((x[0], x[4], x[5]), (x[2], x[6], x[7]))
+        return [v for y, s, ds in pairs for v in (ds, corner**2 * (y - s) - 2.0 * damping * corner * ds)]
 
     def pull(t: float, x: np.ndarray) -> float:
         return a * x[2] + d * x[3] + force(t)
@@ -182,7 +194,7 @@ def hub_and_link(
             away = 0.0
             if s:
                 away = pull(t, x) + b * x[1] - s * (friction + more * np.exp(-((x[1] / speed) ** 2)))
-            return [x[1] if s else 0.0, away, x[3], -away - k * x[2] - c * x[3]]
+            return [x[1] if s else 0.0, away, x[3], -away - k * x[2] - c * x[3], *behind(x)]
 
         def event(t: float, x: np.ndarray, s: float = side, begun: float = now) -> float:
             if s:
@@ -195,7 +207,7 @@ def hub_and_link(
         inside = np.flatnonzero((times > now) & (times <= found.t[-1]))
         if inside.size:
             there = found.sol(times[inside])
-            angles[:, inside], rate[inside] = there[[0, 2]], there[1] if side else 0.0
+            angles[:, inside], rate[inside] = there[shown], there[1] if side else 0.0
         now, state = float(found.t[-1]), found.y[:, -1].copy()
         if found.status == 1:
             if side:

@@ -162,15 +162,24 @@ def test_where_a_hub_starts_moves_nothing(nu: float) -> None:
 # ------------------------------------------------------------------------------------------------------- sensitivities
 
 
-@pytest.mark.parametrize("orders", [(1.9, 0.95, 2.1), (1.8, 0.9, 1.95), (1.95, 1.1, 2.0)])
-def test_derivatives_are_those_of_finite_differences(orders) -> None:
+@pytest.mark.parametrize(
+    ("orders", "passes"),
+    [
+        ((1.9, 0.95, 2.1), None), ((1.8, 0.9, 1.95), None), ((1.95, 1.1, 2.0), None),
+        ((1.9, 0.95, 2.1), [False, True]), ((1.95, 1.1, 2.0), [True, True]),
+    ],
+)  # fmt: skip
+def test_derivatives_are_those_of_finite_differences(orders, passes) -> None:
     rng = np.random.default_rng(1)
 
     def experiment(m: int, every: int):
         u = 8 * np.sin(0.012 * np.arange(m)) + 1.3 * rng.normal(size=m) + 0.2
         samples = rng.normal(size=(2, m // every + 1))
         record = (0.004, np.stack([0 * u, 0 * u, u]), None)
-        return (record, every, samples, None, [1.3, 5.0], [(None, False)] * 3, None, None)
+        low_pass = None
+        if passes is not None:
+            low_pass = (_core.filter_series([(150.0, 0.0)], [(1.0, 2.0), (22.0, 1.0), (150.0, 0.0)], m, 0.004), passes)
+        return (record, every, samples, low_pass, [1.3, 5.0], [(None, False)] * 3, None, None)
 
     runs = [experiment(400, 1), experiment(600, 2)]
 
@@ -184,16 +193,20 @@ def test_derivatives_are_those_of_finite_differences(orders) -> None:
         (1, order(2.0), [(0, order(0.0, 2), (-1.0, [])), (1, order(0.2), (-1.0, [(0, 1), (3, 1)])),
                          (1, order(0.8), (-1.0, [(4, 1)]))]),
     ]  # fmt: skip
-    count, states = 9, 2 * 6
+    # What a filter of the second order holds are two states more of each output that passes it.
+    each = 6 if passes is None else 6 + 2 * sum(passes)
+    count, states = 9, 2 * each
+    begun = (True, [], 1) if passes is None else (True, [], 1, 2)
     law = [(1.0, [(5, 1)]), (0.4, [(5, 1)]), (0.2, [])]
 
     def at(point):
         return _core.friction_error(
-            runs, laws, 0, law, [(1.05, 2.0), (0.0, 1.5), (0.0, 2.5)], ["plain"] * 6, (True, [], 1), list(point[:3]),
-            list(point[3:count]), [], [list(point[count : count + 6]), list(point[count + 6 :])], 1, 1e-9,
+            runs, laws, 0, law, [(1.05, 2.0), (0.0, 1.5), (0.0, 2.5)], ["plain"] * 6, begun, list(point[:3]),
+            list(point[3:count]), [], [list(point[count : count + each]), list(point[count + each :])], 1, 1e-9,
         )  # fmt: skip
 
-    starts = [0.02, -0.3, 0.01, 0.2, 0.4, 0.1, -0.05, 0.1, 0.02, -0.3, 0.3, -0.1]
+    plain = [0.02, -0.3, 0.01, 0.2, 0.4, 0.1, -0.05, 0.1, 0.02, -0.3, 0.3, -0.1]
+    starts = [v for run in (plain[:6], plain[6:]) for v in (*run, *rng.normal(scale=0.01, size=each - 6))]
     point = np.array([*orders, 30.0, 1.5, 1.2, 3.0, 2.0, 3.0, *starts])
     assert point.size == count + states
     assert max(friction.slope_errors(at, point, count)) < 2e-6

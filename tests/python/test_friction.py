@@ -264,7 +264,7 @@ def test_a_negative_coefficient_is_refused() -> None:
     [
         ({"initial": "history"}, "initial='caputo'"),
         ({"delay": {"u": (0.0, 0.1)}}, "delay of u is free"),
-        ({"sensor_filter": ftlm.SensorFilter.low_pass(["y"])}, "sensor filter"),
+        ({"sensor_filter": ftlm.SensorFilter.low_pass(["u"])}, "u, which drives it, passed the sensor filter"),
     ],
 )
 def test_what_a_march_does_not_know_is_refused(options, said: str) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 import ftlm
 from ftlm.paper.unseen import MARGIN, judged, link_structure, orders_on_unseen_runs, stages_in
-from ftlm.paper.unseen_page import sentence, unseen_page, unseen_text
+from ftlm.paper.unseen_page import places_table, sentence, unseen_page, unseen_text
 from test_cli import ftlm_command
 
 ROWS, STEP = 251, 0.02
@@ -196,6 +196,42 @@ def test_both_stages_push_on_each_other():
     both = link_structure(2, both=True, filtered=True)
     assert set(both.signals) == {"theta11", "theta12", "theta21", "theta22"}
     assert set(both.sensor_filter.signals) == {"theta12", "theta22"}
+
+
+def test_the_rate_of_the_other_deflection_stands_where_it_was_measured():
+    for stage, rate in ((1, "w2 D^1 theta22"), (2, "w4 D^1 theta12")):
+        full = link_structure(stage, both=True, filtered=True)
+        less = link_structure(stage, both=True, filtered=True, rate=False)
+        assert rate in str(full)
+        assert set(full.coefficient_names) - set(less.coefficient_names) == {f"w{2 * stage}"}
+        assert full.order_names == less.order_names
+    assert link_structure(1, both=False, filtered=True) == link_structure(1, both=False, filtered=True, rate=False)
+
+
+def test_places_are_told_before_and_after_the_rate(fractional, tmp_path):
+    # As if the rate had taken the order's place: what is fractional without it gains nothing beside it.
+    link = fractional.deflections["theta12"]
+    assert places_table(fractional) is None
+    idle = {
+        run: replace(each, compared=link.fits["whole orders"][run].compared)
+        for run, each in link.fits["fractional damping"].items()
+    }
+    after = replace(link, fits={**link.fits, "fractional damping": idle}, before=link)
+    found = replace(fractional, deflections={"theta12": after})
+    table = places_table(found)
+    assert [row[0] for row in table.rows] == ["fractional elasticity", "fractional damping", "both fractional"]
+    assert list(table.rows[1][1:]) == ["yes", "no"]
+    assert list(table.rows[2][1:]) == ["yes", "yes"]
+    page = unseen_page(found, tmp_path / "orders.html").read_text()
+    assert "Does the order earn its place?" in page
+    assert page.count("θ₁₂, without the rate of the other deflection") >= 2
+    said = found.to_dict()["deflections"]["theta12"]
+    assert said["without_rate"] == fractional.to_dict()["deflections"]["theta12"]
+    assert [s["verdicts"]["fractional damping"]["earns"] for s in (said["without_rate"], said)] == [True, False]
+    text = unseen_text(found)
+    told = text[text.index("θ₁₂, without the rate of the other deflection:") :]
+    assert "θ₁₂: a fractional order of the damping earns its place." in told
+    assert "θ₁₂: a fractional order of the damping does not earn its place." not in told
 
 
 def test_stages_are_those_that_all_runs_have(fractional):

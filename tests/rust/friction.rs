@@ -169,6 +169,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
         initial: Initial::Rest,
+        filtered: vec![],
     };
     let start = Start { orders: vec![2.0], coefficients: vec![0.7, 1.2, 0.5], inputs: vec![], states: vec![] };
     let found =
@@ -179,7 +180,13 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
     }
     let strange =
         FrictionModel { friction: FreeLaw::coulomb(Monomial { factor: -1.0, powers: vec![] }), ..model.clone() };
-    assert!(matches!(strange.check(&[experiment]), Err(Error::Structure { .. })));
+    assert!(matches!(strange.check(std::slice::from_ref(&experiment)), Err(Error::Structure { .. })));
+    // Behind a filter that the model does not know.
+    let mut series = vec![0.0; m];
+    series[..2].copy_from_slice(&[0.5, 0.5]);
+    let behind = experiment.with_filter(series, vec![true])?;
+    assert!(matches!(model.check(std::slice::from_ref(&behind)), Err(Error::Structure { .. })));
+    FrictionModel { filtered: vec![true], ..model.clone() }.check(&[behind])?;
     assert!(matches!(model.check(&[]), Err(Error::Length { .. })));
     Ok(())
 }

@@ -75,6 +75,7 @@ fn rubbing(law: InputLaw) -> FrictionModel {
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
         initial: Initial::Rest,
+        filtered: vec![],
     }
 }
 

@@ -33,11 +33,11 @@ START_WORDS = ("auto", "rest", "caputo", "history")
 class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A known rational filter that some signals were measured through.
 
-    It belongs to signals, inputs and outputs alike, for it commutes with every equation. Where an equation is driven by
-    a filtered signal, all of its signals are taken behind the filter: a filtered one as it was measured, any other one
-    put through it, the output that the equation is compared with included. A free run in which all outputs follow from
-    unfiltered signals is the machine's own motion, and only its filtered outputs pass the filter before they are
-    compared. See :attr:`Structure.behind_filter`.
+    It belongs to signals, inputs and outputs alike, for it commutes with every linear equation. Where an equation is
+    driven by a filtered signal, all of its signals are taken behind the filter: a filtered one as it was measured, any
+    other one put through it, the output that the equation is compared with included. A free run in which all outputs
+    follow from unfiltered signals is the machine's own motion, and only its filtered outputs pass the filter before
+    they are compared; so it always is where a body has friction. See :attr:`Structure.behind_filter`.
 
     Parameters
     ----------
@@ -282,10 +282,12 @@ class Structure:
                 f"measured signals they share no free run, so give that of {rubbing[0]} a structure of its own, or "
                 "follow them together with coupling='simulated'"
             )
-        if self.sensor_filter is not None:
+        if self.behind_filter:
+            through = [s for s in self.signals if s not in self.outputs and self.measured_through(s)]
             raise ModelError(
-                f"{words}, and the structure a sensor filter: what sticks does so before the filter; leave the filter "
-                "out, or compare signals that passed none"
+                f"{words}, and {' and '.join(through)}, which drives it, passed the sensor filter: what sticks does so "
+                "before the filter, and what was filtered is not given back; let it follow from an equation of its "
+                "own with coupling='simulated', or leave it out of the filter"
             )
         if self.free_delays:
             raise ModelError(f"{words}, and the delay of {', '.join(self.free_delays)} is free; give it in seconds")
@@ -330,9 +332,10 @@ class Structure:
         """Whether equations and free runs are those of filtered signals, every unfiltered one put through the filter.
 
         So it is where a filtered signal drives an equation: another output with measured coupling, or what is not
-        modelled. What such a structure compares and returns is filtered, in all of its equations.
+        modelled. What such a structure compares and returns is filtered, in all of its equations. What may stick
+        follows from its own velocity, before the filter.
         """
-        followed = self.outputs if self.coupling == "simulated" else ()
+        followed = self.outputs if self.coupling == "simulated" or self.has_friction else ()
         return any(s not in followed and self.measured_through(s) for s in self.signals)
 
     def filter_states(self, initial: Initial) -> int:

@@ -80,7 +80,8 @@ def carrying(problem: FreeProblem, runs: Sequence[Run], values: dict[str, float]
     item = structure.equations[structure.sticks]
     if item.friction is None:
         return []
-    alone = structure.equation(item.output)
+    # A filter's lag is no part of a start.
+    alone = replace(structure, sensor_filter=None).equation(item.output)
     kept = tuple(t for t in alone.equations[0].terms if t.signal not in structure.outputs or t.signal == item.output)
     if not kept:
         return []

@@ -190,8 +190,8 @@ def _with_friction(
     known = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
     return _core.friction_error(
         experiments, problem.laws(structure.signals), structure.sticks, problem.strength(), bounds, coordinates,
-        initial_tuple(structure.initial, structure.offset), attempt.orders, attempt.coefficients, inputs, known,
-        evaluations, tolerance, stop(),
+        initial_tuple(structure.initial, structure.offset, structure.filter_states(structure.initial)),
+        attempt.orders, attempt.coefficients, inputs, known, evaluations, tolerance, stop(),
     )  # fmt: skip
 
 

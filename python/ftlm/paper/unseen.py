@@ -29,6 +29,8 @@ KINDS: dict[str, tuple[str, ...]] = {
 WHOLE_ORDERS = {"beta": 0.0, "mu": 1.0}
 #: Rows that a fit takes at most of a run; the arm's modes are a decade below the rate that is left of 20 s.
 MOST_ROWS = 1250
+#: What the structures of ``Deflection.before`` are called.
+WITHOUT = "without the rate of the other deflection"
 #: Points of fit below which a difference on an unseen run is none.
 MARGIN = 0.5
 
@@ -108,12 +110,15 @@ class Deflection:
         By kind, then by the run that was fitted.
     failed
         Why there is no fit, by kind and run.
+    before
+        The same without the rate of the other deflection; None where the other stage was not measured.
     """
 
     output: str
     structure: Structure
     fits: dict[str, dict[str, Fitted]]
     failed: dict[tuple[str, str], str] = field(default_factory=dict)
+    before: Deflection | None = None
 
     def gains(self, kind: str) -> dict[tuple[str, str], float]:
         """Points of fit over whole orders by (fitted, judged), on runs that were not fitted to."""
@@ -234,38 +239,45 @@ class UnseenOrders:
             "filtered": self.filtered,
             "margin": MARGIN,
             "deflections": {
-                output: {
-                    "equation": str(d.structure),
-                    "verdicts": {v.kind: {"earns": v.earns, "words": v.words} for v in d.verdicts},
-                    "fits": {
-                        kind: {
-                            run: {
-                                "numbers": f.numbers,
-                                "fit": {other: finite(f.fit(other)) for other in f.compared},
-                                "estimates": {n: float(v) for n, (v, *_) in f.estimates.items()},
-                                "intervals": {n: list(map(finite, ends)) for n, (_, *ends) in f.estimates.items()},
-                                "warnings": list(f.result.warnings),
-                            }
-                            for run, f in each.items()
-                        }
-                        for kind, each in d.fits.items()
-                    },
-                    "failed": {f"{kind}, {run}": words for (kind, run), words in d.failed.items()},
-                }
+                output: _told(d) | ({} if d.before is None else {"without_rate": _told(d.before)})
                 for output, d in self.deflections.items()
             },
             "notes": list(self.notes),
         }
 
 
-def link_structure(stage: StageNumber, *, both: bool, filtered: bool) -> Structure:
+def _told(deflection: Deflection) -> dict[str, Any]:
+    """One structure's fits and verdicts, for JSON."""
+    return {
+        "equation": str(deflection.structure),
+        "verdicts": {v.kind: {"earns": v.earns, "words": v.words} for v in deflection.verdicts},
+        "fits": {
+            kind: {
+                run: {
+                    "numbers": f.numbers,
+                    "fit": {other: finite(f.fit(other)) for other in f.compared},
+                    "estimates": {n: float(v) for n, (v, *_) in f.estimates.items()},
+                    "intervals": {n: list(map(finite, ends)) for n, (_, *ends) in f.estimates.items()},
+                    "warnings": list(f.result.warnings),
+                }
+                for run, f in each.items()
+            }
+            for kind, each in deflection.fits.items()
+        },
+        "failed": {f"{kind}, {run}": words for (kind, run), words in deflection.failed.items()},
+    }
+
+
+def link_structure(stage: StageNumber, *, both: bool, filtered: bool, rate: bool = True) -> Structure:
     """A deflection as (15) has it, driven by the measured hub: elasticity and damping of any order, gauge and cable.
 
-    With the other stage's angles its accelerations besides, by the energies of the planar arm. Initial terms are
-    Caputo's: a history would give fractional orders more numbers of the judged run than whole ones.
+    With the other stage's angles its accelerations besides, by the energies of the planar arm, and the rate of its
+    deflection, an observer's gain (``rate``). Initial terms are Caputo's: a history would give fractional orders more
+    numbers of the judged run than whole ones.
     """
     made = flexible_link(
         stage=stage, hub=False, cross_stage="inertial" if both else False, cross_sensitivity=True,
+        cross_damping=both and rate,
         sensor_filter="stock" if filtered else None, laws=("orders", "coefficients", "velocities"), offset="constant",
     )  # fmt: skip
     return replace(made, initial="caputo")
@@ -278,9 +290,10 @@ def orders_on_unseen_runs(
     """Fit every deflection of the arm to each run, with whole and with fractional orders, and judge it on all others.
 
     A link is (15) with the terms that a real arm needs: the hub's measured motion, the other stage's accelerations
-    where both stages were measured, hub angles in the gauge, and the gauge's zero, one a run. The same terms stand
-    in every structure; what differs is whether the link's elasticity (order 0) and its damping (order 1) may have
-    other orders.
+    and the rate of its deflection where both stages were measured, hub angles in the gauge, and the gauge's zero, one
+    a run. The same terms stand in every structure; what differs is whether the link's elasticity (order 0) and its
+    damping (order 1) may have other orders. Where both stages were measured all of that is done without the rate of
+    the other deflection besides (``Deflection.before``): an order that earns its place there alone stands in for it.
 
     Parameters
     ----------
@@ -320,9 +333,12 @@ def orders_on_unseen_runs(
             notes.append(f"of run {run.name} one of {every} rows is used, {every * run.step:.4g} s apart")
         used.append(thinned(run, every) if every > 1 else run)
     deflections = {}
+    both = len(stages) == 2
     for stage in stages:
-        structure = link_structure(stage, both=len(stages) == 2, filtered=filtered)
-        found = _deflection(structure, [r.select(list(structure.signals)) for r in used], threads, say, progress)
+        found = _deflection(link_structure(stage, both=both, filtered=filtered), "", used, threads, say, progress)
+        if both:
+            less = link_structure(stage, both=True, filtered=filtered, rate=False)
+            found = replace(found, before=_deflection(less, f", {WITHOUT}", used, threads, say, progress))
         deflections[found.output] = found
     return UnseenOrders(tuple(used), deflections, filtered, tuple(notes))
 
@@ -346,18 +362,19 @@ def stages_in(runs: Sequence[Run]) -> list[StageNumber]:
 
 
 def _deflection(
-    structure: Structure, runs: Sequence[Run], threads: int | None, say: Callable[[str], None],
+    structure: Structure, told: str, runs: Sequence[Run], threads: int | None, say: Callable[[str], None],
     progress: Callable[[int, int], None] | None,
 ) -> Deflection:  # fmt: skip
     """Every kind fitted to every run."""
     output = structure.outputs[0]
+    runs = [run.select(list(structure.signals)) for run in runs]
     fits: dict[str, dict[str, Fitted]] = {kind: {} for kind in KINDS}
     failed = {}
     for kind, free in KINDS.items():
         letters = {n: n.rstrip("0123456789") for n in structure.order_names}
         held = {n: WHOLE_ORDERS[letter] for n, letter in letters.items() if letter not in free}
         for run in runs:
-            say(f"{output}: {kind}, fitted to {run.name}")
+            say(f"{output}{told}: {kind}, fitted to {run.name}")
             try:
                 result = identify(run, structure.with_orders(held), threads=threads, progress=progress)
                 fits[kind][run.name] = Fitted(result, {other.name: result.model.compare(other) for other in runs})

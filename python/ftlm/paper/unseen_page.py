@@ -18,7 +18,7 @@ from ftlm.paint.lines import line_chart
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol, symbol_html, unbounded
-from ftlm.paper.unseen import KINDS, MARGIN, WHOLE, Deflection, UnseenOrders, Verdict, percent
+from ftlm.paper.unseen import KINDS, MARGIN, WHOLE, WITHOUT, Deflection, UnseenOrders, Verdict, percent
 
 #: The structure of the pictures: everything that the paper says of a link may be fractional.
 SHOWN = "both fractional"
@@ -28,6 +28,8 @@ WHAT = {
     "fractional damping": ("a fractional order of the damping", "earns its place", "does not earn its place"),
     SHOWN: ("fractional orders", "earn their place", "do not earn their place"),
 }  # fmt: skip
+#: A verdict in a cell.
+SHORT = {True: "yes", False: "no", None: "cannot be told"}
 #: Points of a line of the pictures.
 LINE_POINTS = 700
 
@@ -73,14 +75,45 @@ def unseen_charts(found: UnseenOrders, deflection: Deflection) -> list[Figure]:
     return charts
 
 
+def _each(found: UnseenOrders) -> list[tuple[str, Deflection]]:
+    """Every structure that was judged, with its heading; those without the rate after those with it."""
+    out = []
+    for output, deflection in found.deflections.items():
+        out.append((symbol(output), deflection))
+        if deflection.before is not None:
+            out.append((f"{symbol(output)}, {WITHOUT}", deflection.before))
+    return out
+
+
+def places_table(found: UnseenOrders) -> Table | None:
+    """Which orders earn their place before the rate of the other deflection stood in the equation, and with it."""
+    rows: list[list[Cell]] = []
+    headings = {}
+    for output, deflection in found.deflections.items():
+        if deflection.before is not None:
+            headings[len(rows)] = symbol(output)
+            pair = (deflection.before, deflection)
+            rows += [[kind, *(SHORT[d.verdict(kind).earns] for d in pair)] for kind in KINDS if kind != WHOLE]
+    if not rows:
+        return None
+    return Table(
+        "Does the order earn its place?",
+        ("order", "without rate", "with rate"),
+        rows,
+        headings=headings,
+        note="The rate of the other deflection stands in a link's equation as the gain of an observer would. An order "
+        "that earns its place only without it stood in for that gain.",
+    )
+
+
 def fits_table(found: UnseenOrders) -> Table:
     """Every structure on every run, seen and unseen, with its orders."""
     names = [run.name or "" for run in found.runs]
     pairs = [(run, other) for run in names for other in names]
     rows: list[list[Cell]] = []
     headings = {}
-    for output, deflection in found.deflections.items():
-        headings[len(rows)] = symbol_html(output)
+    for heading, deflection in _each(found):
+        headings[len(rows)] = heading
         for kind, each in deflection.fits.items():
             numbers = next((f.numbers for f in each.values()), None)
             fits: list[Cell] = []
@@ -98,7 +131,7 @@ def fits_table(found: UnseenOrders) -> Table:
     )  # fmt: skip
 
 
-def estimates_table(deflection: Deflection) -> Table:
+def estimates_table(deflection: Deflection, told: str = "") -> Table:
     """What every fit found, with intervals, a line a number."""
     rows: list[list[Cell]] = []
     headings = {}
@@ -107,7 +140,7 @@ def estimates_table(deflection: Deflection) -> Table:
             headings[len(rows)] = f"{kind}, fitted to {run}"
             for name, (value, low, high) in fitted.estimates.items():
                 rows.append([symbol_html(name), value, *(v if math.isfinite(v) else unbounded(v) for v in (low, high))])
-    title = f"{symbol(deflection.output)}: estimates and their 95 % intervals"
+    title = f"{symbol(deflection.output)}{told}: estimates and their 95 % intervals"
     return Table(title, ("number", "estimate", "from", "to"), rows, headings=headings)
 
 
@@ -118,8 +151,11 @@ def _first_section(found: UnseenOrders) -> Section:
 
 
 def _deflection_section(deflection: Deflection) -> Section:
-    results = {f"{k}, {run}": f.result for k, each in deflection.fits.items() for run, f in each.items()}
-    failed = [f"{kind}, {run}: {words}" for (kind, run), words in deflection.failed.items()]
+    parts = [("", deflection)] + ([] if deflection.before is None else [(f", {WITHOUT}", deflection.before)])
+    results = {
+        f"{k}, {run}{told}": f.result for told, d in parts for k, each in d.fits.items() for run, f in each.items()
+    }
+    failed = [f"{kind}, {run}{told}: {words}" for told, d in parts for (kind, run), words in d.failed.items()]
     last = next(iter(deflection.fits[WHOLE].values())).result.model
     first, run = next((f.result.model, run) for run, f in {
         **deflection.fits[WHOLE], **deflection.fits[SHOWN]
@@ -128,7 +164,7 @@ def _deflection_section(deflection: Deflection) -> Section:
     words = f"With whole orders and with both free, fitted to {run}:"
     return Section(
         symbol(deflection.output), [words, *equations], warnings=[*failed, *grouped_warnings(results)],
-        tables=[estimates_table(deflection)],
+        tables=[estimates_table(d, told) for told, d in parts],
     )  # fmt: skip
 
 
@@ -137,7 +173,8 @@ def _method_section(found: UnseenOrders) -> Section:
     words = [
         "A link is the Euler–Lagrange equation (15) with what a real arm needs: it hangs on the measured motion of its "
         "hub, whose coefficient −1 is known; the other stage's accelerations push on it where both stages were "
-        "measured; hub angles leak into its gauge; the gauge has an unknown zero."
+        "measured, and the rate of the other deflection steadies it as an observer's gain would; hub angles leak into "
+        "its gauge; the gauge has an unknown zero."
         + (" Both deflections passed the 2 Hz low-pass of the arm's stock model." if found.filtered else ""),
         "All structures have the same terms. Whole orders: elasticity of order 0, damping of order 1.",
         f"An order earns its place where every fitted run's 95 % interval excludes the whole one, the runs' intervals "
@@ -175,9 +212,10 @@ def unseen_page(found: UnseenOrders, path: str | os.PathLike[str], *, force: boo
     alone = [
         _verdict(o, v) for o, d in found.deflections.items() for v in d.verdicts if v.kind != SHOWN
     ]  # fmt: skip
+    places = places_table(found)
     sections = [
         _first_section(found),
-        Section("One order at a time", alone, tables=[fits_table(found)]),
+        Section("One order at a time", alone, tables=[*([] if places is None else [places]), fits_table(found)]),
         *(_deflection_section(d) for d in found.deflections.values()),
         _method_section(found),
     ]  # fmt: skip
@@ -197,7 +235,11 @@ def unseen_text(found: UnseenOrders) -> str:
             lines += [sentence(output, verdict), f"    {verdict.words}"]
     names = [run.name or "" for run in found.runs]
     for output, deflection in found.deflections.items():
-        lines += ["", f"{output}: fit of the free run in percent, fitted to the first, judged on the second"]
+        if deflection.before is not None:
+            lines += ["", f"{symbol(output)}, {WITHOUT}:"]
+            lines += [f"    {sentence(output, verdict)}" for verdict in deflection.before.verdicts]
+    for heading, deflection in _each(found):
+        lines += ["", f"{heading}: fit of the free run in percent, fitted to the first, judged on the second"]
         lines.append(" " * 24 + "numbers".rjust(8) + "".join(f"{a} → {b}".rjust(18) for a in names for b in names))
         lines += [_line(kind, deflection, names) for kind in KINDS]
     return "\n".join([*lines, *(f"note: {n}" for n in found.notes)])

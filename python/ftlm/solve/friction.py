@@ -14,7 +14,7 @@ from ftlm.data.equations import Equation, Friction
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.solve.instants import has_own_times
-from ftlm.solve.records import Record, initial_tuple, linear_tuple
+from ftlm.solve.records import Record, initial_tuple, linear_tuple, sensor_series
 
 #: Evaluations in which level, velocity and offset of a run are found, and the share of the cost that ends the search.
 EVALUATIONS = 60
@@ -23,6 +23,8 @@ STILL = 1e-12
 
 def motion_with_friction(model: Solved, rec: Record, powers: Sequence[Sequence[tuple[float, float]]]) -> _core._Motion:
     """Outputs of identified equations one of which has friction, initial terms by equation as (exponent, coefficient).
+
+    Impulses (-1, -2, ...) stand in the outputs for what the filter that these pass still held.
 
     Returns
     -------
@@ -62,15 +64,19 @@ def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | 
     shares: Floats | None = None
     if not known.all():
         shares = np.ascontiguousarray(np.where(known[:, 1:-1], 1.0, 0.0))
+    structure = model.structure
+    series = sensor_series(structure, rec.m, rec.step)
+    filtered = None if series is None else (series, [structure.measured_through(o) for o in model.outputs])
     experiment = (
-        rec.core(), every, np.where(known, samples, 0.0), None, [1.0 / s if s > 0 else 1.0 for s in sizes.tolist()],
+        rec.core(), every, np.where(known, samples, 0.0), filtered, [1.0 / s if s > 0 else 1.0 for s in sizes.tolist()],
         [(None, False)] * len(rec.signals), shares, None,
     )  # fmt: skip
     laws = [known_law(item, rec.signals) for item in model.equations]
-    sticks = model.structure.sticks
+    sticks = structure.sticks
     rubs: list[tuple[float, list[Any]]] = [(x, []) for x in strength(model.equations[sticks])]
     return _core.friction_error(
-        [experiment], laws, sticks, rubs, [], [], initial_tuple(rec.initial, rec.offset), [], [], [],
+        [experiment], laws, sticks, rubs, [], [],
+        initial_tuple(rec.initial, rec.offset, structure.filter_states(rec.initial)), [], [], [],
         [] if near is None else [near], EVALUATIONS, STILL,
     )  # fmt: skip
 

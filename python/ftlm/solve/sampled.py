@@ -101,7 +101,7 @@ def refined(
     every = FIRST_REFINEMENT
     if initial is None and model.structure.has_friction:
         # Level and velocity at the start are found by descent, whose ends scatter by more than steps move them.
-        rec = record(run, model.structure, FRICTION_REFINEMENT * own)
+        rec = record(run, model.structure, FRICTION_REFINEMENT * own, filtered=False)
         initial = begun_terms(model, begun(model, run, rec, FRICTION_REFINEMENT))
     elif initial is None:
         model = started(model, run)
@@ -324,13 +324,16 @@ def _read(
     drive, now, start = None if drive is None else through @ drive, through @ now, through @ start
     with np.errstate(invalid="ignore", over="ignore"):
         rest = means if drive is None else means - drive
-        gain = np.ones(len(names))
+        gain, held = np.ones(len(names)), np.zeros(len(names))
         series = sensor_series(structure, rec.m, rec.step) if rec.sensor is None else None
         if series is not None and structure.sensor_filter is not None:
             rest = means.copy() if drive is None else rest
             for i, name in enumerate(names):
                 if structure.measured_through(name) and np.all(np.isfinite(means[i])):
                     gain[i] = high_frequency_gain(structure.sensor_filter)
+                    # What the filter of a body that may stick still held, of impulses as powers below.
+                    degree = structure.sensor_filter.relative_degree
+                    held[i] = terms[name].get(-float(degree), 0.0) * leading_gain(structure.sensor_filter)
                     rest[i] = _core.series_multiply(series, means[i], rec.m)
                     if drive is not None:
                         rest[i] -= gain[i] * drive[i]
@@ -338,7 +341,7 @@ def _read(
             kinks = through @ _kinks(model, run, at, terms)
             kinks[gain != 1.0] = 0.0
             # At the very start nothing has been integrated yet.
-            begun = np.where(at.times > 0.0, _finite_readings(rest, at) + kinks, (gain * start)[:, None])
+            begun = np.where(at.times > 0.0, _finite_readings(rest, at) + kinks, (gain * start + held)[:, None])
             return np.asarray(begun + gain[:, None] * now)
         later = 1.5 * rest[:, every - 1 :: every] - 0.5 * rest[:, every - 2 :: every]
         if any(t.order.constant > e.order.constant + GRAIN for e in model.equations for t in e.terms):
@@ -346,7 +349,7 @@ def _read(
             # a part that changes its sign from one to the next, which those on both sides of an instant take away.
             later[:, :-1] = 0.5 * (rest[:, every - 1 : -1 : every] + rest[:, every::every])
             later[:, -1] = rest[:, -1] + 0.5 * rest[:, -2] - 0.5 * rest[:, -3]
-        return np.concatenate([(gain * start)[:, None], later], axis=1) + gain[:, None] * now
+        return np.concatenate([(gain * start + held)[:, None], later], axis=1) + gain[:, None] * now
 
 
 def _finite_readings(rest: Floats, at: Instants) -> Floats:
