@@ -134,7 +134,7 @@ def call_batch(seed, count):
         print(f"{index} {own or ''}.{name}", flush=True)
         try:
             if own is None:
-                getattr(_core)(*given)
+                getattr(_core, name)(*given)
             elif name == "__new__":
                 objects[own] = getattr(_core, own)(*given)
             else:
@@ -153,7 +153,7 @@ def call_batch(seed, count):
                     )
                 given = [made["Guard"](values) if isinstance(note, ast.Name) and note.id == "Guard" else g
                          for g, (_, note) in zip(given, arguments, strict=True)]  # fmt: skip
-                getattr(objects[own])(*given)
+                getattr(objects[own], name)(*given)
         except Exception as error:
             if type(error).__name__ == "InternalError":
                 print(f"PANIC {error}", flush=True)
