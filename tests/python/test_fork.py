@@ -8,8 +8,8 @@ import pytest
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 
-#: Forks `COUNT` times from beside `work()` in two threads; a child that has not done all of its own after some seconds is
-#: ended by its alarm.
+#: Forks some times from beside `work` in two threads; a child that has not done its own after some seconds is ended by
+#: its alarm.
 FORKS = """
 import os, signal, sys, threading, time, warnings
 import numpy as np
