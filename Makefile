@@ -5,6 +5,9 @@ PYTHON ?= python3
 CORE := $(shell find rust -name '*.rs') Cargo.toml Cargo.lock pyproject.toml
 export RUSTDOCFLAGS := -D warnings
 
+# The same commit in the same folder gives the same wheel: what is in it is as old as the commit.
+export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct 2>/dev/null || echo 315532800)
+
 .PHONY: demo test test-slow attack test-rust test-python lint docs bench fuzz wheel wheel-test sdist-test clean
 
 demo: $(VENV)/.built
@@ -31,6 +34,7 @@ lint: $(VENV)/.built
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/python -m mypy.stubtest ftlm._core
+	$(BIN)/python tests/notices.py --check
 
 test-rust:
 	cargo test --release
@@ -74,6 +78,7 @@ wheel-test: wheel
 	$(BIN)/python -m abi3audit --strict wheels/*.whl
 ifeq ($(shell uname -s),Linux)
 	$(BIN)/auditwheel show --json wheels/*.whl | $(BIN)/python tests/wheel.py
+	$(BIN)/python tests/wheel.py --holds wheels/*.whl
 endif
 	rm -rf $(VENV)-wheel wheels/demo
 

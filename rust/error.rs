@@ -90,6 +90,16 @@ pub enum Error {
         /// Memory allowed.
         limit: u128,
     },
+    /// What a search would hold at once does not fit the memory that it may take.
+    #[error("{what} need {bytes} bytes, more than the {limit} that a search may take; take a smaller m, a larger step, narrower intervals or fewer runs at once, or allow more by FTLM_MEMORY")]
+    Memory {
+        /// What is to be held.
+        what: String,
+        /// Memory needed.
+        bytes: u128,
+        /// Memory allowed.
+        limit: u128,
+    },
     /// An equation names a signal that the record does not hold, or is otherwise malformed.
     #[error("{what}; {remedy}")]
     Structure {

@@ -4,11 +4,14 @@
 //! spectra is a cyclic convolution. Scratch belongs to the caller ([`Workspace`]): plans are shared,
 //! workspaces are one per thread.
 
-use std::collections::HashMap;
-use std::sync::{Arc, Mutex, OnceLock};
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::sync::Arc;
 
 pub use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealFftPlanner, RealToComplex};
+
+use crate::shared::Shared;
 
 /// One complex number of a spectrum.
 pub type Bin = Complex<f64>;
@@ -50,46 +53,70 @@ const KEPT: usize = 1 << 17;
 /// Points of all longer ones together beyond which those asked for longest ago are forgotten: a run on ever finer grids
 /// would leave the plans of all of them behind. What is forgotten too early costs two transforms once more.
 const POINTS: usize = 1 << 22;
-/// Those among so many asked for last are in use: one evaluation of a large problem holds more points than these.
-const IN_USE: u64 = 32;
+/// Those among so many long ones asked for last are in use: one evaluation of a large problem may hold more points than
+/// these.
+const IN_USE: u64 = 16;
 
 /// Plans by length, each with when it was last asked for.
-#[derive(Default)]
 struct Plans {
     asked: u64,
-    made: HashMap<usize, (Plan, u64)>,
+    made: BTreeMap<usize, (Plan, u64)>,
+}
+
+/// Plans that any thread may take. Short ones are taken once a thread; what many threads ask for all the time, none waits
+/// for.
+static SHARED: Shared<Plans> = Shared::new(Plans::new());
+
+thread_local! {
+    /// Short plans that this thread has asked for, and those that it made while the shared ones were not to be had.
+    static OWN: RefCell<Plans> = const { RefCell::new(Plans::new()) };
 }
 
 impl Plans {
-    fn of(&mut self, len: usize) -> Plan {
-        self.asked += 1;
-        let now = self.asked;
-        if let Some((plan, last)) = self.made.get_mut(&len) {
-            *last = now;
-            return plan.clone();
-        }
+    const fn new() -> Self {
+        Self { asked: 0, made: BTreeMap::new() }
+    }
+
+    fn find(&mut self, len: usize) -> Option<Plan> {
+        let (plan, last) = self.made.get_mut(&len)?;
         if len > KEPT {
-            self.make_room(POINTS.saturating_sub(len));
+            self.asked += 1;
+            *last = self.asked;
         }
-        let mut planner = RealFftPlanner::<f64>::new();
-        let plan = Plan { len, forward: planner.plan_fft_forward(len), inverse: planner.plan_fft_inverse(len) };
-        self.made.insert(len, (plan.clone(), now));
-        plan
+        Some(plan.clone())
+    }
+
+    /// Keeps a plan, unless another thread's of its length is here, and gives that which is kept; beside it those that are
+    /// forgotten for it, so that a lock on these plans need not wait for their memory.
+    fn keep(&mut self, plan: Plan) -> (Plan, Vec<Plan>) {
+        let len = plan.len;
+        if let Some(there) = self.find(len) {
+            return (there, vec![plan]);
+        }
+        let mut forgotten = Vec::new();
+        if len > KEPT {
+            self.asked += 1;
+            forgotten = self.make_room(POINTS.saturating_sub(len));
+        }
+        self.made.insert(len, (plan.clone(), self.asked));
+        (plan, forgotten)
     }
 
     /// Forgets long plans, the one asked for longest ago first, until no more points than these are left.
-    fn make_room(&mut self, points: usize) {
+    fn make_room(&mut self, points: usize) -> Vec<Plan> {
         let mut long: Vec<(u64, usize)> =
             self.made.iter().map(|(&len, &(_, last))| (last, len)).filter(|&(_, len)| len > KEPT).collect();
         long.sort_unstable();
         let mut held: usize = long.iter().map(|&(_, len)| len).sum();
+        let mut forgotten = Vec::new();
         for (last, len) in long {
             if held <= points || self.asked - last <= IN_USE {
                 break;
             }
             held -= len;
-            self.made.remove(&len);
+            forgotten.extend(self.made.remove(&len).map(|(plan, _)| plan));
         }
+        forgotten
     }
 }
 
@@ -105,10 +132,24 @@ impl Plans {
 /// ```
 #[must_use]
 pub fn plan(len: usize) -> Plan {
-    static PLANS: OnceLock<Mutex<Plans>> = OnceLock::new();
-    let table = PLANS.get_or_init(Mutex::default);
-    // A poisoned table only means that another thread died between two inserts; its content is whole.
-    table.lock().unwrap_or_else(std::sync::PoisonError::into_inner).of(len)
+    if let Some(plan) = OWN.with_borrow_mut(|own| own.find(len)) {
+        return plan;
+    }
+    let (plan, shared) = match SHARED.with(|plans| plans.find(len)).flatten() {
+        Some(plan) => (plan, true),
+        None => {
+            // None is made behind a lock: where two threads make the same one at once, the later one is dropped.
+            let made = Plan::new(len);
+            match SHARED.with(|plans| plans.keep(made.clone())) {
+                Some((plan, _forgotten)) => (plan, true),
+                None => (made, false),
+            }
+        }
+    };
+    if len <= KEPT || !shared {
+        OWN.with_borrow_mut(|own| own.keep(plan.clone()));
+    }
+    plan
 }
 
 /// Squared magnitudes of a signal's transform, from frequency 0 to Nyquist's, zero-padded to a fast length.
@@ -123,6 +164,11 @@ pub fn power_spectrum(signal: impl ExactSizeIterator<Item = f64>) -> Vec<f64> {
 }
 
 impl Plan {
+    fn new(len: usize) -> Self {
+        let mut planner = RealFftPlanner::<f64>::new();
+        Self { len, forward: planner.plan_fft_forward(len), inverse: planner.plan_fft_inverse(len) }
+    }
+
     /// Number of real points.
     #[must_use]
     pub fn len(&self) -> usize {
@@ -207,25 +253,44 @@ impl Workspace {
 mod tests {
     use super::*;
 
+    #[allow(clippy::cast_precision_loss)]
+    fn is_sound(plan: &Plan) -> bool {
+        let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
+        plan.forward(&mut vec![1.0; plan.len()], &mut spectrum, &mut Workspace::new());
+        (spectrum[0].re - plan.len() as f64).abs() < 1e-6 && spectrum[1].norm() < 1e-6
+    }
+
     #[test]
     fn long_plans_are_forgotten_that_nobody_asks_for() {
-        let mut plans = Plans::default();
+        let mut plans = Plans::new();
         let (short, long, next) = (64, POINTS / 2, POINTS / 2 + 2);
-        plans.of(short);
-        plans.of(long);
-        plans.of(next);
-        assert!(plans.made.contains_key(&long), "in use");
-        for _ in 0..=IN_USE {
-            plans.of(short);
+        let keep = |plans: &mut Plans, len| plans.keep(Plan::new(len)).1.len();
+        for len in [short, long, next] {
+            assert_eq!(keep(&mut plans, len), 0, "in use");
         }
-        plans.of(next + 2);
-        assert!(!plans.made.contains_key(&long) && !plans.made.contains_key(&next));
-        assert!(plans.made.contains_key(&short) && plans.made.contains_key(&(next + 2)));
+        for _ in 0..=IN_USE {
+            assert!(plans.find(short).is_some() && plans.find(next).is_some());
+        }
+        assert_eq!(keep(&mut plans, next + 2), 1);
+        assert!(plans.find(long).is_none() && plans.find(next).is_some() && plans.find(short).is_some());
         // Made anew, it is the same.
-        let mut spectrum = vec![Bin::new(0.0, 0.0); long / 2 + 1];
-        plans.of(long).forward(&mut vec![1.0; long], &mut spectrum, &mut Workspace::new());
-        #[allow(clippy::cast_precision_loss)]
-        let sum = long as f64;
-        assert!((spectrum[0].re - sum).abs() < 1e-6 && spectrum[1].norm() < 1e-6);
+        assert!(is_sound(&plan(long)));
+    }
+
+    #[test]
+    fn of_two_plans_of_a_length_the_first_is_kept() {
+        let mut plans = Plans::new();
+        let (first, _) = plans.keep(Plan::new(64));
+        let (kept, dropped) = plans.keep(Plan::new(64));
+        assert!(Arc::ptr_eq(&first.forward, &kept.forward) && dropped.len() == 1);
+    }
+
+    #[test]
+    fn a_lock_that_is_never_given_back_stops_no_plan() {
+        for len in [90, KEPT + 2] {
+            let (first, second) = SHARED.held(|| (plan(len), plan(len)));
+            assert!(is_sound(&first));
+            assert!(Arc::ptr_eq(&first.forward, &second.forward), "made once");
+        }
     }
 }

@@ -1,9 +1,12 @@
 //! Kernels of the fractional integral I^η and of its derivative with respect to η, Grünwald–Letnikov weights, and pulse
 //! means of powers of t.
 
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::cell::RefCell;
+use std::sync::Arc;
+use std::thread::LocalKey;
 
 use crate::error::{Error, Result};
+use crate::shared::Shared;
 
 /// Highest order of an integral, and of an equation: five lightly damped modes in one. The kernels are exact to a few ε
 /// up to here; what a division loses to rounding grows as (ωT)^α/Γ(α+1), so long records of many modes need fewer orders.
@@ -209,20 +212,42 @@ fn whole_powers(exponent: f64, m: usize) -> Vec<f64> {
     powers
 }
 
-/// Tables that only ever grow, one per process; a poisoned one is whole, since it is replaced in one go.
-fn grown<T: Copy>(table: &Mutex<Arc<Vec<T>>>, m: usize, make: impl Fn(usize) -> Vec<T>) -> Arc<Vec<T>> {
-    let mut held = table.lock().unwrap_or_else(PoisonError::into_inner);
-    if held.len() < m {
-        *held = Arc::new(make(m.next_power_of_two()));
+/// A table that only ever grows: one for all threads, and one of a thread's own for when that is not to be had.
+struct Table<T: 'static> {
+    shared: &'static Shared<Values<T>>,
+    own: &'static LocalKey<RefCell<Values<T>>>,
+    make: fn(usize) -> Vec<T>,
+}
+
+type Values<T> = Option<Arc<Vec<T>>>;
+
+impl<T> Table<T> {
+    /// At least m values.
+    fn of(&self, m: usize) -> Arc<Vec<T>> {
+        let enough = |values: &Values<T>| values.as_ref().filter(|values| values.len() >= m).map(Arc::clone);
+        let own = || self.own.with_borrow(enough);
+        if let Some(values) = own().or_else(|| self.shared.with(|values| enough(values)).flatten()) {
+            return values;
+        }
+        let made = Arc::new((self.make)(m.next_power_of_two()));
+        // What is replaced is given back, so that its memory is not freed behind the lock.
+        let kept = self.shared.with(|values| {
+            let longer = values.as_ref().is_none_or(|values| values.len() < made.len());
+            longer.then(|| values.replace(Arc::clone(&made)))
+        });
+        if kept.is_none() {
+            self.own.set(Some(Arc::clone(&made)));
+        }
+        made
     }
-    Arc::clone(&held)
 }
 
 /// Least prime divisor of each n < m (at least).
 #[allow(clippy::cast_possible_truncation)]
 fn least_divisors(m: usize) -> Arc<Vec<u32>> {
-    static TABLE: OnceLock<Mutex<Arc<Vec<u32>>>> = OnceLock::new();
-    grown(TABLE.get_or_init(Mutex::default), m, |len| {
+    static SHARED: Shared<Values<u32>> = Shared::new(None);
+    thread_local!(static OWN: RefCell<Values<u32>> = const { RefCell::new(None) });
+    let make = |len| {
         let mut divisors: Vec<u32> = (0..len as u32).collect();
         let mut prime = 2;
         while prime * prime < len {
@@ -236,14 +261,17 @@ fn least_divisors(m: usize) -> Arc<Vec<u32>> {
             prime += 1;
         }
         divisors
-    })
+    };
+    Table { shared: &SHARED, own: &OWN, make }.of(m)
 }
 
 /// ln n for n < m (at least); 0 at n = 0, which nobody reads. Longer than m: zip it with what is m long.
 #[allow(clippy::cast_precision_loss)]
 fn whole_logarithms(m: usize) -> Arc<Vec<f64>> {
-    static TABLE: OnceLock<Mutex<Arc<Vec<f64>>>> = OnceLock::new();
-    grown(TABLE.get_or_init(Mutex::default), m, |len| (0..len).map(|n| libm::log(n.max(1) as f64)).collect())
+    static SHARED: Shared<Values<f64>> = Shared::new(None);
+    thread_local!(static OWN: RefCell<Values<f64>> = const { RefCell::new(None) });
+    let make = |len| (0..len).map(|n: usize| libm::log(n.max(1) as f64)).collect();
+    Table { shared: &SHARED, own: &OWN, make }.of(m)
 }
 
 /// ψ(x) for x > 0, NaN elsewhere: recurrence up to x ≥ 10, then the asymptotic series (DLMF 5.11.2).
@@ -326,5 +354,26 @@ pub fn check_order(name: &str, order: f64) -> Result<()> {
             range: format!("[0, {MAX_ORDER}]"),
             remedy: "split a higher order into a whole and a fractional part".into(),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_lock_that_is_never_given_back_stops_no_table() {
+        static SHARED: Shared<Values<usize>> = Shared::new(None);
+        thread_local!(static OWN: RefCell<Values<usize>> = const { RefCell::new(None) });
+        let table = Table { shared: &SHARED, own: &OWN, make: |len| (0..len).collect() };
+        let (first, second) = SHARED.held(|| (table.of(5), table.of(8)));
+        assert_eq!(*first, [0, 1, 2, 3, 4, 5, 6, 7]);
+        assert!(Arc::ptr_eq(&first, &second), "made once");
+        let longer = table.of(9);
+        assert_eq!(longer.len(), 16);
+        // Another thread takes what is shared, and a shorter one made meanwhile replaces nothing.
+        std::thread::scope(|scope| {
+            scope.spawn(|| assert!(Arc::ptr_eq(&table.of(16), &longer)));
+        });
     }
 }

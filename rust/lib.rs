@@ -61,6 +61,7 @@ pub mod series;
 pub mod dense;
 pub mod fft;
 pub mod lanes;
+mod shared;
 
 pub mod equation;
 pub mod regressors;

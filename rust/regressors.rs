@@ -8,8 +8,8 @@ use crate::excess::kernel;
 use crate::kernels::power_means;
 use crate::series::{self, Buffers, Kernel};
 
-/// Largest bank kept in memory; beyond it a search refuses to start.
-pub const BANK_LIMIT: u128 = 2 << 30;
+/// Largest bank that is made for itself, and what a search takes in all where no other limit is given, in bytes.
+pub const BANK_LIMIT: u64 = 2 << 30;
 
 /// One run as pulse means: all signals over the same m pulses of length `step`.
 #[derive(Debug, Clone)]
@@ -268,8 +268,26 @@ impl Bank {
     /// assert!(bank.kernel(input).is_empty() && bank.kernel(own).len() == 4);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    #[allow(clippy::cast_precision_loss)]
     pub fn new(index: &Index, record: &Record, output: usize) -> Result<Self> {
+        let (m, limit) = (record.m(), u128::from(BANK_LIMIT));
+        let bytes = 8 * m as u128 * (index.keys.len() + Self::own(index, output)) as u128;
+        if bytes > limit {
+            return Err(Error::BankTooLarge { columns: index.keys.len(), m, bytes, limit });
+        }
+        Self::counted(index, record, output)
+    }
+
+    /// How many regressors are integrals of this signal.
+    pub(crate) fn own(index: &Index, output: usize) -> usize {
+        index.keys.iter().filter(|k| matches!(k, Key::Integral { signal, .. } if *signal == output)).count()
+    }
+
+    /// As [`Bank::new`], for who has counted its memory.
+    ///
+    /// # Errors
+    /// [`Error::Structure`] for a signal that the record does not hold.
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn counted(index: &Index, record: &Record, output: usize) -> Result<Self> {
         let m = record.m();
         let strange = |key: &&Key| matches!(key, Key::Integral { signal, .. } if *signal >= record.len());
         if let Some(Key::Integral { signal, .. }) = index.keys.iter().find(strange) {
@@ -277,11 +295,6 @@ impl Bank {
                 what: format!("a regressor is of signal {signal}, but the record holds {}", record.len()),
                 remedy: "give the record all signals of the equation".into(),
             });
-        }
-        let own = index.keys.iter().filter(|k| matches!(k, Key::Integral { signal, .. } if *signal == output)).count();
-        let bytes = 8 * m as u128 * (index.keys.len() + own) as u128;
-        if bytes > BANK_LIMIT {
-            return Err(Error::BankTooLarge { columns: index.keys.len(), m, bytes, limit: BANK_LIMIT });
         }
         let mut buffers = Buffers::default();
         let mut spectra: HashMap<usize, Kernel> = HashMap::new();

@@ -134,7 +134,7 @@ def call_batch(seed, count):
         print(f"{index} {own or ''}.{name}", flush=True)
         try:
             if own is None:
-                getattr(_core)(*given)
+                getattr(_core, name)(*given)
             elif name == "__new__":
                 objects[own] = getattr(_core, own)(*given)
             else:
@@ -153,7 +153,8 @@ def call_batch(seed, count):
                     )
                 given = [made["Guard"](values) if isinstance(note, ast.Name) and note.id == "Guard" else g
                          for g, (_, note) in zip(given, arguments, strict=True)]  # fmt: skip
-                getattr(objects[own])(*given)
+                getattr(objects[own], name)(*given)
+            print("ANSWERED", flush=True)
         except Exception as error:
             if type(error).__name__ == "InternalError":
                 print(f"PANIC {error}", flush=True)
@@ -162,7 +163,8 @@ def call_batch(seed, count):
 
 
 def calls(table, count, folder):
-    tried = 0
+    tried, names, answered = 0, set(), set()
+    answers = 0
     for seed in range(-(-count // BATCH)):
         with (folder / "errors").open("w") as errors:
             command = [sys.executable, __file__, "--batch", str(seed)]
@@ -178,8 +180,12 @@ def calls(table, count, folder):
                 for line in lines:
                     if line.startswith("PANIC"):
                         table.broken("calls of the extension", f"batch {seed}: {last}: {line}")
+                    elif line == "ANSWERED":
+                        answers += 1
+                        answered.add(last.partition(" ")[2])
                     else:
                         last, tried = line, tried + 1
+                        names.add(last.partition(" ")[2])
             elif child.poll() is not None:
                 break
             elif time.monotonic() - at > HANG + (10 if not last else 0):
@@ -191,6 +197,9 @@ def calls(table, count, folder):
         if child.wait() not in (0, -9):
             table.broken("calls of the extension", f"batch {seed}: {last} ended the process with {child.returncode}")
     table.tried("calls of the extension", tried)
+    # Refused arguments alone would prove little.
+    table.notes.append(f"{answers} calls of {len(answered)} of {len(names)} entries were answered, the others refused")
+    table.notes += [f"never answered: {', '.join(sorted(names - answered))}"] if names - answered else []
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -335,7 +344,7 @@ laws = [(0, law(1., 0., 0.), [(0, law(0., 1., 0.)), (2, law(0., 0., 1.))]),
         (1, law(0., 1., 1.), [(1, law(0., .5, .1)), (2, law(0., .3, .1))])]
 call = lambda: _core.search_stage([(0.01, rng.standard_normal((3, 2000)), None)], [ax(1.05, 2), ax(.1, 1), ax(.1, 1)],
     laws, [False, False, True], [[None] * 2] * 2, [1., 1.], (True, []),
-    ("output-error", "l1", 0, 1e6, False, 20, 2, True, 0), None)
+    ("output-error", "l1", 0, 1e6, False, 20, 2, True, 0, 1 << 31), None)
 """,
     "integral of 2^23 samples": """
 x = rng.standard_normal(1 << 23)

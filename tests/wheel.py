@@ -1,10 +1,18 @@
 """Checks what auditwheel says of a wheel: it claims the policy that it meets and needs nothing but the C library.
 
 auditwheel show --json wheels/*.whl | python tests/wheel.py
+
+With --holds, that it brings license and notices; with --nameless also that it names no folder of the machine where it
+was made, as wheels for others must not.
+
+python tests/wheel.py --holds wheels/*.whl
 """
 
 import json
+import os
 import sys
+import zipfile
+from pathlib import Path
 
 #: The C library, its mathematics, and the compiler's run time: every Linux of a manylinux policy has them.
 SYSTEM = {"libc.so.6", "libm.so.6", "libgcc_s.so.1"}
@@ -29,7 +37,36 @@ def faults(found):
     ]
 
 
+#: What every wheel brings beside its code.
+TERMS = ("LICENSE", "THIRD-PARTY-NOTICES.txt")
+
+
+def folders():
+    """Folders of this machine that a wheel must not name."""
+    return [
+        str(folder) for folder in (Path.home(), Path.cwd(), *map(Path, filter(None, [os.environ.get("CARGO_HOME")])))
+    ]
+
+
+def lacks(path, folders):
+    """What is wrong with what a wheel holds, in words."""
+    with zipfile.ZipFile(path) as wheel:
+        files = {name: wheel.read(name) for name in wheel.namelist()}
+    ends = {name.rsplit("/", 1)[-1] for name in files}
+    told = [f"it lacks {name}" for name in TERMS if name not in ends]
+    told += [
+        f"{name} names {folder}"
+        for name, content in files.items()
+        for folder in folders
+        if len(folder) > 1 and f"{folder}/".encode() in content
+    ]
+    return told
+
+
 if __name__ == "__main__":
+    if sys.argv[1:2] in (["--holds"], ["--nameless"]):
+        named = folders() if sys.argv[1] == "--nameless" else []
+        sys.exit("\n".join(f"{path}: {words}" for path in sys.argv[2:] for words in lacks(path, named)))
     found = json.load(sys.stdin)
     wrong = faults(found)
     if wrong:

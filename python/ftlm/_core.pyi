@@ -77,7 +77,7 @@ _Initial: TypeAlias = (
     tuple[bool, Sequence[float]] | tuple[bool, Sequence[float], int] | tuple[bool, Sequence[float], int, int]
 )
 #: (criterion, norm, p or 0 for least squares, K0, Haar rows, keep, threads, early stopping)
-_Options: TypeAlias = tuple[str, str, int, float, bool, int, int, bool, int]
+_Options: TypeAlias = tuple[str, str, int, float, bool, int, int, bool, int, int]
 #: (output, values of alpha, [(signal, values, interchangeable), ...])
 _Lattice: TypeAlias = tuple[int, Sequence[float], Sequence[tuple[int, Sequence[float], bool]]]
 #: (constant, weight of each free order)

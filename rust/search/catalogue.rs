@@ -5,6 +5,8 @@ use std::borrow::Cow;
 use crate::equation::Initial;
 use crate::error::{check_length, Result};
 use crate::regressors::Record;
+use crate::search::bound::lower::Bound;
+use crate::search::budget::Budget;
 use crate::search::candidate::needed::Needed;
 use crate::search::candidate::problem::Problem;
 use crate::search::lattice::cursor::Cursor;
@@ -42,7 +44,10 @@ impl<'a> Catalogue<'a> {
                 }
             }
         }
-        let problem = Problem::new(records, lattice.output(), needed.index(), fixed, options)?;
+        let (output, index, mut budget) = (lattice.output(), needed.index(), Budget::default());
+        budget.add(records, output, &index, options, Bound::POOL);
+        budget.check(options.memory)?;
+        let problem = Problem::new(records, output, index, fixed, options)?;
         let problem = pool.install(|| problem.with_bound(lattice.count()));
         let tables = tables(&lattice, &problem)?;
         Ok(Self { problem, lattice, options: options.clone(), tables })

@@ -4,6 +4,7 @@ use crate::equation::Initial;
 use crate::error::{check_finite, Error, Result};
 use crate::estimate::iv::Settings;
 use crate::estimate::multi_innovation::Innovation;
+use crate::regressors::BANK_LIMIT;
 
 /// Which error ranks the candidates.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -82,6 +83,8 @@ pub struct Options {
     /// Whether to leave a candidate as soon as it cannot be kept, by bound or partial sum; `false` is brute force, the
     /// oracle.
     pub early_stopping: bool,
+    /// Bytes that regressors, their products, test vectors and the layout of an order law may take together.
+    pub memory: u64,
 }
 
 impl Default for Options {
@@ -94,6 +97,7 @@ impl Default for Options {
             keep: 20,
             threads: 1,
             early_stopping: true,
+            memory: BANK_LIMIT,
         }
     }
 }

@@ -452,11 +452,11 @@ def hostile_calls(order, alpha, step, signal, output, values, coefficient, expon
         lambda: _core.trace_errors(rec, structure, inputs, np.array([[coefficient, 1.0]])),
         lambda: _core.search(
             [rec], (output, [alpha, order], [(signal, [order, alpha], True)]), inputs, [None], (False, exponents),
-            ("output-error", "l1", 0, 1.0, False, 5, 1, True, 2), None,
+            ("output-error", "l1", 0, 1.0, False, 5, 1, True, 2, 1 << 31), None,
         ),
         lambda: _core.OrderSearch(
             [rec], (output, [alpha, order], [(signal, [order, alpha], True)]), inputs, [None], (False, exponents),
-            ("equation-error", "l2", 2, coefficient, True, 5, 1, True, 0),
+            ("equation-error", "l2", 2, coefficient, True, 5, 1, True, 0, 1 << 31),
         ).rounds(0, signal, [(output, coefficient)], None, 1, None, None),
         lambda: _core.filter_series([(coefficient, order)], [(1.0, alpha)], 8, step),
         lambda: _core.fractional_integral(means, order, step, "trapezoidal"),

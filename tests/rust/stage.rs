@@ -85,6 +85,7 @@ fn options() -> Options {
         keep: 12,
         threads: 2,
         early_stopping: true,
+        memory: 2 << 30,
     }
 }
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from ftlm.base.checks import check_threads, real_number, whole_number
 from ftlm.base.errors import ModelError
+from ftlm.base.memory import memory_limit
 
 Criterion = Literal["output-error", "equation-error"]
 Coefficients = Literal["multi-innovation", "least-squares", "instrumental-variables"]
@@ -106,12 +107,12 @@ class Settings:
         """Whether m must be a power of two."""
         return self.coefficients == "multi-innovation" and self.rows == "haar"
 
-    def core(self) -> tuple[str, str, int, float, bool, int, int, bool, int]:
-        """As the core takes them."""
+    def core(self) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
+        """As the core takes them; the memory that may be taken is asked for here and now, where the search runs."""
         p = self.innovation_length if self.coefficients == "multi-innovation" else 0
         steps = REFINEMENTS if self.coefficients == "instrumental-variables" else 0
         ranked = (self.criterion, self.norm, p, self.prior_covariance, self.rows == "haar")
-        return *ranked, self.keep, self.threads, self.early_stopping, steps
+        return *ranked, self.keep, self.threads, self.early_stopping, steps, memory_limit()
 
     def to_dict(self) -> dict[str, Any]:
         """For results and reports."""

@@ -106,7 +106,7 @@ def search_orders(
         written.
     ModelError
         Nothing to search, a lattice without or with too many candidates, settings out of range, an option that these
-        coefficients do not use.
+        coefficients do not use; what needs more memory than the machine has left, or than ``FTLM_MEMORY`` allows.
     ConvergenceError
         An executor that has lost its workers.
     KeyboardInterrupt

@@ -20,8 +20,8 @@ use crate::search::stage::Span;
 const REFINED: f64 = 1e-4;
 
 /// (criterion, norm, p or 0 for least squares, K₀, Haar rows, keep, threads, early stopping, steps of instrumental
-/// variables or 0).
-type SettingsTuple = (String, String, usize, f64, bool, usize, usize, bool, usize);
+/// variables or 0, bytes of memory).
+type SettingsTuple = (String, String, usize, f64, bool, usize, usize, bool, usize, u64);
 
 /// Settings of a search but for its initial terms.
 pub struct SettingsArg {
@@ -31,14 +31,16 @@ pub struct SettingsArg {
     keep: usize,
     threads: usize,
     early_stopping: bool,
+    memory: u64,
 }
 
 impl<'py> FromPyObject<'_, 'py> for SettingsArg {
     type Error = PyErr;
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
-        let (criterion, norm, length, prior_covariance, haar, keep, threads, early_stopping, iterations): SettingsTuple =
-            object.extract()?;
+        let given: SettingsTuple = object.extract()?;
+        let (criterion, norm, length, prior_covariance, haar, keep, threads, early_stopping, iterations, memory) =
+            given;
         let unknown = |what: String, remedy: &str| Error::Structure { what, remedy: remedy.into() };
         Ok(Self {
             criterion: match criterion.as_str() {
@@ -65,6 +67,7 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
             keep,
             threads,
             early_stopping,
+            memory,
         })
     }
 }
@@ -72,8 +75,8 @@ impl<'py> FromPyObject<'_, 'py> for SettingsArg {
 impl SettingsArg {
     /// With the initial terms of the records.
     pub fn options(self, terms: InitialArg) -> PyResult<Options> {
-        let Self { criterion, norm, estimator, keep, threads, early_stopping } = self;
-        Ok(Options { criterion, norm, estimator, initial: initial(terms)?, keep, threads, early_stopping })
+        let Self { criterion, norm, estimator, keep, threads, early_stopping, memory } = self;
+        Ok(Options { criterion, norm, estimator, initial: initial(terms)?, keep, threads, early_stopping, memory })
     }
 }
 

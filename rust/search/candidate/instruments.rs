@@ -86,10 +86,10 @@ impl Refiner {
 /// Bank and target behind which the first coefficients are estimated: clean signals, low-passed.
 ///
 /// # Errors
-/// As [`Bank::new`].
+/// As [`Bank::counted`].
 pub(crate) fn start_bank(record: &Record, output: usize, index: &Index) -> Result<(Bank, Vec<f64>)> {
     let band = START_BAND * power_frequency(record.signal(output), record.step());
     let smooth = record.cleaned().through(&low_pass(band, record)?)?;
     let target = smooth.signal(output).to_vec();
-    Ok((Bank::new(index, &smooth, output)?, target))
+    Ok((Bank::counted(index, &smooth, output)?, target))
 }

@@ -5,7 +5,7 @@ use crate::error::{check_finite, Error, Result};
 use crate::estimate::multi_innovation::Rows;
 use crate::haar;
 use crate::lanes::{self, WIDTH};
-use crate::regressors::{Bank, Index, Key, Record, BANK_LIMIT};
+use crate::regressors::{Bank, Index, Key, Record};
 use crate::search::bound::lower::Bound;
 use crate::search::bound::reach::Reach;
 use crate::search::candidate::columns::Columns;
@@ -78,7 +78,6 @@ impl lanes::Kernel for Excluding<'_> {
 }
 
 /// Memory of one thread.
-/// Memory of one thread.
 pub(crate) struct Scratch {
     reach: Reach,
     start: Vec<f64>,
@@ -108,7 +107,7 @@ impl Default for Scratch {
 }
 
 impl Problem {
-    /// Builds banks and Gram matrices for the regressors in `index`.
+    /// Builds banks and Gram matrices for the regressors in `index`, whose memory was counted.
     pub(crate) fn new(
         records: &[Record],
         output: usize,
@@ -127,18 +126,19 @@ impl Problem {
             }
         }
         let width = index.keys().len();
-        // Banks refuse for themselves; products of all columns may need far more.
-        let bytes = 8 * (3 + records.len() as u128) * (width as u128 + 1).pow(2);
-        if bytes > BANK_LIMIT {
-            let m = records.iter().map(Record::m).max().unwrap_or(0);
-            return Err(Error::BankTooLarge { columns: width, m, bytes, limit: BANK_LIMIT });
-        }
         let refined = options.refines();
         // Noise of a measured output that drives an equation would rank like a fault of the equation.
-        let banks = records
-            .iter()
-            .map(|r| if refined { Bank::new(&index, &r.cleaned(), output) } else { Bank::new(&index, r, output) })
-            .collect::<Result<Vec<_>>>()?;
+        let banks =
+            records
+                .iter()
+                .map(|r| {
+                    if refined {
+                        Bank::counted(&index, &r.cleaned(), output)
+                    } else {
+                        Bank::counted(&index, r, output)
+                    }
+                })
+                .collect::<Result<Vec<_>>>()?;
         let targets: Vec<Vec<f64>> = records.iter().map(|r| r.signal(output).to_vec()).collect();
         let samples = records.iter().map(Record::m).sum();
         let elements = (width + 1) * (width + 1);
@@ -171,7 +171,7 @@ impl Problem {
         };
         // D e = w holds for integrals of the output as it was measured.
         let bound_banks = if refined && options.early_stopping && options.criterion == Criterion::OutputError {
-            records.iter().map(|r| Bank::new(&index, &r.cleaned_but(output), output)).collect::<Result<_>>()?
+            records.iter().map(|r| Bank::counted(&index, &r.cleaned_but(output), output)).collect::<Result<_>>()?
         } else {
             Vec::new()
         };

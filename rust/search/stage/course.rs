@@ -11,6 +11,8 @@ use rayon::prelude::*;
 use crate::equation::Structure;
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
+use crate::search::bound::lower::Bound;
+use crate::search::budget::Budget;
 use crate::search::candidate::needed::Needed;
 use crate::search::candidate::problem::{Problem, Scratch};
 use crate::search::control::{another, Control};
@@ -134,13 +136,15 @@ impl<'a> Stage<'a> {
             lattice.check_signals(record.len())?;
         }
         let mut candidates: Vec<Candidates> = equations.iter().map(Candidates::new).collect();
-        let (join, used) = Join::new(&lattice, &mut candidates, pool, control)?;
+        let (join, used) = Join::new(&lattice, &mut candidates, options.memory, pool, control)?;
         if join.tuples() == 0 {
             return Err(Error::EmptyLattice { why: "no tuple of free orders gives orders in range".into() });
         }
         #[allow(clippy::cast_precision_loss)]
         let samples = records.iter().map(Record::m).sum::<usize>() as f64;
-        let mut tables = Vec::with_capacity(equations.len());
+        let mut indices = Vec::with_capacity(equations.len());
+        let mut budget = Budget::default();
+        budget.add_layout(join.bytes());
         for (e, (candidates, used)) in candidates.into_iter().zip(used).enumerate() {
             check_length("fixed coefficients", equations[e].terms.len(), fixed[e].len())?;
             let mut needed = Needed::new(&options.initial);
@@ -149,7 +153,14 @@ impl<'a> Stage<'a> {
                 needed.alpha(structure.order);
                 structure.terms.iter().for_each(|term| needed.term(structure.order, term.signal, term.order));
             }
-            let problem = Problem::new(records, equations[e].output, needed.index(), &fixed[e], options)?;
+            let index = needed.index();
+            budget.add(records, equations[e].output, &index, options, Bound::POOL);
+            indices.push((index, candidates, used));
+        }
+        budget.check(options.memory)?;
+        let mut tables = Vec::with_capacity(equations.len());
+        for (e, (index, candidates, used)) in indices.into_iter().enumerate() {
+            let problem = Problem::new(records, equations[e].output, index, &fixed[e], options)?;
             let problem = pool.install(|| problem.with_bound(used.len() as u64));
             tables.push(Table { problem, candidates, used, scale: scales[e] });
         }

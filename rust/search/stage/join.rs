@@ -77,11 +77,13 @@ pub(super) struct Join {
 
 /// Most rows of both halves: they take a GB.
 const MAX_PARTS: u128 = 40_000_000;
+/// Memory of a row, and as much again while their list grows.
+const ROW: u128 = 2 * size_of::<Part>() as u128;
 /// Free orders whose place in either half is tried; more go to the second.
 const PLACED: usize = 10;
 
 /// The free orders that go to the first half: those that leave the fewest rows.
-fn split(lattice: &LawLattice, rows: &[Sums; 2], control: &Control) -> Result<Vec<usize>> {
+fn split(lattice: &LawLattice, rows: &[Sums; 2], memory: u64, control: &Control) -> Result<Vec<usize>> {
     let axes: Vec<usize> = (0..lattice.axes().len()).collect();
     let size = |axes: &[usize]| axes.iter().map(|&a| lattice.axes()[a].len() as u128).product::<u128>();
     let several: Vec<usize> = axes.iter().copied().filter(|&a| lattice.axes()[a].len() > 1).take(PLACED).collect();
@@ -111,21 +113,27 @@ fn split(lattice: &LawLattice, rows: &[Sums; 2], control: &Control) -> Result<Ve
     if least > MAX_PARTS {
         return Err(Error::LatticeTooLarge { count: least.min(u128::from(lattice.product())), limit: MAX_PARTS });
     }
+    let (bytes, limit) = (ROW * least, u128::from(memory));
+    if bytes > limit {
+        return Err(Error::Memory { what: format!("{least} rows of the layout of the order law"), bytes, limit });
+    }
     Ok(best)
 }
 
 impl Join {
-    /// Lays out the join and the distinct candidates of every equation; marks those that some tuple needs.
+    /// Lays out the join and the distinct candidates of every equation; marks those that some tuple needs. Refuses rows of
+    /// more than so many bytes.
     pub(super) fn new(
         lattice: &LawLattice,
         candidates: &mut [Candidates],
+        memory: u64,
         pool: &rayon::ThreadPool,
         control: &Control,
     ) -> Result<(Self, Vec<Vec<usize>>)> {
         let count = candidates.len();
         let ranges = [0..count.min(1), count.min(1)..count];
         let rows = ranges.clone().map(|range| Sums::new(lattice, range));
-        let own = split(lattice, &rows, control)?;
+        let own = split(lattice, &rows, memory, control)?;
         let other: Vec<usize> = (0..lattice.axes().len()).filter(|axis| !own.contains(axis)).collect();
         let full = |axes: &[usize], rows: &Sums| {
             rows.image(lattice, axes, usize::MAX, control)?
@@ -207,6 +215,11 @@ impl Join {
             }
         }
         Ok(())
+    }
+
+    /// Memory of its rows.
+    pub(super) fn bytes(&self) -> u128 {
+        self.halves.iter().map(|half| (half.parts.capacity() * size_of::<Part>()) as u128).sum()
     }
 
     /// Number of tuples.

@@ -1,0 +1,77 @@
+"""Writes the notices of all crates that the extension links, on any platform; ``--check`` only compares.
+
+python tests/notices.py [--check]
+"""
+
+import argparse
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+FILE = ROOT / "THIRD-PARTY-NOTICES.txt"
+HEAD = """The compiled part of ftlm links the Rust crates below, and the standard library of Rust (its project,
+MIT OR Apache-2.0, whose texts are below, too). Crates that only build or test ftlm are not in it. Written by
+tests/notices.py from Cargo.lock and the crates' own files.
+"""
+#: How files with terms begin.
+TERMS = ("license", "licence", "copying", "notice", "copyright", "unlicense")
+
+
+def linked(metadata):
+    """Packages that end up in the extension: normal dependencies of it or of these, but no macros of the compiler."""
+    packages = {package["id"]: package for package in metadata["packages"]}
+    nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
+    root = metadata["resolve"]["root"]
+    seen, open_ = set(), [root]
+    while open_:
+        here = open_.pop()
+        kinds = {kind for target in packages[here]["targets"] for kind in target["kind"]}
+        if here in seen or "proc-macro" in kinds:
+            continue
+        seen.add(here)
+        for dependency in nodes[here]["deps"]:
+            if any(kind["kind"] is None for kind in dependency["dep_kinds"]):
+                open_.append(dependency["pkg"])
+    return sorted((packages[i] for i in seen - {root}), key=lambda p: (p["name"], p["version"]))
+
+
+def terms(package):
+    """Texts of the files with a package's terms, by name."""
+    folder = Path(package["manifest_path"]).parent
+    files = [p for p in sorted(folder.iterdir()) if p.is_file() and p.name.lower().startswith(TERMS)]
+    return {p.name: p.read_text(encoding="utf-8", errors="replace").strip().replace("\r\n", "\n") for p in files}
+
+
+def notices(metadata):
+    """The notices, each text once; refuse a crate that says nothing of its terms."""
+    texts, crates = {}, []
+    for package in linked(metadata):
+        if not package["license"]:
+            raise SystemExit(f"{package['name']} {package['version']} names no license; look into its source")
+        numbers = [str(texts.setdefault(text, len(texts) + 1)) for text in terms(package).values()]
+        where = f"text {', '.join(numbers)}" if numbers else "no text of its own"
+        by = f"; {', '.join(a.split(' <')[0] for a in package['authors'])}" if package["authors"] else ""
+        crates.append(f"{package['name']} {package['version']}: {package['license']} ({where}){by}")
+    parts = [HEAD, *crates]
+    for text, number in texts.items():
+        parts += ["", "-" * 80, f"Text {number}", "", text]
+    return "\n".join(parts) + "\n"
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true")
+    given = parser.parse_args()
+    call = ["cargo", "metadata", "--format-version", "1", "--locked", "--features", "python"]
+    got = subprocess.run(call, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout
+    made = notices(json.loads(got))
+    if not given.check:
+        FILE.write_text(made, encoding="utf-8")
+    elif FILE.read_text(encoding="utf-8") != made:
+        sys.exit(f"{FILE.name} is not that of Cargo.lock; run python tests/notices.py")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""One limit of memory: asked of the machine or given, kept by a whole search, refused beyond it before allocation."""
+
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm.base.errors import ModelError
+from ftlm.base.memory import GIVEN, SHARE, UNKNOWN, available_memory, memory_limit
+
+REFUSED = re.compile(r"(\d+) regressors of all runs.* need (\d+) bytes, more than the (\d+) that a search may take")
+
+
+def machine(folder, **files):
+    """Files of a system, by their paths with __ for /."""
+    for name, text in files.items():
+        path = folder / name.replace("__", "/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return folder
+
+
+MEMINFO = "MemTotal:       24000000 kB\nMemFree:  1 kB\nMemAvailable:   8000000 kB\n"
+V2 = {
+    "proc__self__cgroup": "0::/jobs/mine\n",
+    "sys__fs__cgroup__jobs__mine__memory.max": "max\n",
+    "sys__fs__cgroup__jobs__mine__memory.current": "7\n",
+    "sys__fs__cgroup__jobs__memory.max": "3000000000\n",
+    "sys__fs__cgroup__jobs__memory.current": "1000000000\n",
+    "sys__fs__cgroup__jobs__memory.stat": "anon 5\ninactive_file 400000000\nfile 9\n",
+}
+V1 = {
+    "proc__self__cgroup": "5:cpu,cpuacct:/other\n4:memory:/box\n",
+    "sys__fs__cgroup__memory__memory.limit_in_bytes": "9223372036854771712\n",
+    "sys__fs__cgroup__memory__memory.usage_in_bytes": "1\n",
+    "sys__fs__cgroup__memory__box__memory.limit_in_bytes": "500000000\n",
+    "sys__fs__cgroup__memory__box__memory.usage_in_bytes": "100000000\n",
+}
+
+
+@pytest.mark.parametrize(
+    ("files", "left"),
+    [
+        ({"proc__meminfo": MEMINFO}, 8_000_000 << 10),
+        ({"proc__meminfo": MEMINFO, **V2}, 2_400_000_000),
+        ({"proc__meminfo": MEMINFO, **V1}, 400_000_000),
+        ({"proc__meminfo": MEMINFO, "proc__self__cgroup": "nonsense\n1:memory\n0::/../..\n"}, 8_000_000 << 10),
+        (dict(V1), 400_000_000),
+        ({**V1, "sys__fs__cgroup__memory__box__memory.usage_in_bytes": "600000000\n"}, 1),
+    ],
+    ids=["kernel", "groups", "older groups", "strange groups", "groups alone", "beyond its limit"],
+)
+def test_a_machine_is_asked_what_it_has_left(tmp_path, monkeypatch, files, left):
+    monkeypatch.delenv(GIVEN, raising=False)
+    system = machine(tmp_path, **files)
+    assert available_memory(system) == left
+    assert memory_limit(system) == int(SHARE * left)
+
+
+def test_a_machine_that_tells_nothing_gives_what_is_safe(tmp_path, monkeypatch):
+    monkeypatch.delenv(GIVEN, raising=False)
+    assert available_memory(tmp_path) > 1 << 20
+    monkeypatch.setattr("os.sysconf", lambda _: (_ for _ in ()).throw(ValueError), raising=False)
+    assert available_memory(tmp_path) is None
+    assert memory_limit(tmp_path) == UNKNOWN
+
+
+def test_this_machine_answers():
+    assert 1 << 20 < memory_limit() < 1 << 50
+
+
+SIZES = {"1": 1, "12345": 12345, "3K": 3072, "2GiB": 2 << 30, "512M": 512 << 20, " 1T ": 1 << 40, "7MB": 7 << 20}
+
+
+@pytest.mark.parametrize("text", SIZES)
+def test_a_limit_that_is_given_counts(monkeypatch, text):
+    monkeypatch.setenv(GIVEN, text)
+    assert memory_limit() == SIZES[text]
+
+
+@pytest.mark.parametrize("text", ["0", "-1", "2 GiB", "much", "1e9", "nan", "٣", "9" * 18 + "T", "0x10"])
+def test_a_limit_that_is_none_is_refused(monkeypatch, text):
+    monkeypatch.setenv(GIVEN, text)
+    with pytest.raises(ModelError, match=r"FTLM_MEMORY=.* is no size of memory"):
+        memory_limit()
+
+
+def runs(count, length=200):
+    rng = np.random.default_rng(0)
+    t = np.arange(length) * 0.05
+    made = []
+    for k in range(count):
+        u = np.sign(np.sin((1 + k) * t))
+        y = ftlm.fractional_integral(u, 1.4, step=0.05) + 0.01 * rng.standard_normal(length)
+        made.append(ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=0.05))
+    return made
+
+
+ONE = ftlm.equation("D^alpha y = a D^beta y + b u", initial="rest")
+LAW = ftlm.flexible_link(form="published")
+CASES = {
+    "one equation": (ONE, {"coefficients": "least-squares"}),
+    "by recursion": (ONE, {"coefficients": "multi-innovation"}),
+    "by instruments": (ONE, {"coefficients": "instrumental-variables"}),
+    "brute force": (ONE, {"coefficients": "least-squares", "early_stopping": False}),
+}
+
+
+def search(structure, runs, **options):
+    lattice = ftlm.lattice(step=0.1) if structure is ONE else ftlm.Lattice(step=0.1, orders={"alpha": (1.9, 2.0)})
+    return ftlm.search_orders(runs, structure, lattice, m=64, keep=5, **options)
+
+
+def needed(monkeypatch, structure, runs, **options):
+    """Columns and bytes that a search says it needs."""
+    monkeypatch.setenv(GIVEN, "1")
+    with pytest.raises(ModelError) as refused:
+        search(structure, runs, **options)
+    assert "or allow more by FTLM_MEMORY" in str(refused.value)
+    told = REFUSED.search(str(refused.value))
+    return int(told[1]), int(told[2])
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_the_border_is_exact_and_all_runs_count(monkeypatch, case):
+    structure, options = CASES[case]
+    of_one = runs(1)
+    columns, one = needed(monkeypatch, structure, of_one, **options)
+    same, three = needed(monkeypatch, structure, 3 * of_one, **options)
+    assert columns == same
+    # A bank of each run at least.
+    assert three - one >= 2 * 8 * 64 * columns
+    monkeypatch.setenv(GIVEN, str(one))
+    found = search(structure, of_one, **options)
+    monkeypatch.setenv(GIVEN, str(one - 1))
+    with pytest.raises(ModelError, match=f"need {one} bytes, more than the {one - 1} that"):
+        search(structure, of_one, **options)
+    monkeypatch.delenv(GIVEN)
+    assert str(search(structure, of_one, **options)) == str(found)
+
+
+def test_a_layout_and_the_banks_of_all_its_equations_count_together(monkeypatch, plant, drive):
+    run = plant("A").simulate(drive("A", samples=201), tolerance=1e-5)
+    options = {"coefficients": "least-squares"}
+    monkeypatch.setenv(GIVEN, "1")
+    with pytest.raises(ModelError, match="rows of the layout of the order law need") as refused:
+        search(LAW, [run], **options)
+    layout = int(re.search(r"need (\d+) bytes", str(refused.value))[1])
+    monkeypatch.setenv(GIVEN, str(layout))
+    search(LAW, [run], **options)
+    with pytest.raises(ModelError) as refused:
+        search(LAW, [run] * 300, **options)
+    assert "and the layout of the order law need" in str(refused.value)
+    both = int(REFUSED.search(str(refused.value))[2])
+    assert both > layout
+    monkeypatch.setenv(GIVEN, str(layout - 1))
+    with pytest.raises(ModelError, match=f"rows of the layout of the order law need {layout} bytes"):
+        search(LAW, [run], **options)
+
+
+TOO_LARGE = """
+import numpy as np, resource, ftlm
+run = ftlm.Run.from_arrays(inputs={"u": np.ones(65537)}, outputs={"y": np.arange(65537.0)}, step=0.05)
+equation = ftlm.equation("D^alpha y = a D^beta y + b u", initial="rest")
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+try:
+    ftlm.search_orders(run, equation, ftlm.lattice(step=0.005), coefficients="least-squares", m=1 << 16)
+except ftlm.ModelError as error:
+    print(error)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="peaks are counted in kB on Linux")
+def test_what_is_too_large_is_refused_before_it_is_allocated(monkeypatch):
+    monkeypatch.setenv(GIVEN, "300M")
+    done = subprocess.run([sys.executable, "-c", TOO_LARGE], capture_output=True, text=True, check=True, timeout=60)
+    message, peak = done.stdout.splitlines()
+    told = REFUSED.search(message)
+    assert int(told[2]) > 400 << 20
+    assert int(told[3]) == 300 << 20
+    assert int(peak) << 10 < 60 << 20, "its regressors alone would take several times that"
