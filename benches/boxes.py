@@ -1,8 +1,9 @@
 """Growth of an exact order search with its lattice: Plant A's deflection, steps 0.05 to 0.005, and the real arm's.
 
-``python benches/boxes.py [--steps 0.05 0.02 0.01] [--write]`` prints candidates, seconds of processors and of clock, what
-became of the candidates, and the growth from each step to the next: the exponent of the candidates that the processor time
-follows. ``--psf FILE`` adds a measured run (CSV) of the arm; ``--write`` appends all to benches/RESULTS.md.
+``python benches/boxes.py [--steps 0.05 0.02 0.01] [--write]`` prints candidates, seconds of processors and of clock,
+what became of the candidates, and the growth from each step to the next: the exponent of the candidates that the
+processor time follows. ``--psf FILE`` adds a measured run (CSV) of the arm; ``--write`` appends all to
+benches/RESULTS.md.
 """
 
 from __future__ import annotations

@@ -170,28 +170,30 @@ impl<const L: usize> Screen<L> {
             open.push(Open { index, bound, guess });
         }
     }
-    /// Screens the first `count` of these candidates at rest: index, and columns of the two terms that vary in a slab
-    /// with these columns.
+
+    /// Screens these candidates, at most L, at rest: index, and columns of the two terms that vary in a slab with these
+    /// columns.
     #[inline(always)]
     pub(crate) fn these(
         &mut self,
         catalogue: &Catalogue<'_>,
         slab: &Slab,
         columns: &[usize],
-        candidates: &[(u64, usize, usize); L],
-        count: usize,
+        candidates: &[(u64, usize, usize)],
         limit: f64,
         found: &mut (Vec<Open>, Vec<u64>),
     ) {
         for (positions, &column) in self.positions.iter_mut().zip(columns) {
             *positions = Columns::one(column);
         }
-        let outer: [usize; L] = std::array::from_fn(|n| candidates[n].1);
-        let inner: [usize; L] = std::array::from_fn(|n| candidates[n].2);
+        let Some(last) = candidates.last() else { return };
+        let of = |n: usize| candidates.get(n).unwrap_or(last);
+        let outer: [usize; L] = std::array::from_fn(|n| of(n).1);
+        let inner: [usize; L] = std::array::from_fn(|n| of(n).2);
         for (term, at) in [(slab.outer, outer), (slab.inner, inner)] {
             self.positions[term].at = at;
             self.positions[term].compare();
         }
-        self.judge(catalogue, std::array::from_fn(|n| candidates[n].0), count, limit, found);
+        self.judge(catalogue, std::array::from_fn(|n| of(n).0), candidates.len().min(L), limit, found);
     }
 }

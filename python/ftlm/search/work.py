@@ -88,7 +88,7 @@ class EquationWork(Work["_core._Found"]):
         return _core.OrderSearch(*self.core())
 
     def plan(self, algorithm: int | None = None) -> tuple[int, list[int], int]:
-        """Candidates, where each wave of rounds ends by an earlier algorithm or this one, and the number of this one."""
+        """Candidates, where each wave of rounds ends by this or an earlier algorithm, and the number of this one."""
         return _core.search_plan(self.orders, self.inputs, self.initial, self.settings.core(), algorithm)
 
     @property

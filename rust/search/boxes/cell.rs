@@ -162,8 +162,8 @@ impl<'a> Slab<'a> {
         let corners = [self.product(u0, v0), self.product(u1, v0), self.product(u0, v1), self.product(u1, v1)];
         let off = wu * pu.curve + wv * pv.curve + self.others.rounding * self.others.trace * sums * sums;
         let b_most = corners.iter().fold(0.0_f64, |m, b| m.max(b.abs())) + off;
-        // Written so that what is not a number proves nothing.
-        if !(b_most < 1.0) {
+        // What is not a number proves nothing.
+        if b_most.is_nan() || b_most >= 1.0 {
             return 0.0;
         }
         let left = 1.0 - b_most * b_most;

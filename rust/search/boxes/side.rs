@@ -117,8 +117,8 @@ impl Side {
             others.solve(shared, raw);
             let left = 1.0 - shared.iter().zip(raw.iter()).map(|(g, a)| g * a).sum::<f64>();
             let sum = 1.0 + raw.iter().map(|a| a.abs()).sum::<f64>();
-            // Written so that what is not a number ends here too.
-            if !(left > 1e3 * others.rounding * others.trace * sum * sum) {
+            // What is not a number ends here too.
+            if left.is_nan() || left <= 1e3 * others.rounding * others.trace * sum * sum {
                 return None;
             }
             scale[i] = 1.0 / left.sqrt();

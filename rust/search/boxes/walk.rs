@@ -154,7 +154,7 @@ impl lanes::Kernel for Walk<'_> {
                             waiting[count] = (index, ready.sides[0].columns[row], ready.sides[1].columns[value]);
                             count += 1;
                             if count == WIDTH {
-                                screen.these(catalogue, slab, &columns, &waiting, count, limit, &mut found);
+                                screen.these(catalogue, slab, &columns, &waiting[..count], limit, &mut found);
                                 count = 0;
                             }
                         }
@@ -163,9 +163,7 @@ impl lanes::Kernel for Walk<'_> {
             }
         }
         if count > 0 {
-            let last = waiting[count - 1];
-            waiting[count..].fill(last);
-            screen.these(catalogue, slab, &columns, &waiting, count, limit, &mut found);
+            screen.these(catalogue, slab, &columns, &waiting[..count], limit, &mut found);
         }
         Some(found)
     }
