@@ -285,8 +285,8 @@ impl Side {
                     for g in 0..groups {
                         let mut node = below.nodes[left * groups + g];
                         let mut most = |part: usize, with: &Wide| {
-                            for n in 0..WIDTH {
-                                node.bent[part][n] = node.bent[part][n].max(with[n]);
+                            for (most, with) in node.bent[part].iter_mut().zip(with) {
+                                *most = most.max(*with);
                             }
                         };
                         let other = &below.nodes[right * groups + g];
