@@ -30,7 +30,7 @@ fn problem(random: &mut Random) -> (Vec<Record>, Lattice) {
         .map(|_| {
             let m = 60 + random.below(140);
             let rest = record(step, vec![vec![0.0; m], random.steps(m, 40), random.steps(m, 25)]);
-            let mut y = respond(&[truth.clone()], &rest, &[]).unwrap().remove(0);
+            let mut y = respond(std::slice::from_ref(&truth), &rest, &[]).unwrap().remove(0);
             y.iter_mut().for_each(|v| *v += noise * random.normal());
             with_signal(&rest, 0, y)
         })
