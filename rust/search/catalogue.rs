@@ -72,6 +72,11 @@ impl<'a> Catalogue<'a> {
         &self.tables[cursor.block()][term]
     }
 
+    /// Columns of the values of one term in a block.
+    pub(crate) fn columns(&self, block: usize, term: usize) -> &[usize] {
+        &self.tables[block][term]
+    }
+
     /// Goes to the next candidate and its columns.
     #[inline(always)]
     pub(crate) fn next(&self, cursor: &mut Cursor<'_>, terms: &mut [usize]) {

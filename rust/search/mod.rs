@@ -3,6 +3,7 @@
 //! lattice ([`points`]). All speak of [`options`], [`outcome`] and [`control`].
 
 pub mod bound;
+pub mod boxes;
 mod budget;
 mod candidate;
 mod catalogue;

@@ -5,6 +5,7 @@ use crate::search::candidate::columns::{part_of, Columns};
 use crate::search::candidate::normal::Solve;
 use crate::search::catalogue::Catalogue;
 use crate::search::lattice::cursor::Cursor;
+use crate::search::lattice::slab::Slab;
 use crate::search::spread::spread;
 
 /// A candidate that its bound has not excluded.
@@ -65,7 +66,7 @@ impl lanes::Kernel for Screening<'_> {
 }
 
 /// Memory of a screening of L candidates side by side.
-struct Screen<const L: usize> {
+pub(crate) struct Screen<const L: usize> {
     solve: Solve<L>,
     positions: Vec<Columns<L>>,
     initial: Vec<usize>,
@@ -78,7 +79,7 @@ struct Screen<const L: usize> {
 }
 
 impl<const L: usize> Screen<L> {
-    fn new(width: usize) -> Self {
+    pub(crate) fn new(width: usize) -> Self {
         Self {
             solve: Solve::new(),
             positions: vec![Columns::new([0; L]); width],
@@ -98,9 +99,9 @@ impl<const L: usize> Screen<L> {
         cursor: &mut Cursor<'_>,
         index: u64,
         limit: f64,
-        (open, singular): &mut (Vec<Open>, Vec<u64>),
+        found: &mut (Vec<Open>, Vec<u64>),
     ) {
-        let Self { solve, positions, initial, terms, columns, coefficients, weights } = self;
+        let Self { positions, initial, terms, .. } = self;
         catalogue.initial(cursor, initial);
         if let Some((term, digit)) = cursor.stretch(L) {
             for (columns, &column) in positions.iter_mut().zip(terms.iter()) {
@@ -119,14 +120,27 @@ impl<const L: usize> Screen<L> {
             }
             positions.iter_mut().for_each(Columns::compare);
         }
+        self.judge(catalogue, std::array::from_fn(|n| index + n as u64), L, limit, found);
+    }
+
+    /// Screens the candidates whose columns have been laid out.
+    #[inline(always)]
+    fn judge(
+        &mut self,
+        catalogue: &Catalogue<'_>,
+        indices: [u64; L],
+        count: usize,
+        limit: f64,
+        (open, singular): &mut (Vec<Open>, Vec<u64>),
+    ) {
+        let Self { solve, positions, initial, columns, coefficients, weights, .. } = self;
         let failed = catalogue.problem.equations.solve(positions, initial, solve);
         #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
         let squares = match &catalogue.problem.squares {
             Some(squares) => Some(squares.error(positions, &solve.coefficients)),
             None => None,
         };
-        for n in 0..L {
-            let index = index + n as u64;
+        for (n, &index) in indices.iter().enumerate().take(count) {
             if failed[n] {
                 singular.push(index);
                 continue;
@@ -155,5 +169,31 @@ impl<const L: usize> Screen<L> {
             }
             open.push(Open { index, bound, guess });
         }
+    }
+
+    /// Screens these candidates, at most L, at rest: index, and columns of the two terms that vary in a slab with these
+    /// columns.
+    #[inline(always)]
+    pub(crate) fn these(
+        &mut self,
+        catalogue: &Catalogue<'_>,
+        slab: &Slab,
+        columns: &[usize],
+        candidates: &[(u64, usize, usize)],
+        limit: f64,
+        found: &mut (Vec<Open>, Vec<u64>),
+    ) {
+        for (positions, &column) in self.positions.iter_mut().zip(columns) {
+            *positions = Columns::one(column);
+        }
+        let Some(last) = candidates.last() else { return };
+        let of = |n: usize| candidates.get(n).unwrap_or(last);
+        let outer: [usize; L] = std::array::from_fn(|n| of(n).1);
+        let inner: [usize; L] = std::array::from_fn(|n| of(n).2);
+        for (term, at) in [(slab.outer, outer), (slab.inner, inner)] {
+            self.positions[term].at = at;
+            self.positions[term].compare();
+        }
+        self.judge(catalogue, std::array::from_fn(|n| of(n).0), candidates.len().min(L), limit, found);
     }
 }

@@ -111,6 +111,8 @@ def test_a_store_is_written_as_it_was_then(folder, tmp_path, monkeypatch, name):
         ftlm.search_orders(make.run(), structure, lattice, **options)
     now, then = payloads(path), payloads(folder / f"{name}.ftlm")
     assert (now[0].pop("version"), then[0].pop("version")) == (ftlm.__version__, folder.name)
+    # Small lattices are searched as they were by the first algorithm.
+    assert (now[0].pop("algorithm"), then[0].pop("algorithm")) == (frames.ALGORITHM, 1)
     # Compared as bytes: the order of keys counts.
     assert msgspec.msgpack.encode(now[0]) == msgspec.msgpack.encode(then[0])
     assert {tuple(frame) for frame in now[1:]} == {tuple(frame) for frame in then[1:]}

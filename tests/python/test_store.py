@@ -114,7 +114,7 @@ def test_rounds_do_not_depend_on_how_they_are_cut_up(run):
     """R4: any number of threads, any stretch of rounds, in any order."""
     job = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32, early_stopping=False)
     work = job.equation_work()
-    count, ends = work.plan()
+    count, ends, _ = work.plan()
     assert count == 19_295
     assert ends == [1, 3, 5]
     ready = work.ready()
@@ -271,7 +271,7 @@ def test_a_store_cut_at_any_byte_holds_only_right_rows_and_goes_on(run, whole, e
 def test_a_half_done_stretch_of_another_visiting_order_is_done_again(run, whole, expected, tmp_path, order):
     """Its candidates would be followed twice or never: the table is that of an uninterrupted search all the same."""
     _, digest, end = frames.next_frame(memoryview(whole), len(MAGIC), bytes(frames.DIGEST))
-    _, (wave, *_) = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32).equation_work().plan()
+    _, (wave, *_), _ = job_of(run, ftlm.equation(EQUATION, initial="rest"), COARSE, m=32).equation_work().plan()
     found = contents_of("whole", memoryview(whole)).sections[0].done[0].part
     # A row that would win, were it believed.
     rows = ((found[0][0][0], 0.0, *found[0][0][2:]),)
@@ -692,11 +692,11 @@ def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_w
     finished, half = tmp_path / "finished.ftlm", tmp_path / "half.ftlm"
     finished.write_bytes(whole)
     half.write_bytes(whole[: len(whole) // 2])
-    monkeypatch.setattr("ftlm.search.frames.ALGORITHM", 2)
+    monkeypatch.setattr("ftlm.search.frames.ALGORITHM", 3)
     assert bytes_of(ftlm.resume_search(finished)["y"]) == expected
     assert finished.read_bytes() == whole
     kept = read_store(half).end
-    with pytest.raises(ftlm.DataError, match=r"follow algorithm 1; this version's is 2: finish the search with that"):
+    with pytest.raises(ftlm.DataError, match=r"follow algorithm 2; this version's is 3: finish the search with that"):
         ftlm.resume_search(half)
     assert half.read_bytes() == whole[:kept]
 

@@ -6,6 +6,7 @@
 mod common;
 
 mod bindings;
+mod boxes;
 mod equation;
 mod estimators;
 mod fractional;

@@ -18,7 +18,10 @@ MAGIC = b"ftlm search store 1\n"
 HEAD = struct.Struct("<II")
 DIGEST = 16
 #: Number of the algorithm that rounds follow; rounds of different ones must not be joined.
-ALGORITHM = 1
+ALGORITHM = 2
+#: Earlier ones whose half-finished stores go on where the rounds of a search have not changed since: 2 screens lattices
+#: of 2²⁵ candidates and more in boxes and in longer rounds, and leaves all others as they were.
+CONTINUED = (1,)
 #: Largest payload: a table of 100 000 rows of many coefficients is far below.
 MAX_PAYLOAD = 1 << 30
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]

@@ -32,7 +32,8 @@ def search_equation(
     """Search the orders of one equation: at once here, or in rounds with a store (its search `number`) or executor."""
     if store is None and executor is None:
         return work.search(progress)
-    return _do(EquationCourse(work), store, number, executor, progress)
+    algorithm = None if store is None else store.contents.algorithm
+    return _do(EquationCourse(work, algorithm), store, number, executor, progress)
 
 
 def search_stage(
@@ -61,6 +62,8 @@ def _do(
         for held in _held(section, first, end):
             course.take(held)
         left = list(_left(section, first, end))
+        if left and store is not None and not course.goes_on:
+            raise store.outdated()
         if executor is None:
             pieces = course.here(left, progress, save)
         else:

@@ -174,15 +174,20 @@ class Store:
         self._end += len(data)
         self._last = time.monotonic()
 
+    def outdated(self) -> DataError:
+        """Say why a search that another version began does not go on."""
+        held = self.contents
+        return DataError(
+            f"store {self.path} is of ftlm {held.version}, whose rounds follow algorithm {held.algorithm}; this "
+            f"version's is {frames.ALGORITHM}: finish the search with that version, or start it again in another "
+            "file"
+        )
+
     def _append(self, added: Sequence[frames.Frame]) -> None:
         held = self.contents
-        if held.algorithm != frames.ALGORITHM:
+        if held.algorithm not in (frames.ALGORITHM, *frames.CONTINUED):
             # A finished search is only read, whatever made it.
-            raise DataError(
-                f"store {self.path} is of ftlm {held.version}, whose rounds follow algorithm {held.algorithm}; this "
-                f"version's is {frames.ALGORITHM}: finish the search with that version, or start it again in another "
-                "file"
-            )
+            raise self.outdated()
         data, digest, offset = [], self._digest, self._end
         for frame in added:
             payload = frames.ENCODER.encode(frame)

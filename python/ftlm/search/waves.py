@@ -30,6 +30,8 @@ Save = Callable[[int, int, Checkpoint | None], None]
 class Course(ABC, Generic[Done, Table]):
     """A search on its way: candidates done and in all, and the wave that is being done."""
 
+    #: Whether what an earlier version began may be gone on with.
+    goes_on = True
     #: Whether the core itself tells of progress in what is done here.
     core_tells = False
 
@@ -78,9 +80,10 @@ class EquationCourse(Course[Rounds, "_core._Found"]):
     core_tells = True
     work: EquationWork
 
-    def __init__(self, work: EquationWork) -> None:
+    def __init__(self, work: EquationWork, algorithm: int | None = None) -> None:
         super().__init__(work, Pace())
-        self.total, self._ends = work.plan()
+        self.total, self._ends, present = work.plan(algorithm)
+        self.goes_on = algorithm is None or algorithm >= present
         self._parts: list[Part] = []
         self._seed: list[tuple[int, float]] = []
 

@@ -87,9 +87,9 @@ class EquationWork(Work["_core._Found"]):
         """Build what all rounds share."""
         return _core.OrderSearch(*self.core())
 
-    def plan(self) -> tuple[int, list[int]]:
-        """Candidates, and where each wave of rounds ends."""
-        return _core.search_plan(self.orders, self.inputs, self.initial, self.settings.core())
+    def plan(self, algorithm: int | None = None) -> tuple[int, list[int], int]:
+        """Candidates, where each wave of rounds ends by this or an earlier algorithm, and the number of this one."""
+        return _core.search_plan(self.orders, self.inputs, self.initial, self.settings.core(), algorithm)
 
     @property
     def samples(self) -> int:

@@ -84,7 +84,8 @@ impl Found {
     }
 }
 
-/// Candidates of a search, and where each wave of its rounds ends.
+/// Candidates of a search, where each wave of its rounds ends by this algorithm or the present one, and whose number that
+/// is.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
 pub fn search_plan(
@@ -93,11 +94,14 @@ pub fn search_plan(
     inputs: Vec<bool>,
     terms: InitialArg,
     settings: SettingsArg,
-) -> PyResult<(u64, Vec<u64>)> {
+    algorithm: Option<u64>,
+) -> PyResult<(u64, Vec<u64>, u64)> {
     let options = settings.options(terms)?;
     detached(py, || {
         let count = orders.lattice(&inputs)?.count();
-        Ok((count, rounds::waves(rounds::rounds(count, &options))))
+        let present = rounds::algorithm(count, &options);
+        let all = rounds::rounds_by(algorithm.unwrap_or(present).min(present), count, &options);
+        Ok((count, rounds::waves(all), present))
     })
 }
 

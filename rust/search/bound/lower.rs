@@ -111,6 +111,11 @@ impl Bound {
         Self { norm, probes }
     }
 
+    /// The test vectors on every record.
+    pub(crate) fn probes(&self) -> &[Probes] {
+        &self.probes
+    }
+
     /// Number of test vectors.
     pub(crate) fn len(&self) -> usize {
         self.probes.first().map_or(0, |p| p.groups * WIDTH)

@@ -1,7 +1,7 @@
 //! What is proved of a candidate's output error from a few inner products with test vectors, without running it.
 
 pub mod lower;
-mod probes;
+pub(crate) mod probes;
 pub(crate) mod reach;
 mod vectors;
 

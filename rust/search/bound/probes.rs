@@ -7,27 +7,27 @@ use crate::search::bound::vectors::{effects, vectors, Wide};
 use crate::search::options::Norm;
 
 /// A column without an effect on the divisor.
-pub(super) const NONE: usize = usize::MAX;
+pub(crate) const NONE: usize = usize::MAX;
 
 /// The test vectors on one record: what they make of each column.
-pub(super) struct Probes {
+pub(crate) struct Probes {
     /// Number of [`Wide`] groups of test vectors.
-    pub(super) groups: usize,
+    pub(crate) groups: usize,
     /// ⟨t, x⟩ of column p and group g at p·groups + g, real and imaginary part.
-    pub(super) products: Vec<[Wide; 2]>,
+    pub(crate) products: Vec<[Wide; 2]>,
     /// ⟨t, y⟩.
-    pub(super) target: Vec<[Wide; 2]>,
+    pub(crate) target: Vec<[Wide; 2]>,
     /// Row of `effects` of a column, [`NONE`] where it is not of the output itself.
-    pub(super) rows: Vec<usize>,
+    pub(crate) rows: Vec<usize>,
     /// g·‖t‖ (real, imaginary) and ‖Fᵀt − g t‖.
-    pub(super) effects: Vec<[Wide; 3]>,
+    pub(crate) effects: Vec<[Wide; 3]>,
     /// ‖t‖ in the dual norm.
-    pub(super) size: Vec<Wide>,
+    pub(crate) size: Vec<Wide>,
     /// What rounding may add to |⟨t, w⟩| per unit of a column's coefficient, and for the target.
-    pub(super) rounding: Vec<f64>,
-    pub(super) target_rounding: f64,
+    pub(crate) rounding: Vec<f64>,
+    pub(crate) target_rounding: f64,
     /// What rounding may add to a sum of m terms, per unit.
-    pub(super) unit: f64,
+    pub(crate) unit: f64,
 }
 
 impl Probes {

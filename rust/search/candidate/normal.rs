@@ -10,7 +10,7 @@ use crate::search::candidate::columns::Columns;
 use crate::small::{packed, solve_lanes};
 
 /// Normal equations over a bank's columns, weighted as the estimator asks, scaled to a diagonal of ones.
-pub(super) struct Normal {
+pub(crate) struct Normal {
     width: usize,
     /// Correlation matrix, row-major width × width; rows of columns that vanish are 0.
     correlation: Vec<f64>,
@@ -37,6 +37,22 @@ impl Normal {
         }
         let rhs = (0..width).map(|p| gram[p * stride + width] * inverse[p]).collect();
         Self { width, correlation, rhs, size, inverse }
+    }
+
+    /// Correlation of two columns.
+    #[inline(always)]
+    pub(crate) fn product(&self, a: usize, b: usize) -> f64 {
+        self.correlation[a * self.width + b]
+    }
+
+    /// Products of the columns, of unit size, with the target.
+    pub(crate) fn rhs(&self) -> &[f64] {
+        &self.rhs
+    }
+
+    /// Inverse size of each column, 0 for one that vanishes.
+    pub(crate) fn inverse(&self) -> &[f64] {
+        &self.inverse
     }
 }
 
@@ -71,6 +87,11 @@ impl NormalEquations {
     pub(super) fn new(terms: Normal, parts: Vec<Normal>, fixed: &[Option<f64>]) -> Self {
         let free = (0..fixed.len()).filter(|&k| fixed[k].is_none()).collect();
         Self { terms, parts, fixed: fixed.to_vec(), free }
+    }
+
+    /// The equations over all records where no coefficient is known and there are no initial terms.
+    pub(crate) fn whole(&self) -> Option<&Normal> {
+        (self.parts.is_empty() && self.free.len() == self.fixed.len()).then_some(&self.terms)
     }
 
     /// Known coefficients of the terms.

@@ -199,8 +199,8 @@ impl Problem {
             // Two transforms for each own column and test vector; the products cost as much as a transform or so.
             let each = 2 * own + 4;
             #[allow(clippy::cast_possible_truncation)]
-            let groups =
-                (candidates * transforms / 4 / (each * WIDTH as u64)).min((Bound::POOL / WIDTH) as u64) as usize;
+            let groups = (candidates.saturating_mul(transforms) / 4 / (each * WIDTH as u64))
+                .min((Bound::POOL / WIDTH) as u64) as usize;
             if groups > 0 {
                 self.bound = Some(Bound::new(banks, &self.targets, self.options.norm, output_error, groups * WIDTH));
             }
@@ -211,6 +211,16 @@ impl Problem {
     /// Whether coefficients are refined after a first estimate.
     pub(crate) fn refines(&self) -> bool {
         self.refiner.is_some()
+    }
+
+    /// Regressors on every record.
+    pub(crate) fn banks(&self) -> &[Bank] {
+        &self.banks
+    }
+
+    /// Size of the output over all records.
+    pub(crate) fn size(&self) -> f64 {
+        self.targets.iter().flatten().map(|y| y * y).sum::<f64>().sqrt()
     }
 
     /// Samples of all records.

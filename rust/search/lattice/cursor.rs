@@ -145,6 +145,12 @@ impl<'a> Cursor<'a> {
         true
     }
 
+    /// Positions of the orders that complete a group's prefix.
+    pub(crate) fn completions(&self, group: usize) -> Vec<usize> {
+        let set = &self.completions[group];
+        std::iter::successors(set.next(0), |&digit| set.next(digit + 1)).collect()
+    }
+
     /// Number of the block.
     pub(crate) fn block(&self) -> usize {
         self.block

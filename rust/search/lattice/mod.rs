@@ -4,6 +4,7 @@
 pub(crate) mod cursor;
 pub mod independent;
 pub mod law;
+pub(crate) mod slab;
 mod tuples;
 
 pub use independent::{Lattice, TermAxis, MAX_CANDIDATES};

@@ -5,10 +5,12 @@ use std::sync::atomic::Ordering;
 use rayon::prelude::*;
 
 use crate::error::Result;
+use crate::search::boxes::{screen_slab, Boxes, LEAST};
 use crate::search::candidate::problem::Scratch;
 use crate::search::catalogue::Catalogue;
 use crate::search::control::{Checkpoint, Control, Place};
 use crate::search::lattice::cursor::Cursor;
+use crate::search::lattice::slab::Slab;
 use crate::search::outcome::{Failure, Kept, Part, Row, Verdict, LISTED};
 use crate::search::screen::{by_guess, screen, Open};
 use crate::search::threads::PerThread;
@@ -26,6 +28,7 @@ const REFINED: (u64, u64) = (32, 1024);
 /// Some rounds of a search at work.
 pub(super) struct Hunt<'a> {
     pub(super) catalogue: &'a Catalogue<'a>,
+    boxes: Option<&'a Boxes>,
     pub(super) pool: &'a rayon::ThreadPool,
     control: &'a Control,
     scratches: PerThread<Scratch>,
@@ -36,8 +39,13 @@ pub(super) struct Hunt<'a> {
 }
 
 impl<'a> Hunt<'a> {
-    pub(super) fn new(catalogue: &'a Catalogue<'a>, pool: &'a rayon::ThreadPool, control: &'a Control) -> Self {
-        Self { catalogue, pool, control, scratches: PerThread::new(pool), part: Part::default(), anew: true }
+    pub(super) fn new(
+        catalogue: &'a Catalogue<'a>,
+        boxes: Option<&'a Boxes>,
+        pool: &'a rayon::ThreadPool,
+        control: &'a Control,
+    ) -> Self {
+        Self { catalogue, boxes, pool, control, scratches: PerThread::new(pool), part: Part::default(), anew: true }
     }
 
     pub(super) fn check_stop(&self) -> Result<()> {
@@ -51,14 +59,17 @@ impl<'a> Hunt<'a> {
         let (limit, resumed) = (kept.limit, place.end > 0);
         let (catalogue, control) = (self.catalogue, self.control);
         let parts: Vec<(Vec<Open>, Vec<u64>)> = self.pool.install(|| {
-            (0..(end - start).div_ceil(CHUNK))
-                .into_par_iter()
-                .map(|chunk| {
-                    let (lo, hi) = (start + chunk * CHUNK, end.min(start + (chunk + 1) * CHUNK));
+            self.chunks(start, end, limit)
+                .par_iter()
+                .with_max_len(1)
+                .map(|(lo, hi, slab)| {
+                    let (lo, hi) = (*lo, *hi);
                     if control.stopped() {
                         return Default::default();
                     }
-                    let found = screen(catalogue, lo, hi, limit);
+                    let boxes = slab.as_ref().zip(self.boxes);
+                    let boxed = boxes.and_then(|(slab, boxes)| screen_slab(catalogue, boxes, slab, (lo, hi), limit));
+                    let found = boxed.unwrap_or_else(|| screen(catalogue, lo, hi, limit));
                     let closed = hi - lo - (found.0.len() + found.1.len()) as u64;
                     if !resumed {
                         control.count(closed + found.1.len() as u64, closed);
@@ -87,6 +98,27 @@ impl<'a> Hunt<'a> {
             self.part.failures.extend(singular.into_iter().take(LISTED).map(|index| (index, Failure::Singular)));
         }
         self.follow(&open, kept, place, true).map(|()| true)
+    }
+
+    /// The candidates of a round in chunks: those of a large slab together, others a few at a time.
+    fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<Slab>)> {
+        let mut chunks = Vec::new();
+        let mut at = start;
+        while at < end {
+            let boxed = self.boxes.filter(|_| limit < f64::INFINITY).and_then(|_| self.catalogue.lattice.slab(at));
+            if let Some(slab) = boxed {
+                let to = end.min(slab.hi);
+                if to - at >= LEAST {
+                    chunks.push((at, to, Some(slab)));
+                    at = to;
+                    continue;
+                }
+            }
+            let to = end.min(at + CHUNK);
+            chunks.push((at, to, None));
+            at = to;
+        }
+        chunks
     }
 
     /// Follows open candidates in this order from a place on; what is learnt goes to `kept`, and to the counts and

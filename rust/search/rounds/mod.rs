@@ -5,5 +5,5 @@ mod plan;
 mod ready;
 mod scouts;
 
-pub use plan::{rounds, waves};
+pub use plan::{algorithm, rounds, rounds_by, waves};
 pub use ready::{search, Search};

@@ -12,24 +12,46 @@ use crate::search::options::Options;
 const ROUND_PLAIN: u64 = 1 << 18;
 const ROUND_BOUNDED: u64 = 1 << 16;
 const ROUND_FOLLOWED: u64 = 1 << 12;
+/// Candidates from which on boxes may screen ([`crate::search::boxes`]), in rounds that grow with the lattice up to the
+/// longest: the tables of boxes that two rounds share are made twice.
+pub(super) const BOXED: u64 = 1 << 25;
+const ROUND_LONGEST: u64 = 1 << 22;
 /// Refined candidates that are followed without scouts, one round of them.
 pub(super) const FEW: u64 = ROUND_FOLLOWED;
 
-/// Candidates in a round of a search with these options.
-pub(super) fn round_length(options: &Options) -> u64 {
+/// Number of the algorithm by which the rounds of a search over so many candidates are cut and done.
+#[must_use]
+pub fn algorithm(candidates: u64, options: &Options) -> u64 {
+    if candidates < BOXED || options.refines() || !options.early_stopping || options.scored_by_products() {
+        1
+    } else {
+        2
+    }
+}
+
+/// Candidates in a round of a search over so many, by this algorithm.
+pub(super) fn round_length(candidates: u64, options: &Options, algorithm: u64) -> u64 {
     if options.refines() || !options.early_stopping {
         ROUND_FOLLOWED
     } else if options.scored_by_products() {
         ROUND_PLAIN
-    } else {
+    } else if algorithm < 2 {
         ROUND_BOUNDED
+    } else {
+        (candidates / (BOXED / ROUND_BOUNDED)).next_power_of_two().clamp(ROUND_BOUNDED, ROUND_LONGEST)
     }
 }
 
 /// Rounds of a search over so many candidates.
 #[must_use]
 pub fn rounds(candidates: u64, options: &Options) -> u64 {
-    candidates.div_ceil(round_length(options))
+    rounds_by(algorithm(candidates, options), candidates, options)
+}
+
+/// The same by an earlier algorithm, whose finished rounds are still to be read.
+#[must_use]
+pub fn rounds_by(algorithm: u64, candidates: u64, options: &Options) -> u64 {
+    candidates.div_ceil(round_length(candidates, options, algorithm))
 }
 
 /// Where each wave of so many rounds ends: 1, 3, 7, …

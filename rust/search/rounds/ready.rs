@@ -9,13 +9,14 @@ use std::sync::atomic::Ordering;
 
 use crate::error::Result;
 use crate::regressors::Record;
+use crate::search::boxes::Boxes;
 use crate::search::catalogue::Catalogue;
 use crate::search::control::{another, Checkpoint, Control, Place};
 use crate::search::lattice::independent::Lattice;
 use crate::search::options::Options;
 use crate::search::outcome::{Counts, Kept, Outcome, Part, Row};
 use crate::search::rounds::hunt::Hunt;
-use crate::search::rounds::plan::{round_length, rounds, waves, FEW};
+use crate::search::rounds::plan::{algorithm, round_length, rounds, waves, BOXED, FEW};
 use crate::search::spread::visit;
 use crate::search::threads::pool;
 
@@ -63,6 +64,8 @@ pub fn search(
 /// A search over a lattice, ready for its rounds.
 pub struct Search<'a> {
     catalogue: Catalogue<'a>,
+    /// Where whole boxes of candidates are excluded at once.
+    boxes: Option<Boxes>,
     /// No candidate above this raw score can be kept, as far as scouts can tell.
     limit: f64,
 }
@@ -88,14 +91,17 @@ impl<'a> Search<'a> {
         // Scouts of a few candidates, each refined, would cost as much as the search.
         let few = problem.refines() && count <= FEW;
         if few || (problem.bound.is_none() && problem.squares.is_none()) {
-            return Ok(Self { catalogue, limit: f64::INFINITY });
+            return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
         }
-        let (limit, which) = Hunt::new(&catalogue, pool, control).scout()?;
+        let pay = count >= BOXED && Boxes::pay(&catalogue);
+        let (limit, which) = Hunt::new(&catalogue, None, pool, control).scout(pay)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
             problem.bound = problem.bound.take().map(|bound| bound.chosen(&which));
         }
-        Ok(Self { catalogue, limit })
+        let boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
+        control.check_stop()?;
+        Ok(Self { catalogue, boxes, limit })
     }
 
     /// Does rounds `first … last − 1` of one wave.
@@ -139,7 +145,7 @@ impl<'a> Search<'a> {
     ) -> Result<Part> {
         let Catalogue { lattice, options, .. } = &self.catalogue;
         let count = lattice.count();
-        let (all, length) = (rounds(count, options), round_length(options));
+        let (all, length) = (rounds(count, options), round_length(count, options, algorithm(count, options)));
         let begun = from.is_none();
         let from = from.unwrap_or_else(|| Checkpoint { place: Place::start(first), anew: true, part: Part::default() });
         if !(first <= from.place.round && from.place.round <= last && last <= all) {
@@ -158,7 +164,7 @@ impl<'a> Search<'a> {
         self.check(&from.part)?;
         // Rounds are spread over the lattice, so that early waves see all of it and later ones get a good limit.
         let order = visit(all);
-        let mut hunt = Hunt::new(&self.catalogue, pool, control);
+        let mut hunt = Hunt::new(&self.catalogue, self.boxes.as_ref(), pool, control);
         let Checkpoint { mut place, part, .. } = from;
         control.total.store(count, Ordering::Relaxed);
         let known = part.counts.done();

@@ -21,7 +21,8 @@ const VECTORS: usize = 16;
 const GUESSED: u64 = 1 << 18;
 
 impl Hunt<'_> {
-    pub(super) fn scout(&mut self) -> Result<(f64, Option<Vec<usize>>)> {
+    /// A first limit, and the test vectors to work with: all of them, the best first, where `all` is true.
+    pub(super) fn scout(&mut self, all: bool) -> Result<(f64, Option<Vec<usize>>)> {
         let catalogue = self.catalogue;
         let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
         let count = lattice.count();
@@ -75,14 +76,14 @@ impl Hunt<'_> {
         // Where no coefficients are known yet all test vectors count.
         let which = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
             let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
-            choose(&each, bound.len(), limit)
+            choose(&each, if all { bound.len() } else { VECTORS.min(bound.len()) }, limit)
         });
         Ok((limit, which))
     }
 }
 
 /// The test vectors that together exclude most of a sample, those that exclude most by themselves first.
-fn choose(each: &[Vec<f64>], count: usize, limit: f64) -> Vec<usize> {
+fn choose(each: &[Vec<f64>], wanted: usize, limit: f64) -> Vec<usize> {
     let mut open: Vec<bool> = vec![true; each.len()];
     let mut chosen: Vec<usize> = Vec::new();
     // Where one excludes no more than another the smaller threshold tells: how near it comes.
@@ -90,7 +91,8 @@ fn choose(each: &[Vec<f64>], count: usize, limit: f64) -> Vec<usize> {
         let values = each.iter().zip(open).filter(|(_, open)| **open).map(|(e, _)| e[j]);
         values.fold((0, 0.0), |(n, sum), v| (n + usize::from(v > limit), sum + v / (v + limit).max(f64::MIN_POSITIVE)))
     };
-    while chosen.len() < VECTORS.min(count) {
+    let count = each.first().map_or(0, Vec::len);
+    while chosen.len() < wanted.min(count) {
         let best = (0..count)
             .filter(|j| !chosen.contains(j))
             .map(|j| (gain(j, &open), j))

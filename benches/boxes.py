@@ -1,0 +1,64 @@
+"""Growth of an exact order search with its lattice: Plant A's deflection, steps 0.05 to 0.005, and the real arm's.
+
+``python benches/boxes.py [--steps 0.05 0.02 0.01] [--write]`` prints candidates, seconds of processors and of clock,
+what became of the candidates, and the growth from each step to the next: the exponent of the candidates that the
+processor time follows. ``--psf FILE`` adds a measured run (CSV) of the arm; ``--write`` appends all to
+benches/RESULTS.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import ftlm
+from results import append, heading
+from search import M, plant_a_run
+
+STEPS = (0.05, 0.02, 0.01, 0.005)
+
+
+def main() -> None:
+    """Search, time, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=float, nargs="+", default=STEPS)
+    parser.add_argument("--noise", type=float, nargs="+", default=(1e-4, 1e-3), help="deviation on both angles [rad]")
+    parser.add_argument("--psf", type=Path, help="a measured run of the arm's first stage")
+    parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
+    arguments = parser.parse_args()
+    equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
+    runs = {f"Plant A, {noise:g} rad": plant_a_run(noise, noise) for noise in arguments.noise}
+    if arguments.psf is not None:
+        runs[arguments.psf.stem] = ftlm.load(arguments.psf)
+    lines = [heading()]
+    print(lines[0], flush=True)
+    for name, run in runs.items():
+        before: tuple[int, float] | None = None
+        for step in arguments.steps:
+            wall, cpu = time.perf_counter(), time.process_time()
+            found = ftlm.search_orders(
+                run, equation, ftlm.lattice(step=step, alpha=(1.05, 2.0)), coefficients="least-squares", m=M
+            )
+            wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+            grown = ""
+            if before is not None:
+                exponent = math.log(cpu / before[1]) / math.log(found.candidates / before[0])
+                grown = f", growth as candidates^{exponent:.2f}"
+            before = found.candidates, cpu
+            best = ", ".join(f"{n} {v:g}" for n, v in found.table[0].orders.items())
+            lines.append(
+                f"{name}, step {step:g}: {found.candidates} candidates, {cpu:.1f} s of processors, {wall:.1f} s, "
+                f"{cpu / found.candidates * 1e9:.1f} ns each{grown}; bound {found.pruned['bound']}, stopped early "
+                f"{found.pruned['stopped early']}, beaten {found.pruned['beaten']}; best {found.table[0].score:.6g} "
+                f"({best}), last kept {found.table[-1].score:.6g}"
+            )
+            print(lines[-1], flush=True)
+    if arguments.write:
+        append([f"- {line}" for line in lines])
+
+
+if __name__ == "__main__":
+    main()

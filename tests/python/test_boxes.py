@@ -1,0 +1,50 @@
+"""Order searches over lattices that are screened in boxes, beside the same candidates one by one."""
+
+import pytest
+
+import ftlm
+from test_store import EQUATION, bytes_of
+
+#: From this many candidates on boxes screen.
+BOXED = 1 << 25
+
+pytestmark = pytest.mark.slow
+
+
+def search(run, *, alpha=(1.05, 2.0), store=None, threads=2):
+    equation = ftlm.equation(EQUATION, initial="rest")
+    options = {"coefficients": "least-squares", "m": 64, "threads": threads, "store": store}
+    return ftlm.search_orders(run, equation, ftlm.lattice(step=0.015, alpha=alpha), **options)
+
+
+def rows_of(found):
+    return [(row.score, dict(row.orders), dict(row.coefficients)) for row in found.table]
+
+
+@pytest.fixture(scope="module")
+def run(small_run, with_noise):
+    return with_noise(small_run, 0.003, 1)
+
+
+@pytest.fixture(scope="module")
+def whole(run):
+    return search(run)
+
+
+def test_boxes_keep_the_table_of_one_by_one(run, whole):
+    assert whole.candidates >= BOXED
+    parts = [search(run, alpha=alpha) for alpha in ((1.05, 1.8), (1.815, 2.0))]
+    assert sum(part.candidates for part in parts) == whole.candidates
+    assert all(part.candidates < BOXED for part in parts)
+    rows = sorted((row for part in parts for row in rows_of(part)), key=lambda row: row[0])
+    assert rows_of(whole) == rows[: len(whole.table)]
+    assert sum(whole.pruned.values()) + len(whole.table) == whole.candidates
+
+
+def test_boxes_give_the_same_bits_for_any_threads_in_a_store_and_when_cut(run, whole, tmp_path):
+    path = tmp_path / "s.ftlm"
+    assert bytes_of(search(run, store=path, threads=1)) == bytes_of(whole)
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+    assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
+    assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)

@@ -1,0 +1,110 @@
+//! Boxes of orders: no box's bound exceeds a score of its candidates, and boxes change no table.
+
+use ftlm::equation::Initial;
+use ftlm::regressors::Record;
+use ftlm::search::boxes::{box_bounds, left_open, Boxed};
+use ftlm::search::control::Control;
+use ftlm::search::lattice::{Lattice, TermAxis};
+use ftlm::search::options::{Norm, Options};
+use ftlm::search::rounds::search;
+use ftlm::simulate::respond;
+
+use crate::common::{equation, record, with_signal, Random};
+
+fn grid(random: &mut Random, highest: f64, most: usize) -> Vec<f64> {
+    let count = 2 + random.below(most - 1);
+    let from = random.uniform(0.0, 0.3 * highest);
+    let step = 10.0_f64.powf(random.uniform(-3.3, -1.0)).min((highest - from) / count as f64);
+    // Orders as people space them, and sometimes not.
+    let uneven = random.chance(0.2);
+    let values = (0..count).map(|i| from + step * (i as f64 + if uneven { random.uniform(0.0, 0.9) } else { 0.0 }));
+    values.collect()
+}
+
+/// Records and a lattice whose candidates are one slab for each order of the terms that do not vary.
+fn problem(random: &mut Random) -> (Vec<Record>, Lattice) {
+    let noise = 10.0_f64.powf(random.uniform(-5.0, -1.0));
+    let truth = equation(0, 1.6, &[(0, 0.9, -2.0), (0, 0.0, -9.0), (1, 0.3, 1.5), (2, 0.0, 6.0)]);
+    let step = random.uniform(0.01, 0.05);
+    let records = (0..1 + random.below(2))
+        .map(|_| {
+            let m = 60 + random.below(140);
+            let rest = record(step, vec![vec![0.0; m], random.steps(m, 40), random.steps(m, 25)]);
+            let mut y = respond(std::slice::from_ref(&truth), &rest, &[]).unwrap().remove(0);
+            y.iter_mut().for_each(|v| *v += noise * random.normal());
+            with_signal(&rest, 0, y)
+        })
+        .collect();
+    let alpha = random.uniform(0.8, 2.2);
+    let axis = |signal: usize, values: Vec<f64>| TermAxis { signal, values, interchangeable: true };
+    let own = grid(random, 0.9 * alpha, 24);
+    let mut axes = vec![axis(0, own.clone())];
+    if random.chance(0.6) {
+        axes.push(axis(0, own));
+    }
+    axes.push(axis(1, grid(random, alpha, 24)));
+    if random.chance(0.7) {
+        axes.push(axis(2, vec![random.uniform(-0.3, 0.5)]));
+    }
+    (records, Lattice::new(0, &[alpha], &axes, |s| s == 2).unwrap())
+}
+
+#[test]
+fn no_bound_of_a_box_exceeds_a_score_of_its_candidates() {
+    let mut random = Random::new(901);
+    let (mut boxes, mut telling, mut large, mut best) = (0, 0, 0, 0.0_f64);
+    let (mut asked, mut open) = (0, 0);
+    for _ in 0..60 {
+        let (records, lattice) = problem(&mut random);
+        let norm = if random.chance(0.7) { Norm::L1 } else { Norm::L2 };
+        let samples: usize = records.iter().map(Record::m).sum();
+        // Brute force, which asks no bound.
+        let options =
+            Options { norm, keep: 10_000, early_stopping: false, initial: Initial::Rest, ..Options::default() };
+        let fixed = vec![None; lattice.width()];
+        let found = search(&records, &lattice, &fixed, &options, &Control::default()).unwrap();
+        let mut scores = vec![f64::INFINITY; lattice.count() as usize];
+        for row in &found.rows {
+            // A root of a mean of squares becomes a sum again, up to rounding.
+            let raw = match norm {
+                Norm::L1 => row.score,
+                Norm::L2 => row.score * row.score * samples as f64 * (1.0 + 1e-12),
+            };
+            scores[row.index as usize] = raw;
+        }
+        let mut ranked: Vec<f64> = scores.clone();
+        ranked.sort_by(f64::total_cmp);
+        for index in [0, lattice.count() / 2, lattice.count() - 1] {
+            let limit = ranked[random.below(ranked.len().min(20))];
+            let (from, to) = (random.below(scores.len()) as u64 / 2, lattice.count());
+            let left = left_open(&records, &lattice, norm, index, from..to, limit).unwrap();
+            let all = box_bounds(&records, &lattice, norm, index).unwrap();
+            if let Some(slab) = all.iter().max_by_key(|b| b.rows * b.values) {
+                let within = slab.first.max(from)..slab.first + slab.rows * slab.stride;
+                assert!(left.iter().all(|i| within.contains(i)));
+                let reach = within.clone().filter(|&i| scores[i as usize] <= limit * (1.0 - 1e-9));
+                for i in reach {
+                    assert_eq!(left.iter().filter(|&&j| i == j).count(), 1, "candidate {i} is within reach");
+                }
+                (asked, open) = (asked + within.count(), open + left.len());
+            }
+            for Boxed { first, rows, values, stride, bound } in all {
+                let all = (0..rows).flat_map(|i| (0..values).map(move |j| first + i * stride + j));
+                let least = all.map(|i| scores[i as usize]).fold(f64::INFINITY, f64::min);
+                assert!(bound <= least, "box of {rows} by {values} from {first}: bound {bound:e}, score {least:e}");
+                boxes += 1;
+                if least.is_finite() {
+                    best = best.max(bound / least);
+                    telling += usize::from(bound > 0.1 * least);
+                    large += usize::from(bound > 0.1 * least && rows * values >= 16);
+                }
+            }
+        }
+    }
+    println!(
+        "{boxes} boxes, {telling} bounds within a factor of ten, {large} of 16 candidates or more, best {best:.3}"
+    );
+    println!("{open} of {asked} candidates left open");
+    assert!(asked - open > 500);
+    assert!(boxes > 90_000 && telling > 20_000 && large > 2_000);
+}
