@@ -159,6 +159,7 @@ fn order_search(c: &mut Criterion) {
             keep: 20,
             threads: 1,
             early_stopping: true,
+            memory: 2 << 30,
         };
         group.bench_function(name, |b| {
             b.iter(|| search(&records, &lattice, &[None; 4], &options, &Control::default()));

@@ -69,6 +69,7 @@ fn main() -> Result<()> {
         keep: 3,
         threads: 2,
         early_stopping: true,
+        ..Options::default()
     };
     let outcome = search(std::slice::from_ref(&record), &lattice, &[None; 3], &options, &Control::default())?;
     println!("{} candidates; the best:", outcome.counts.candidates);

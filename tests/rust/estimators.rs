@@ -410,7 +410,7 @@ fn a_bank_beyond_memory_is_refused_before_it_is_made() {
     }
     // Own columns count twice: for the column and for the kernel.
     let bytes = 8 * m as u128 * 400;
-    let refused = Error::BankTooLarge { columns: 200, m, bytes, limit: BANK_LIMIT };
+    let refused = Error::BankTooLarge { columns: 200, m, bytes, limit: u128::from(BANK_LIMIT) };
     assert_eq!(Bank::new(&index, &record, 0).err(), Some(refused));
 }
 

@@ -347,6 +347,7 @@ fn a_search_refines_every_candidate_as_refining_it_alone_does() {
         keep: 10,
         threads,
         early_stopping,
+        memory: 2 << 30,
     };
     let run = |threads, stopping| {
         let records = [noisy.clone()];
@@ -431,7 +432,8 @@ fn what_no_coefficients_can_bring_below_the_kept_ones_is_left_out_and_nothing_el
             let settings = Settings { iterations: 3, tolerance: 1e-4 };
             let estimator = Estimator::InstrumentalVariables(settings);
             let (criterion, initial) = (Criterion::OutputError, initial.clone());
-            let options = Options { criterion, norm, estimator, initial, keep, threads, early_stopping };
+            let memory = 2 << 30;
+            let options = Options { criterion, norm, estimator, initial, keep, threads, early_stopping, memory };
             search(&records, &lattice, &[None; 3], &options, &Control::default()).unwrap()
         };
         let (brute, found) = (run(2, false), run(1, true));

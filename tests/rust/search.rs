@@ -259,6 +259,7 @@ fn random_problem(seed: u64) -> Problem {
         keep: 1 + random.below(8),
         threads: 1,
         early_stopping: true,
+        memory: 2 << 30,
     };
     Problem { records, lattice, fixed, options }
 }
