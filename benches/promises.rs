@@ -204,6 +204,7 @@ fn options(threads: usize) -> Options {
         keep: 20,
         threads,
         early_stopping: true,
+        memory: 2 << 30,
     }
 }
 
