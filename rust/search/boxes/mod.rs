@@ -2,7 +2,7 @@
 //!
 //! Over a slab of the lattice two orders alone vary ([`crate::search::lattice::slab`]). What the candidate bound is made
 //! of ([`crate::search::bound::lower`]) is tabled along each of the two once for the slab ([`side`]), laid over a box by
-//! its corners with proved remainders ([`cell`]), and boxes are halved until they are excluded or small ([`walk`]).
+//! its corners with proved remainders ([`cell`]), and boxes are halved until they are excluded or small (`walk`).
 
 mod cell;
 mod differences;
