@@ -237,7 +237,7 @@ pub fn fit(model: &FrictionModel, experiments: &[Experiment], start: &Start, set
 /// [`fit`], until it is told to stop.
 ///
 /// # Errors
-/// As [`fit`]; [`Error::Interrupted`].
+/// As [`fit`]; [`crate::error::Error::Interrupted`].
 pub fn fit_until(
     model: &FrictionModel,
     experiments: &[Experiment],
