@@ -332,8 +332,8 @@ def _read(
                 if structure.measured_through(name) and np.all(np.isfinite(means[i])):
                     gain[i] = high_frequency_gain(structure.sensor_filter)
                     # What the filter of a body that may stick still held, of impulses as powers below.
-                    degree = structure.sensor_filter.relative_degree
-                    held[i] = terms[name].get(-float(degree), 0.0) * leading_gain(structure.sensor_filter)
+                    if degree := structure.sensor_filter.relative_degree:
+                        held[i] = terms[name].get(-float(degree), 0.0) * leading_gain(structure.sensor_filter)
                     rest[i] = _core.series_multiply(series, means[i], rec.m)
                     if drive is not None:
                         rest[i] -= gain[i] * drive[i]
