@@ -16,7 +16,7 @@ def test_a_wheel_without_terms_or_with_a_folder_of_its_maker_is_seen(tmp_path):
     with zipfile.ZipFile(path, "w") as wheel:
         wheel.writestr("a/LICENSE", "free")
         wheel.writestr("a/THIRD-PARTY-NOTICES.txt", "free, too")
-        wheel.writestr("a/_core.so", b"\0/house/me/src/lib.rs\0/homely/lib.rs")
+        wheel.writestr("a/_core.so", b"\0/house/me/src/lib.rs\0/housely/lib.rs")
     assert WHEEL["lacks"](path, []) == []
     assert WHEEL["lacks"](path, ["/house/you", "/house/m", "/hous", "/"]) == []
     assert WHEEL["lacks"](path, ["/house/me"]) == ["a/_core.so names /house/me"]
