@@ -39,9 +39,9 @@ lint: $(VENV)/.built
 test-rust:
 	cargo test --release
 
-# A file is the work of one of two workers, so that what its tests share is made once.
+# A file is the work of one of two workers (tests/python/conftest.py).
 test-python: $(VENV)/.built
-	$(BIN)/python -m pytest -n 2 --dist loadgroup
+	$(BIN)/python -m pytest -n 2
 
 test-slow: $(VENV)/.built
 	$(BIN)/python -m pytest -m slow --timeout 7200

@@ -10,6 +10,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import pytest
 from hypothesis import settings
+from xdist.scheduler import LoadScopeScheduling
 
 import ftlm
 
@@ -21,11 +22,17 @@ settings.register_profile("ftlm", derandomize=True, deadline=None)
 settings.load_profile("ftlm")
 
 
-def pytest_collection_modifyitems(items):
-    """One worker takes a file; those tests of several files that share the dear reproduction go to one as well."""
-    for item in items:
-        shared = "reproduction" in getattr(item, "fixturenames", ())
-        item.add_marker(pytest.mark.xdist_group("reproduction" if shared else item.path.stem))
+class ByFile(LoadScopeScheduling):
+    """One worker takes a file, so that what its tests share is made once; those of the dear reproduction go to one."""
+
+    def _split_scope(self, nodeid):
+        file = nodeid.split("::", 1)[0]
+        return "reproduction" if file.endswith(("test_browser.py", "test_reproduction.py")) else file
+
+
+def pytest_xdist_make_scheduler(config, log):
+    """Groups of pytest-xdist 3.8 are marked in names that pytest 9.2 no longer reads."""
+    return ByFile(config, log)
 
 
 @pytest.fixture(scope="session")
