@@ -66,7 +66,7 @@ def lacks(path, folders):
 if __name__ == "__main__":
     if sys.argv[1:2] in (["--holds"], ["--nameless"]):
         named = folders() if sys.argv[1] == "--nameless" else []
-        sys.exit("\n".join(f"{path}: {words}" for path in sys.argv[2:] for words in lacks(path, named)))
+        sys.exit("\n".join(f"{path}: {words}" for path in sys.argv[2:] for words in lacks(path, named)) or None)
     found = json.load(sys.stdin)
     wrong = faults(found)
     if wrong:

@@ -1,8 +1,8 @@
 //! What a search will hold at once, counted before any of it is made, and the one limit that it keeps to.
 //!
 //! Counted is what grows with records and lattice: columns, kernels, their products, spectra and test vectors of every
-//! equation and record, rows of the layout of an order law. Not counted are the records themselves, and what each thread
-//! needs for one candidate: some vectors of the record's length.
+//! equation and record, rows of the layout of an order law; tables of boxes take of what is left, or there are none. Not
+//! counted are the records themselves, and what each thread needs for one candidate: some vectors of the record's length.
 
 use crate::error::{Error, Result};
 use crate::fft::{fast_length, Bin};
@@ -61,6 +61,11 @@ impl Budget {
         self.columns += index.keys().len();
     }
 
+    /// Bytes that are left of a limit.
+    pub(crate) fn left(&self, limit: u64) -> u64 {
+        u128::from(limit).saturating_sub(self.bytes).try_into().unwrap_or(u64::MAX)
+    }
+
     /// Refuses what does not fit.
     ///
     /// # Errors
@@ -73,5 +78,20 @@ impl Budget {
         let layout = if self.layout > 0 { " and the layout of the order law" } else { "" };
         let what = format!("{} regressors of all runs, their products and test vectors{layout}", self.columns);
         Err(Error::Memory { what, bytes: self.bytes, limit })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_left_of_a_limit_is_never_below_nothing() {
+        let mut budget = Budget::default();
+        assert_eq!(budget.left(u64::MAX), u64::MAX);
+        budget.add_layout(1000);
+        assert_eq!([999, 1000, 1500].map(|limit| budget.left(limit)), [0, 0, 500]);
+        budget.add_layout(u128::from(u64::MAX));
+        assert_eq!(budget.left(u64::MAX), 0);
     }
 }

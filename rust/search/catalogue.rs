@@ -18,6 +18,8 @@ pub(crate) struct Catalogue<'a> {
     pub(crate) problem: Problem,
     pub(crate) lattice: Cow<'a, Lattice>,
     pub(crate) options: Options,
+    /// What is left of the memory limit [bytes].
+    pub(crate) spare: u64,
     /// Column of each value of each term, per block of the lattice.
     tables: Vec<Vec<Vec<usize>>>,
 }
@@ -47,10 +49,11 @@ impl<'a> Catalogue<'a> {
         let (output, index, mut budget) = (lattice.output(), needed.index(), Budget::default());
         budget.add(records, output, &index, options, Bound::POOL);
         budget.check(options.memory)?;
+        let spare = budget.left(options.memory);
         let problem = Problem::new(records, output, index, fixed, options)?;
         let problem = pool.install(|| problem.with_bound(lattice.count()));
         let tables = tables(&lattice, &problem)?;
-        Ok(Self { problem, lattice, options: options.clone(), tables })
+        Ok(Self { problem, lattice, options: options.clone(), spare, tables })
     }
 
     /// Columns of the terms where a walk stands.

@@ -5,12 +5,13 @@ use std::sync::{Mutex, PoisonError};
 
 use crate::error::{Error, Result};
 use crate::search::outcome::Part;
+use crate::stop::Stop;
 
 /// Shared with the caller while a search runs: any thread may read the counters, stop the search, take its checkpoints.
 #[derive(Debug, Default)]
 pub struct Control {
     /// Set to end the search with [`Error::Interrupted`].
-    pub stop: AtomicBool,
+    pub stop: Stop,
     /// Candidates dealt with so far.
     pub done: AtomicU64,
     /// Candidates in all, once known.
@@ -41,15 +42,11 @@ impl Control {
 
     /// Refuses to go on once the caller has asked to stop.
     pub(crate) fn check_stop(&self) -> Result<()> {
-        if self.stopped() {
-            Err(Error::Interrupted)
-        } else {
-            Ok(())
-        }
+        self.stop.check()
     }
 
     pub(crate) fn stopped(&self) -> bool {
-        self.stop.load(Ordering::Relaxed)
+        self.stop.is_set()
     }
 
     /// Counts candidates as done, and so many of them as left early.

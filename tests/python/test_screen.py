@@ -17,7 +17,7 @@ WORDS = "D^2 y = a y + d D y + c0 s + c1 D s + c2 D^2 s + c3 v"
 class Alone:
     """Work done one after another."""
 
-    def spread(self, work, items):
+    def quietly(self, work, items):
         return [work(item) for item in items]
 
 

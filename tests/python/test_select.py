@@ -242,7 +242,7 @@ def test_fits_on_threads_end_with_the_flag(runs):
             return call()
 
         with pytest.raises(KeyboardInterrupt):
-            work.spread(item, [0])
+            work.quietly(item, [0])
 
     joint = work.fitted(structure, [start])
     stopped(lambda: work.fitted(structure, []))

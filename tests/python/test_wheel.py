@@ -2,6 +2,8 @@
 
 import re
 import runpy
+import subprocess
+import sys
 import tomllib
 import zipfile
 from pathlib import Path
@@ -23,6 +25,20 @@ def test_a_wheel_without_terms_or_with_a_folder_of_its_maker_is_seen(tmp_path):
     with zipfile.ZipFile(path, "w") as wheel:
         wheel.writestr("a/LICENSE", "free")
     assert WHEEL["lacks"](path, []) == ["it lacks THIRD-PARTY-NOTICES.txt"]
+
+
+def test_the_check_of_a_wheel_ends_with_its_verdict(tmp_path):
+    path = tmp_path / "a.whl"
+    call = [sys.executable, str(ROOT / "tests" / "wheel.py"), "--holds", str(path)]
+    for names, code, told in (
+        (("LICENSE", "THIRD-PARTY-NOTICES.txt"), 0, ""),
+        (("LICENSE",), 1, f"{path}: it lacks THIRD-PARTY-NOTICES.txt\n"),
+    ):
+        with zipfile.ZipFile(path, "w") as wheel:
+            for name in names:
+                wheel.writestr(f"a/{name}", "free")
+        done = subprocess.run(call, capture_output=True, text=True, timeout=60, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (code, "", told)
 
 
 def test_linked_is_what_normal_dependencies_reach():

@@ -85,6 +85,6 @@ fn orders_that_make_no_equation_are_infinitely_bad_and_bad_numbers_are_refused()
     assert!(fast.scores(&wrong, f64::INFINITY, 1, &Control::default()).is_err());
     assert!(Points::new(Vec::new(), 0, vec![0], vec![false], Norm::L1).is_err());
     let control = Control::default();
-    control.stop.store(true, std::sync::atomic::Ordering::Relaxed);
+    control.stop.set();
     assert!(fast.scores(&points, f64::INFINITY, 1, &control).is_err());
 }

@@ -555,7 +555,7 @@ fn long_problem() -> Problem {
 fn a_search_ends_when_told_to() {
     let problem = long_problem();
     let control = Control::default();
-    control.stop.store(true, Ordering::Relaxed);
+    control.stop.set();
     let found = search(&problem.records, &problem.lattice, &problem.fixed, &problem.options, &control);
     assert_eq!(found, Err(Error::Interrupted));
     assert_eq!(control.done.load(Ordering::Relaxed), 0);
@@ -567,7 +567,7 @@ fn a_search_ends_when_told_to() {
         while control.done.load(Ordering::Relaxed) < 500 && !run.is_finished() {
             std::thread::yield_now();
         }
-        control.stop.store(true, Ordering::Relaxed);
+        control.stop.set();
         assert_eq!(run.join().unwrap(), Err(Error::Interrupted));
     });
     assert_eq!(control.total.load(Ordering::Relaxed), 313_845);
@@ -779,7 +779,7 @@ fn a_stretch_of_rounds_goes_on_from_any_checkpoint() {
                         while watched.done.load(Relaxed) < end && !finished.load(Relaxed) {
                             std::thread::yield_now();
                         }
-                        watched.stop.store(true, Relaxed);
+                        watched.stop.set();
                     });
                     let found = run(&ready, from.clone(), &control);
                     finished.store(true, Relaxed);

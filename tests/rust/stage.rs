@@ -457,7 +457,7 @@ fn a_stage_search_ends_when_told_to_and_checks_its_arguments() {
     let lattice = LawLattice::new(&axes(), &two_link(), &INPUTS).unwrap();
     let records = [data(100, 0.01, 73)];
     let control = Control::default();
-    control.stop.store(true, Ordering::Relaxed);
+    control.stop.set();
     let found = search(&records, &lattice, &free(), &[1.0; 2], &options(), &control);
     assert_eq!(found, Err(Error::Interrupted));
     let run = |fixed: &[Vec<Option<f64>>], scales: &[f64], options: &Options| {

@@ -71,7 +71,7 @@ class Work:
         self.known += len(items)
         return self._in_order(work, items, self._told)
 
-    def spread(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+    def quietly(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
         """The same of work that is no candidate's fit."""
         return self._in_order(work, items, lambda: None)
 

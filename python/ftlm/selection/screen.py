@@ -54,7 +54,7 @@ CHUNK = 16
 class Pool(Protocol):
     """What does work for items in their order."""
 
-    def spread(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
+    def quietly(self, work: Callable[[Item], Made], items: Sequence[Item]) -> list[Made]:
         """Work done for each item."""
 
 
@@ -271,7 +271,7 @@ def judged_subsets(
     def all_of(points: Sequence[tuple[float, ...]]) -> list[tuple[tuple[float, ...], Floats]]:
         asked = [p for p in points if ground.stable(p)]
         chunks = [asked[k : k + CHUNK] for k in range(0, len(asked), CHUNK)]
-        made = [g for part in pool.spread(one, chunks) for g in part]
+        made = [g for part in pool.quietly(one, chunks) for g in part]
         return [(p, g) for p, g in zip(asked, made, strict=True) if g is not None]
 
     there = all_of(list(ground.lattice()) if points is None else points)
@@ -318,9 +318,6 @@ def _products(
     rows = np.vstack([np.asarray(outcome["jacobian"])[places], np.asarray(outcome["residuals"])])
     if not np.isfinite(rows).all():
         return None
-    # What is evaluated may have moved the columns' coefficients to their optimum: here they are 0.
-    moved = np.asarray(outcome["coefficients"])[places]
-    rows[-1] -= moved @ rows[:-1]
     return np.stack([rows[:, a:b] @ rows[:, a:b].T for a, b in itertools.pairwise(ends)])
 
 

@@ -131,7 +131,7 @@ def _chosen(work: Work, folds: Folds) -> Selection:
     best = ranked[0]
     near = [k for k, t in enumerate(ranked) if t.failed is None and t.grows == best.grows and _as_good(t, best)]
     # What the grid leaves is a fraction of an order, and to a criterion of thousands of samples a fraction counts.
-    for k, trial in zip(near, work.spread(work.refined, [ranked[k] for k in near]), strict=True):
+    for k, trial in zip(near, work.quietly(work.refined, [ranked[k] for k in near]), strict=True):
         ranked[k] = trial
     scatter = min(spread(t.joint) for t in ranked if t.joint is not None)
     ranked = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in ranked]

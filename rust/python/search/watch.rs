@@ -54,7 +54,7 @@ pub fn saved<T: Send>(
                     Ok::<_, PyErr>(())
                 });
                 if let Err(error) = look {
-                    control.stop.store(true, Ordering::Relaxed);
+                    control.stop.set();
                     raised.get_or_insert(error);
                 }
             }

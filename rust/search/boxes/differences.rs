@@ -12,7 +12,7 @@ use crate::search::candidate::problem::Problem;
 /// Differences whose products are made at a time.
 const BATCH: usize = 64;
 /// Most bytes of products; above, boxes do without.
-const MOST: usize = 256 << 20;
+const MOST: u64 = 256 << 20;
 
 /// Of columns a, b, c of unit size that follow one another: δ = (c − a)/2 and D = a − 2b + c.
 pub(crate) struct Differences {
@@ -25,8 +25,10 @@ pub(crate) struct Differences {
 }
 
 impl Differences {
-    /// Of these neighbours; none where their products would need too much memory. Runs on the current thread pool.
-    pub(crate) fn new(problem: &Problem, neighbours: impl Iterator<Item = [usize; 3]>) -> Option<Self> {
+    /// Of these neighbours; none where their products would need too much memory, or more than is left of it [bytes].
+    ///
+    /// Runs on the current thread pool.
+    pub(crate) fn new(problem: &Problem, neighbours: impl Iterator<Item = [usize; 3]>, left: u64) -> Option<Self> {
         let mut rows = HashMap::new();
         let mut triples: Vec<[usize; 3]> = Vec::new();
         for triple in neighbours {
@@ -37,7 +39,7 @@ impl Differences {
         }
         let inverse = problem.equations.whole()?.inverse();
         let width = inverse.len();
-        if triples.len().checked_mul(2 * 8 * width)? > MOST {
+        if triples.len().checked_mul(8 * (2 * width + 3))? as u64 > left.min(MOST) {
             return None;
         }
         let mut products = vec![0.0; 2 * triples.len() * width];

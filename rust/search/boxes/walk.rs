@@ -61,7 +61,7 @@ impl Boxes {
                 neighbours.extend(columns[from..].windows(3).map(|w| [w[0], w[1], w[2]]));
             }
         }
-        let differences = Differences::new(problem, neighbours.into_iter())?;
+        let differences = Differences::new(problem, neighbours.into_iter(), catalogue.spare)?;
         #[allow(clippy::cast_precision_loss)]
         let rounding = f64::EPSILON * problem.samples() as f64;
         let probes = bound.probes();
