@@ -80,6 +80,20 @@ def test_a_machine_that_grows_is_found_growing() -> None:
     assert any("grows without bound" in w for w in found.warnings)
 
 
+def test_what_is_printed_of_a_machine_that_grows_is_what_it_leaves() -> None:
+    # A bounded motion of an equation that grows by e^25: all responses to what a run starts with become one mode, beside
+    # which the gauge's zero hardly shows.
+    t, growth = np.arange(4501) * 0.01, 0.55
+    w, phase, size = np.array([[3.1], [7.7], [12.3]]), np.array([[0.3], [1.1], [2.0]]), np.array([[1.0], [0.7], [0.4]])
+    y, rate, change = (np.sum(size * w**k * np.sin(w * t + phase + k * np.pi / 2), axis=0) for k in (0, 1, 2))
+    run = ftlm.Run.from_arrays(
+        step=0.01, inputs={"u": change - 2 * growth * rate + 400 * y}, outputs={"y": y + 0.3}, intersample={"u": "foh"}
+    )
+    words = ftlm.equation("D^2 y = d D y + a y + u", initial="caputo", offset="constant")
+    model = ftlm.Model(words.with_coefficients({"d": 2 * growth, "a": -400.0}))
+    assert model.compare(run).fit_percent["y"] > 99.8
+
+
 def test_a_machine_that_dies_away_is_compared_with_nothing() -> None:
     found = ftlm.identify(swing(-0.5), ftlm.equation("D^2 y = a y + d D y + b u"), intervals="quadratic")
     assert found.coefficients["d"] == pytest.approx(-0.5, abs=0.03)

@@ -38,8 +38,9 @@ GRAIN = 1e-9
 STAND_IN = 0.05
 #: Orders of integration from which on a kink is as smooth as pulses follow.
 SMOOTH = 2.0
-#: Share of a response of an initial term that others must leave for it to be told from them.
-SPANNED = 1e-10
+#: Share of a response of an initial term that others must leave for it to be told from them: the joint fit's, or what is
+#: printed of a model that grows is not what was fitted, since all its responses become one mode.
+SPANNED = 1e-12
 
 Terms = Mapping[str, Mapping[float, float]]
 
