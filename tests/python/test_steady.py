@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,11 @@ from ftlm import _core
 from ftlm.cli.options import StructureOptions
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
+from ftlm.fit.profile import Valley, profiled
+from ftlm.fit.race import distinct, without_vanished
 from ftlm.fit.simpler import whole
 from ftlm.fit.steady import dissipative, forced, grows, nearest_stable
+from ftlm.identification.intervals import valley_of
 from measured import DATA, needs_data
 
 ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}
@@ -81,8 +85,8 @@ def test_a_machine_that_grows_is_found_growing() -> None:
 
 
 def test_what_is_printed_of_a_machine_that_grows_is_what_it_leaves() -> None:
-    # A bounded motion of an equation that grows by e^25: all responses to what a run starts with become one mode, beside
-    # which the gauge's zero hardly shows.
+    # A bounded motion of an equation that grows by e^25: all responses to what a run starts with become one mode,
+    # beside which the gauge's zero hardly shows.
     t, growth = np.arange(4501) * 0.01, 0.55
     w, phase, size = np.array([[3.1], [7.7], [12.3]]), np.array([[0.3], [1.1], [2.0]]), np.array([[1.0], [0.7], [0.4]])
     y, rate, change = (np.sum(size * w**k * np.sin(w * t + phase + k * np.pi / 2), axis=0) for k in (0, 1, 2))
@@ -272,3 +276,46 @@ def test_a_raw_run_by_the_natural_call(tmp_path: Path, fitted: str, judged: str,
     assert -550.0 < coefficients[f"a{number}"] < -150.0
     assert coefficients[f"d{number}"] < 0.05
     assert not any("the model is not stable: 2 poles" in w for w in told["warnings"])
+
+
+def test_a_coefficient_that_keeps_its_sign_ends_where_it_no_longer_shows() -> None:
+    # D y feeds energy here: with the sign of a damper a descent went on towards 0 until its evaluations ran out.
+    problem = FreeProblem.of(ftlm.equation("D^2 y = a y + d D y + b u", initial="caputo"))
+    grid = Grid(problem, [swing(0.2)], [1.0 / 0.001])
+    start = Attempt([], [-25.0, -0.1, 1.0], "damped", {})
+    end = grid.descend(start, 60)
+    assert end.converged
+    assert end.outcome["evaluations"] < 30
+    assert end.coefficients[1] == pytest.approx(-0.1 * np.exp(-20.0), rel=1e-6)
+    let_go = without_vanished(problem, start, end)
+    assert let_go.coefficients == [end.coefficients[0], 0.0, end.coefficients[2]]
+    assert grid.descend(let_go, 60).coefficients[1] == pytest.approx(0.2, abs=0.02)
+    assert without_vanished(problem, start, start).coefficients == start.coefficients
+
+
+def test_starts_that_came_to_one_optimum_go_on_as_one_and_stay_counted() -> None:
+    def ended(cost: float, order: float, origin: str) -> Attempt:
+        return Attempt([order], [1.0], origin, {"cost": cost, "residuals": np.zeros(2)})
+
+    reached = [ended(1.0, 1.5, "a"), ended(1.0005, 1.51, "b"), ended(1.0, 0.5, "c"), ended(1.0009, 1.5, "d")]
+    kept = distinct(reached)
+    assert [(a.origin, a.alike) for a in kept] == [("a", ("b", "d")), ("c", ())]
+    assert reached[0].alike == ()
+    assert [(a.origin, a.alike) for a in distinct([ended(1.0, 0.5, "e"), kept[1]])] == [("e", ("c",))]
+
+
+def test_a_valley_is_looked_at_on_the_coarsest_grid_that_noise_hides() -> None:
+    run = swing(-0.5, noise=0.1)
+    found = ftlm.identify(run, ftlm.equation("D^2 y = a y + d D y + b u"), threads=1, intervals="quadratic")
+    assert found.joint is not None
+    assert found.joint.unnoticed < found.joint.refinement
+    coarse = valley_of(found)
+    problem, runs = coarse.grid.problem, coarse.grid.runs
+    fine = Valley.of(replace(found.joint, unnoticed=found.joint.refinement), problem, runs)
+    assert (coarse.grid.every, fine.grid.every) == (found.joint.unnoticed, found.joint.refinement)
+    for valley in (coarse, fine):
+        np.testing.assert_allclose(valley.best.values + valley.shift, found.joint.values, rtol=1e-9)
+    (one, two) = (profiled(v, v.names, 0.95).intervals for v in (coarse, fine))
+    for name, error in found.joint.standard_errors.items():
+        assert one[name].low == pytest.approx(two[name].low, abs=0.02 * error)
+        assert one[name].high == pytest.approx(two[name].high, abs=0.02 * error)

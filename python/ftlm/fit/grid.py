@@ -118,13 +118,14 @@ def _instant(
 
 @dataclass
 class Attempt:
-    """A point in the space of parameters, and what the core said about it."""
+    """A point in the space of parameters, what the core said about it, and whose starts came to it as well."""
 
     orders: list[float]
     coefficients: list[float]
     origin: str
     outcome: Any
     inputs: list[float] = field(default_factory=list)
+    alike: tuple[str, ...] = ()
 
     @property
     def values(self) -> Floats:
@@ -170,14 +171,14 @@ def descend(
     if structure.has_friction:
         outcome = _with_friction(problem, experiments, attempt, bounds, coordinates, inputs, evaluations, tolerance)
         numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
-        return Attempt(numbers[0], numbers[1], attempt.origin, outcome, numbers[2])
+        return replace(attempt, orders=numbers[0], coefficients=numbers[1], outcome=outcome, inputs=numbers[2])
     outcome = _core.output_error(
         experiments, problem.laws(signals), bounds, coordinates, structure.coupling == "simulated",
         initial_tuple(structure.initial, structure.offset, states), attempt.orders, attempt.coefficients,
         inputs, evaluations, tolerance, steady, stop(),
     )  # fmt: skip
     numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
-    return Attempt(numbers[0], numbers[1], attempt.origin, outcome, numbers[2])
+    return replace(attempt, orders=numbers[0], coefficients=numbers[1], outcome=outcome, inputs=numbers[2])
 
 
 def _with_friction(

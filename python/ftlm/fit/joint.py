@@ -41,7 +41,8 @@ ROUNDS = 4
 ROBUST_ROUNDS = 15
 #: Weights are settled when no output's residuals differ from their weight by more than this share.
 SETTLED = 0.01
-#: Refinement ends when halving the step moves no estimate, extrapolated to step 0, by this share of its standard error.
+#: Refinement ends when halving the step moves no estimate, or none extrapolated to step 0, by this share of its
+#: standard error.
 REFINED = 0.1
 
 
@@ -64,6 +65,8 @@ class JointFit:
         Number of residuals, of samples that were read.
     refinement
         Pulses a sample interval on the finest grid; the estimates are the limit that it and the next coarser one tell.
+    unnoticed
+        Pulses a sample interval from which on halving the step moves samples by less than noise shows.
     settled
         Whether halving the step moved no estimate by a tenth of its standard error.
     converged
@@ -115,6 +118,7 @@ class JointFit:
     origin: str = "the start that was given"
     profiles: Mapping[str, ProfileInterval] = field(default_factory=dict)
     growth: Growth | None = None
+    unnoticed: int = FINEST
 
     @property
     def choice(self) -> str:
@@ -208,7 +212,8 @@ def fit_output_error(
         floor = float(np.mean([(noise[o] / (COARSE_SHARE * sizes[o])) ** 2 for o in outputs]))
         runners = race_with_friction if structure.has_friction else race
         reached = runners(alike, floor, threads, progress)
-        starts, contenders = [(a.level, a.origin) for a in reached], finalists(reached) if reached else []
+        starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
+        contenders = finalists(reached) if reached else []
         contenders += [given(problem, values) for values in known]
     else:
         contenders = [given(problem, start)]
@@ -219,13 +224,14 @@ def fit_output_error(
     # Where a step passes faster than the samples see, a grid as coarse as the samples has an optimum of its own.
     while weighed.every < FINEST and weighed.matters(contenders[0]):
         weighed = weighed.finer
+    unnoticed = weighed.every
     best = weighed.descend(winner(contenders, replace(alike, every=weighed.every)), LAST_LAP)
     best, weighed = with_settled_weights(best, weighed, loss)
     best, weighed, growth = steadied(best, weighed, reached)
     if growth is not None and not growth.kept:
         best, weighed = with_settled_weights(best, weighed, loss)
     optimum = refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True)
-    return replace(joint_fit(optimum, starts), growth=growth)
+    return replace(joint_fit(optimum, starts), growth=growth, unnoticed=unnoticed)
 
 
 def given(problem: FreeProblem, values: Mapping[str, float]) -> Attempt:
@@ -290,7 +296,8 @@ def refined(best: Attempt, grid: Grid, loss: Loss = "squares") -> Optimum:
         limit = finer.values
         if still:
             limit = feasible(grid.problem, limit, limit + (limit - best.values) / 3.0)
-        settled = bool(np.all(np.abs(limit - estimate) <= REFINED * errors))
+        moved = np.abs(limit - estimate), np.abs(finer.values - best.values)
+        settled = any(bool(np.all(way <= REFINED * errors)) for way in moved)
         best, estimate = finer, limit
     return Optimum(best, grid, nearer(best, grid, estimate), settled)
 
@@ -300,7 +307,9 @@ def nearer(best: Attempt, grid: Grid, limit: Floats) -> Floats:
 
     Along the bottom of a flat and curved valley, where numbers cannot be told apart, a straight line leads out of it.
     """
-    if np.array_equal(limit, best.values):
+    columns = np.asarray(best.outcome["jacobian"]).T
+    if float(np.sum((columns @ (limit - best.values)) ** 2)) <= REFINED**2:
+        # Both leave the same.
         return limit
     orders, coefficients, inputs = grid.problem.split(limit.tolist())
     ahead = replace(best, orders=orders, coefficients=coefficients, inputs=inputs)

@@ -22,6 +22,8 @@ FIRST_LAP = 15
 SECOND_LAP = 60
 RUNNERS = 3
 FEWEST = 8
+#: Share of its start below which a coefficient is as good as 0: a descent that keeps its sign ends at e^-20.
+VANISHED = 1e-8
 #: All get as many as those ahead where the best is above the noise by this factor.
 ABOVE_FLOOR = 2.0
 #: Coarse fits that continue on all samples.
@@ -48,7 +50,8 @@ class Laps:
 
         def tried(attempt: Attempt) -> Attempt | None:
             try:
-                return descend(problem or grid.problem, experiments, attempt, evaluations=evaluations)
+                ended = descend(problem or grid.problem, experiments, attempt, evaluations=evaluations)
+                return without_vanished(problem or grid.problem, attempt, ended)
             except FtlmError:
                 # A start whose free run is not finite is no start; if none is left, the fit says so.
                 return None
@@ -109,6 +112,8 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
         # An offset of each run hides which of the measured signals drives: also from where it ends without.
         plain = replace(alike, problem=FreeProblem.of(replace(problem.structure, offset="none")))
         reached = sorted(reached + race(plain, floor, threads, None)[:FINALISTS], key=lambda a: a.level)
+    # Those that came to the same optimum go on as one.
+    reached = distinct(reached)
     ahead = max(FEWEST, len(reached) // RUNNERS)
     rest = reached[ahead:]
     reached = laps.run(coarse, reached[:ahead], SECOND_LAP)
@@ -121,6 +126,17 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
     return reached
 
 
+def without_vanished(problem: FreeProblem, start: Attempt, ended: Attempt) -> Attempt:
+    """An attempt with coefficients at 0 that fell towards it as far as a sign that is kept lets them.
+
+    From there they may take the other sign.
+    """
+    if problem.products or problem.structure.has_friction:
+        return ended
+    pairs = zip(start.coefficients, ended.coefficients, strict=True)
+    return replace(ended, coefficients=[0.0 if abs(b) < VANISHED * abs(a) else b for a, b in pairs])
+
+
 def finalists(reached: Sequence[Attempt]) -> list[Attempt]:
     """Those that go on on all samples: the best of different optima, unless they are far behind."""
     kept = distinct(reached)[:FINALISTS]
@@ -128,14 +144,18 @@ def finalists(reached: Sequence[Attempt]) -> list[Attempt]:
 
 
 def distinct(reached: Sequence[Attempt]) -> list[Attempt]:
-    """Attempts, best first, without those that ended in the optimum of an earlier one."""
+    """Attempts, best first; those that ended in the optimum of an earlier one are alike to it."""
     kept: list[Attempt] = []
     for attempt in reached:
         values = np.array(attempt.orders)
-        same = any(
-            abs(k.level - attempt.level) <= SAME_COST * k.level and np.allclose(values, k.orders, atol=0.02)
-            for k in kept
-        )
-        if not same:
+        same = (
+            i for i, k in enumerate(kept)
+            if abs(k.level - attempt.level) <= SAME_COST * k.level and np.allclose(values, k.orders, atol=0.02)
+        )  # fmt: skip
+        first = next(same, None)
+        if first is None:
             kept.append(attempt)
+        else:
+            alike = (*kept[first].alike, attempt.origin, *attempt.alike)
+            kept[first] = replace(kept[first], alike=alike)
     return kept

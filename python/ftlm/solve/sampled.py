@@ -38,8 +38,8 @@ GRAIN = 1e-9
 STAND_IN = 0.05
 #: Orders of integration from which on a kink is as smooth as pulses follow.
 SMOOTH = 2.0
-#: Share of a response of an initial term that others must leave for it to be told from them: the joint fit's, or what is
-#: printed of a model that grows is not what was fitted, since all its responses become one mode.
+#: Share of a response of an initial term that others must leave for it to be told from them: the joint fit's. Where a
+#: model grows all its responses become one mode, and another share would print another fit than was made.
 SPANNED = 1e-12
 
 Terms = Mapping[str, Mapping[float, float]]

@@ -36,6 +36,8 @@ pub struct Fit {
 struct OutputError<'a> {
     model: &'a FreeModel,
     experiments: &'a [Experiment],
+    /// Where the coefficients start.
+    start: &'a [f64],
     /// Whether a free run that grows is no place to go.
     steady: bool,
     /// Coefficients that are solved for at every point.
@@ -83,13 +85,17 @@ impl Problem for OutputError<'_> {
             .map_or(1.0, |j| self.model.coordinates[j].stretch(point.coefficients[j]))
     }
 
-    /// Distance of orders and of inputs' numbers from their bounds; coefficients have none.
+    /// Distance of orders and of inputs' numbers from their bounds; coefficients have none but 0 where they keep a sign.
     fn room(&self, point: &Point, parameter: usize) -> (f64, f64) {
         let behind = point.orders.len() + point.coefficients.len();
         let (value, (low, high)) = match (point.orders.get(parameter), parameter.checked_sub(behind)) {
             (Some(order), _) => (*order, self.model.order_bounds[parameter]),
             (None, Some(input)) => (point.inputs[input], self.model.inputs[input].bounds),
-            (None, None) => return (f64::INFINITY, f64::INFINITY),
+            (None, None) => {
+                let j = parameter - point.orders.len();
+                let down = self.model.coordinates[j].room(point.coefficients[j], self.start[j]);
+                return (down, f64::INFINITY);
+            }
         };
         (value - low, high - value)
     }
@@ -219,7 +225,7 @@ pub fn fit_until(
     // Solved for, they need no coordinate that keeps a sign.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
     let shelves = RefCell::new(experiments.iter().map(|_| Shelf::default()).collect());
-    let problem = OutputError { model: &model, experiments, steady, linear, shelves, stop };
+    let problem = OutputError { model: &model, experiments, start: &start.coefficients, steady, linear, shelves, stop };
     let found = minimise(&problem, point, settings)?;
     Ok(Fit {
         point: found.point,

@@ -22,6 +22,9 @@ pub enum Coordinate {
     Held,
 }
 
+/// Logarithm of the share of its start to which a coefficient that keeps its sign may fall.
+const VANISHED: f64 = 20.0;
+
 impl Coordinate {
     /// Whether a coefficient of this value can be moved in its coordinate.
     pub(super) fn holds(self, value: f64) -> bool {
@@ -41,6 +44,15 @@ impl Coordinate {
             Self::Logarithm => value * libm::exp(bounded),
             Self::ExcessLogarithm => 1.0 + (value - 1.0) * libm::exp(bounded),
             Self::Held => value,
+        }
+    }
+
+    /// How far a coefficient may fall in its coordinate, from its start on: none of its terms shows any more behind that,
+    /// and a descent would go on towards 0 for ever.
+    pub(super) fn room(self, value: f64, start: f64) -> f64 {
+        match self {
+            Self::Logarithm => libm::log(value / start) + VANISHED,
+            Self::Plain | Self::ExcessLogarithm | Self::Held => f64::INFINITY,
         }
     }
 
