@@ -3,10 +3,11 @@
 use super::dynamics::{at_rest, Body, Operators, Run};
 use super::integrals::{product, Integrated};
 use super::law::Law;
-use super::states::{add_impulses, parted, together, Forcing, State};
+use super::states::{together, Forcing, State};
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimate::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
+use crate::impulses::{add_impulses, parted};
 use crate::regressors::Record;
 use crate::series::Kernel;
 

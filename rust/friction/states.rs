@@ -4,6 +4,7 @@ use super::integrals::Integrated;
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::excess::kernel;
+use crate::impulses::is_impulse;
 use crate::kernels::power_means;
 use crate::small;
 
@@ -232,7 +233,7 @@ impl State {
 
     /// Whether it moves no body, only the filter of an output.
     pub(super) fn is_impulse(&self) -> bool {
-        matches!(self, Self::Power(_, e) if *e <= -1.0 && e.fract() == 0.0)
+        matches!(self, Self::Power(_, e) if is_impulse(*e))
     }
 
     /// The powers of t that a unit of it is, on the level of the outputs: equation, exponent, coefficient.
@@ -257,22 +258,6 @@ impl State {
             }
             Self::Offset(i, more) => vec![(i, equations[i].structure.order + f64::from(more), 1.0)],
             Self::Power(i, exponent) => vec![(i, exponent, 1.0)],
-        }
-    }
-}
-
-/// Powers of t that move bodies, and impulses that only the filters of their outputs get, by equation.
-#[allow(clippy::type_complexity)]
-pub(super) fn parted(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
-    powers.iter().map(|own| own.iter().partition(|(e, _)| !(*e <= -1.0 && e.fract() == 0.0))).unzip()
-}
-
-/// Adds impulses and their derivatives to pulse means of outputs.
-pub(super) fn add_impulses(outputs: &mut [Vec<f64>], impulses: &[Vec<(f64, f64)>], step: f64) {
-    for (output, own) in outputs.iter_mut().zip(impulses) {
-        for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
-            let means = power_means(exponent, output.len(), step);
-            output.iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
         }
     }
 }

@@ -151,7 +151,7 @@ def descend(
     A steady one goes from a free run that dies away to none that grows.
     """
     structure, signals = problem.structure, problem.structure.signals
-    states = structure.filter_states(structure.initial) if structure.behind_filter else 0
+    states = structure.filter_states(structure.initial)
     coordinates = problem.coordinates(attempt.coefficients, plain=plain)
     bounds, ends = list(problem.bounds), [item.bounds for item in problem.inputs]
     for number in (held,) if isinstance(held, int) else held:

@@ -14,7 +14,7 @@ from ftlm.data.equations import Equation, Friction
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.solve.instants import has_own_times
-from ftlm.solve.records import Record, initial_tuple, linear_tuple, sensor_series
+from ftlm.solve.records import Record, linear_tuple, sensor_series
 
 #: Evaluations in which level, velocity and offset of a run are found, and the share of the cost that ends the search.
 EVALUATIONS = 60
@@ -75,8 +75,7 @@ def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | 
     sticks = structure.sticks
     rubs: list[tuple[float, list[Any]]] = [(x, []) for x in strength(model.equations[sticks])]
     return _core.friction_error(
-        [experiment], laws, sticks, rubs, [], [],
-        initial_tuple(rec.initial, rec.offset, structure.filter_states(rec.initial)), [], [], [],
+        [experiment], laws, sticks, rubs, [], [], rec.start, [], [], [],
         [] if near is None else [near], EVALUATIONS, STILL,
     )  # fmt: skip
 
