@@ -268,20 +268,14 @@ class Structure:
         return any(e.friction is not None for e in self.equations)
 
     @property
-    def sticks(self) -> int:
-        """Place of the equation with friction, the first one where there are several; 0 without."""
-        return next((i for i, e in enumerate(self.equations) if e.friction is not None), 0)
+    def sticks(self) -> tuple[int, ...]:
+        """Places of the equations with friction."""
+        return tuple(i for i, e in enumerate(self.equations) if e.friction is not None)
 
     def _check_friction(self) -> None:
         """Refuse what a free run with friction does not know yet."""
-        rubbing = [e.output for e in self.equations if e.friction is not None]
+        rubbing = [self.equations[i].output for i in self.sticks]
         words = f"the equation of {rubbing[0]} has friction"
-        if len(rubbing) > 1:
-            raise ModelError(
-                f"the equations of {' and '.join(rubbing)} have friction: a free run follows one body that may stick, "
-                "and bodies that drive it and that it drives; leave the friction of the others out, or follow each in "
-                "a structure of its own, driven by the other signals as measured"
-            )
         if len(self.equations) > 1 and self.coupling == "measured":
             raise ModelError(
                 f"{words}, and the structure {len(self.equations)} equations with measured coupling: driven by "
@@ -298,8 +292,7 @@ class Structure:
         if self.free_delays:
             raise ModelError(f"{words}, and the delay of {', '.join(self.free_delays)} is free; give it in seconds")
         tied = {n for name, _, factors in self.coefficient_law for n in (name, *factors)}
-        rubs = self.equations[self.sticks].friction
-        held = [n for n in (() if rubs is None else rubs.names) if n in tied]
+        held = [n for e in self.equations if e.friction is not None for n in e.friction.names if n in tied]
         if held:
             raise ModelError(f"{words}, and a law ties its {held[0]} to other coefficients; leave one of the two out")
         if isinstance(self.initial, History) or self.initial == "history":

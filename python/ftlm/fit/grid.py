@@ -185,11 +185,11 @@ def _with_friction(
     coordinates: list[str], inputs: Sequence[tuple[int, str, tuple[float, float], float]], evaluations: int,
     tolerance: float,
 ) -> Any:  # fmt: skip
-    """The same of a body that may stick: what its runs start with is no projection, and goes on from where it was."""
+    """The same of bodies that may stick: what their runs start with is no projection, and goes on from where it was."""
     structure = problem.structure
     known = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
     return _core.friction_error(
-        experiments, problem.laws(structure.signals), structure.sticks, problem.strength(), bounds, coordinates,
+        experiments, problem.laws(structure.signals), problem.frictions(), bounds, coordinates,
         initial_tuple(structure.initial, structure.offset, structure.filter_states(structure.initial)),
         attempt.orders, attempt.coefficients, inputs, known, evaluations, tolerance, stop(),
     )  # fmt: skip
