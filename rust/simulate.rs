@@ -193,7 +193,8 @@ impl<'a> System<'a> {
 /// One equation alone is driven by the measured other outputs (measured coupling); all equations of a stage together
 /// by the currents alone. `initial` holds (exponent, coefficient) pairs per equation, empty at rest; whole exponents
 /// below 0 are impulses, which of a record that is not behind a filter only the filter of the output gets, so that they
-/// are added to it. An unstable model may leave the range of floating point: the values are then not finite. O(n² m log² m).
+/// are added to it. An unstable model may leave the range of floating point: the values are then not finite.
+/// O(n² m log² m).
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients missing or not finite, [`Error::LeadingZero`] where the outputs

@@ -193,8 +193,8 @@ impl Problem for Begun<'_> {
     }
 }
 
-/// Constants at which the states of a run are begun, as shares of each friction while others are 0: where a body rests hangs on the sign of
-/// what is left of the two, which a descent does not cross.
+/// Constants at which the states of a run are begun, as shares of each friction while others are 0: where a body rests
+/// hangs on the sign of what is left of the two, which a descent does not cross.
 const BEGUN: [f64; 3] = [0.0, 0.5, -0.5];
 const BEGUN_SETTINGS: Settings = Settings { evaluations: 30, tolerance: 1e-6 };
 

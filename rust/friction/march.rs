@@ -57,8 +57,8 @@ impl March {
         let (mut v, mut forces) = (start.to_vec(), vec![0.0; n]);
         let (mut p, mut at) = (vec![0.0; n], Vec::with_capacity(n));
         for k in 0..m {
-            for (a, row) in pasts.iter().enumerate() {
-                p[a] = linear[a][k] - row.iter().map(Online::past).sum::<f64>();
+            for ((p, row), linear) in p.iter_mut().zip(&pasts).zip(linear) {
+                *p = linear[k] - row.iter().map(Online::past).sum::<f64>();
             }
             rubbing.pulse(&v, &p, &rounding, &forces, &mut at);
             for (a, &(free, Pulse { force, end, phase })) in at.iter().enumerate() {
@@ -105,12 +105,12 @@ impl March {
             v.clear();
             at.clear();
             moves.clear();
-            for (a, body) in self.bodies.iter().enumerate() {
+            for (a, (body, moved)) in self.bodies.iter().zip(moved).enumerate() {
                 v.push(body.edges[k]);
                 let (force, end, phase) = (body.force[k], body.edges[k + 1], body.phases[k]);
                 at.push((body.free[k], Pulse { force, end, phase }));
                 let past: f64 = pasts[a].iter().map(Online::past).sum();
-                let free = moved[a][k] + first[a] * force - past;
+                let free = moved[k] + first[a] * force - past;
                 moves.push(Moves { start: dv[a], free, first: first[a], law: laws[a] });
             }
             self.rubbing.slope(&v, &at, &moves, &mut slopes);

@@ -1,4 +1,4 @@
-//! Bodies with friction whose orders and coefficients are free: its residuals on every experiment, and their derivatives.
+//! Bodies with friction whose orders and coefficients are free: residuals on every experiment, and their derivatives.
 
 use super::dynamics::{at_rest, Body, Operators, Run};
 use super::integrals::{product, Integrated};

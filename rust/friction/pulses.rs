@@ -159,8 +159,7 @@ pub fn is_p_matrix(matrix: &[f64], n: usize) -> bool {
         return true;
     }
     let first = matrix[0];
-    // Negated so that what is no number is none.
-    if !(first > 0.0) {
+    if first.is_nan() || first <= 0.0 {
         return false;
     }
     let without: Vec<f64> = (1..n).flat_map(|i| (1..n).map(move |j| matrix[i * n + j])).collect();

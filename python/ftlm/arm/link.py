@@ -235,6 +235,12 @@ def flexible_link(
             "links' equations; use that form, or coupling='measured', whose friction has the sign of the measured "
             "velocity"
         )
+    if friction and coupling == "simulated" and stage == "both" and cross_stage == "inertial":
+        raise ModelError(
+            "cross_stage='inertial' puts accelerations of stage 1 into the equation of hub 2, where friction=True with "
+            "coupling='simulated' has every order below alpha; use cross_stage=False, leave the friction out, or use "
+            "coupling='measured'"
+        )
     if not hub and (form != "lagrange" or coupling == "simulated" or friction):
         raise ModelError(
             "hub=False leaves the deflection to the measured hub: it needs form='lagrange' and coupling='measured', "

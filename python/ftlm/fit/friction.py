@@ -94,7 +94,7 @@ def carrying(problem: FreeProblem, runs: Sequence[Run], values: dict[str, float]
             rest |= orders
         free = dict(zip(problem.coefficients, problem.free_from(found), strict=True))
         rest = {n: v for n, v in rest.items() if n in problem.names}
-        words = " and ".join(item.output for item, _, _ in told)
+        words = " and ".join(item.output for item, _, _ in told) + (", each" if len(told) > 1 else "")
         out.append(at(problem, {**rest, **free}, f"{words} by itself, carrying {share:g} of its inertia"))
     return out
 
