@@ -1,10 +1,11 @@
 """A body that sticks, measured: recovery with intervals, cost of a free run, hubs of real arms.
 
 ``python benches/friction.py recovery [--seeds 20]``, ``stribeck [--seeds 20]``, ``speed``, ``measured``,
-``measured-stribeck``, ``coupled [--seeds 20]``, ``coupled-measured``. Truth of the recovery is a cart in closed form
-between its events (tests/python/friction.py) with offsets a run, that of ``stribeck`` a sledge on a spring that sticks
-and slips, that of ``coupled`` a hub that sticks with a link that rings, both followed from the current alone; real runs
-are those of ``FTLM_DATA``.
+``measured-stribeck``, ``coupled [--seeds 20]``, ``coupled-measured``, ``two [--seeds 20]``. Truth of the recovery is a
+cart in closed form between its events (tests/python/friction.py) with offsets a run, that of ``stribeck`` a sledge on a
+spring that sticks and slips, that of ``coupled`` a hub that sticks with a link that rings, both followed from the
+current alone, that of ``two`` two bodies that both stick (tests/python/test_two_frictions.py); real runs are those of
+``FTLM_DATA``.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from ftlm import _core
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
 
 import friction
+import test_two_frictions as two_frictions
 from measured import DATA
 
 CART = "D^2 y = - v D y + g u - fc*sign(D y) + c"
@@ -152,6 +154,26 @@ def coupled(seeds: int) -> None:
               f"{np.abs(z).max():.2f} | {statistics.median(taken):.2g} |", flush=True)  # fmt: skip
 
 
+def two(seeds: int) -> None:
+    """Coverage of 95 % intervals of two bodies that pull at each other and both stick, a run a fit."""
+    truth = {**two_frictions.TRUTH, **two_frictions.STRENGTH}
+    for start in ((0.0,) * 4, (0.2, 0.8, -0.1, -0.6)):
+        structure = ftlm.equation(two_frictions.WORDS, initial="caputo" if any(start) else "rest")
+        scores, inside, taken = [], [], []
+        for seed in range(seeds):
+            run = two_frictions.noisy(seed, start)
+            begun = time.process_time()
+            found = ftlm.identify(run, structure, threads=1)
+            taken.append(time.process_time() - begun)
+            scores.append([(found.coefficients[n] - v) / found.standard_errors[n] for n, v in truth.items()])
+            inside.append([found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in truth.items()])
+        z = np.array(scores)
+        counts = ", ".join(f"{n} {c}" for n, c in zip(truth, np.sum(inside, axis=0), strict=True))
+        kind = "in motion" if any(start) else "from rest"
+        print(f"| {kind} | {counts} of {seeds} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
+              flush=True)  # fmt: skip
+
+
 def coupled_measured() -> None:
     """Hub and link of the real arm from the current alone, with friction and without, fitted on one unit."""
     runs = {
@@ -170,8 +192,8 @@ def speed() -> None:
     equation = (0, 1.8, [(0, 0.9), (1, 0.0)])
     for m in (1 << 11, 1 << 14, 1 << 17):
         record = (1e-3, np.stack([np.zeros(m), rng.normal(size=m)]), None)
-        rubs = timed(partial(_core.friction_respond, record, [(equation, [-3.0, 1.0])], 0, (0.5, 0.0, 1.0), [[]]))
-        falls = timed(partial(_core.friction_respond, record, [(equation, [-3.0, 1.0])], 0, (0.5, 0.3, 0.01), [[]]))
+        rubs = timed(partial(_core.friction_respond, record, [(equation, [-3.0, 1.0])], [(0, (0.5, 0.0, 1.0))], [[]]))
+        falls = timed(partial(_core.friction_respond, record, [(equation, [-3.0, 1.0])], [(0, (0.5, 0.3, 0.01))], [[]]))
         plain = timed(partial(_core.respond, record, [(equation, [-3.0, 1.0])], [False, True], [[]]))
         print(f"| {m} | {1e3 * rubs:.1f} | {rubs / plain:.1f} | {falls / plain:.1f} |", flush=True)
 
@@ -248,7 +270,7 @@ def told(structure: ftlm.Structure, fitted: list[ftlm.Run], runs: dict[str, ftlm
               f"offset {there.offsets[0]['theta11']['constant']:+.3f}", flush=True)  # fmt: skip
 
 
-WHAT = ("recovery", "stribeck", "speed", "measured", "measured-stribeck", "coupled", "coupled-measured")
+WHAT = ("recovery", "stribeck", "speed", "measured", "measured-stribeck", "coupled", "coupled-measured", "two")
 
 
 def main() -> None:
@@ -260,7 +282,7 @@ def main() -> None:
     {
         "recovery": lambda: recovery(asked.seeds), "stribeck": lambda: stribeck(asked.seeds), "speed": speed,
         "measured": measured, "measured-stribeck": measured_stribeck, "coupled": lambda: coupled(asked.seeds),
-        "coupled-measured": coupled_measured,
+        "coupled-measured": coupled_measured, "two": lambda: two(asked.seeds),
     }[asked.what]()  # fmt: skip
 
 

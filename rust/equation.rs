@@ -160,6 +160,15 @@ impl Initial {
         *self.under() == Self::Rest
     }
 
+    /// The same of an output that no filter stands behind.
+    #[must_use]
+    pub(crate) fn unfiltered(&self) -> &Self {
+        match self {
+            Self::Filtered { under, .. } => under,
+            other => other,
+        }
+    }
+
     /// Whether exponents depend on the orders of the equation.
     #[must_use]
     pub fn follows_orders(&self) -> bool {

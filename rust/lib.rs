@@ -64,6 +64,7 @@ pub mod lanes;
 mod shared;
 
 pub mod equation;
+mod impulses;
 pub mod regressors;
 pub mod regularity;
 

@@ -4,6 +4,7 @@ use crate::equation::{Equation, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::estimate::least_squares;
 use crate::excess::kernel;
+use crate::impulses::{add_impulses, is_impulse, parted};
 use crate::regressors::Record;
 use crate::regularity::check_regular;
 use crate::series::{self, Buffers, Kernel};
@@ -109,13 +110,22 @@ impl<'a> System<'a> {
 
     /// Free run with given initial terms: (exponent, coefficient) pairs per equation, empty at rest.
     pub(crate) fn respond(&self, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
+        let (driving, beside) =
+            if self.record.is_filtered() { (initial.to_vec(), Vec::new()) } else { parted(initial) };
         let mut rhs = self.rhs.clone();
-        for (b, terms) in rhs.iter_mut().zip(initial) {
+        for (b, terms) in rhs.iter_mut().zip(&driving) {
             for &(exponent, coefficient) in terms {
                 b.iter_mut().zip(self.record.initial_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
             }
         }
-        self.solve(&rhs)
+        let mut outputs = self.solve(&rhs)?;
+        add_impulses(&mut outputs, &beside, self.record.step());
+        Ok(outputs)
+    }
+
+    /// Whether an initial term is an impulse that only the filter of its output gets: of none that the record is behind.
+    fn is_beside(&self, exponent: f64) -> bool {
+        is_impulse(exponent) && !self.record.is_filtered()
     }
 
     /// Series of the inverse of the matrix, see [`series::Solver::inverse`].
@@ -133,14 +143,22 @@ impl<'a> System<'a> {
         if units.is_empty() {
             return Ok(Vec::new());
         }
+        let alone = |i: usize, exponent: f64| {
+            let mut rows = vec![vec![0.0; m]; n];
+            rows[i] = self.record.initial_term(exponent);
+            rows
+        };
         let inverse = solver.inverse()?;
         if inverse.iter().flatten().any(|series| grows(series)) {
             return units
                 .iter()
                 .map(|&(i, exponent)| {
-                    let mut rhs = vec![vec![0.0; m]; n];
-                    rhs[i] = self.record.initial_term(exponent);
-                    solver.solve(&rhs)
+                    let term = alone(i, exponent);
+                    if self.is_beside(exponent) {
+                        Ok(term)
+                    } else {
+                        solver.solve(&term)
+                    }
                 })
                 .collect();
         }
@@ -155,6 +173,9 @@ impl<'a> System<'a> {
         Ok(units
             .iter()
             .map(|&(i, exponent)| {
+                if self.is_beside(exponent) {
+                    return alone(i, exponent);
+                }
                 let term = self.record.initial_term(exponent);
                 kernels.iter().map(|row| through(&row[i], &term)).collect()
             })
@@ -170,8 +191,10 @@ impl<'a> System<'a> {
 /// Free run: pulse means of the outputs of `equations`, driven by the record's other signals.
 ///
 /// One equation alone is driven by the measured other outputs (measured coupling); all equations of a stage together
-/// by the currents alone. `initial` holds (exponent, coefficient) pairs per equation, empty at rest. An unstable model
-/// may leave the range of floating point: the values are then not finite. O(n² m log² m).
+/// by the currents alone. `initial` holds (exponent, coefficient) pairs per equation, empty at rest; whole exponents
+/// below 0 are impulses, which of a record that is not behind a filter only the filter of the output gets, so that they
+/// are added to it. An unstable model may leave the range of floating point: the values are then not finite.
+/// O(n² m log² m).
 ///
 /// # Errors
 /// Orders or signals that make no equation, coefficients missing or not finite, [`Error::LeadingZero`] where the outputs
@@ -206,8 +229,7 @@ fn checked<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, 
         let (exponents, coefficients): (Vec<f64>, Vec<f64>) = terms.iter().copied().unzip();
         check_finite("coefficients of the initial terms", &coefficients)?;
         // Behind a filter an impulse is a motion like others.
-        let impulse = |e: f64| record.is_filtered() && e < 0.0 && e.fract() == 0.0;
-        Initial::Powers(exponents.into_iter().filter(|&e| !impulse(e)).collect()).check()?;
+        Initial::Powers(exponents.into_iter().filter(|&e| !is_impulse(e)).collect()).check()?;
     }
     let system = System::new(equations, record)?;
     check_regular(equations)?;
@@ -322,7 +344,10 @@ pub fn respond_with_initial(
         check_length("filter", record.m(), filter.series.len())?;
         check_length("filtered outputs", equations.len(), filter.applies.len())?;
     }
-    let exponents: Vec<Vec<f64>> = equations.iter().map(|e| e.structure.initial_exponents(initial)).collect();
+    let behind = |i: usize| record.is_filtered() || filter.is_some_and(|f| f.applies[i]);
+    let exponents: Vec<Vec<f64>> = (equations.iter().enumerate())
+        .map(|(i, e)| e.structure.initial_exponents(if behind(i) { initial } else { initial.unfiltered() }))
+        .collect();
     let through = |mut outputs: Vec<Vec<f64>>| {
         if let Some(filter) = filter {
             for (output, _) in outputs.iter_mut().zip(filter.applies).filter(|&(_, &applies)| applies) {

@@ -228,22 +228,20 @@ def grows(alpha: float, own_terms: Sequence[tuple[float, float]]) -> bool: ...
 
 class _Motion(TypedDict):
     outputs: _Matrix
-    velocity: _Vector
-    force: _Vector
+    velocity: _Matrix
+    force: _Matrix
     stuck: Any
 
 def friction_respond(
     run: _Record,
     equations: Sequence[_Equation],
-    sticks: int,
-    strength: tuple[float, float, float],
+    frictions: Sequence[tuple[int, tuple[float, float, float]]],
     terms: Sequence[Sequence[tuple[float, float]]],
 ) -> _Motion: ...
 def friction_error(
     runs: Sequence[_Experiment],
     laws: Sequence[_FreeEquation],
-    sticks: int,
-    strength: Sequence[_Monomial],
+    frictions: Sequence[tuple[int, Sequence[_Monomial]]],
     order_bounds: Sequence[tuple[float, float]],
     names: Sequence[str],
     terms: _Initial,

@@ -1,32 +1,32 @@
-//! Bodies between their inputs and the friction of one: operators on pulse means, velocities at the edges of pulses, free
+//! Bodies between their inputs and their friction: operators on pulse means, velocities at the edges of pulses, free
 //! runs.
 //!
 //! The outputs follow from the equations as every linear free run does, friction being one more input once it is known. The
-//! velocities obey the same equations, all that drives them differentiated once. At an edge the velocity of the body that
+//! velocities obey the same equations, all that drives them differentiated once. At an edge the velocity of a body that
 //! may stick is what the pulses before it add up to there, exactly for what is constant within each.
 
 use super::integrals::{edge_kernel, product, Driver, Integrated};
-use super::law::{Law, Phase};
-use super::march::March;
+use super::law::Law;
+use super::march::{March, Trace};
 use super::online::Heads;
-use super::states::{add_impulses, parted, Forcing, Link};
+use super::pulses::Rubbing;
+use super::states::{Forcing, Link};
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::excess::{kernel_and_slope, MAX_EXCESS};
+use crate::impulses::{add_impulses, parted};
 use crate::regressors::Record;
 use crate::regularity::check_regular;
 use crate::series::{self, Kernel, Solver};
 use crate::small;
 
-/// Equations that follow each other's outputs, one of them with friction of its own output's velocity.
+/// Equations that follow each other's outputs, some of them with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Body {
-    /// D^α y = Σ c D^ν s; of the one with friction 1 < α ≤ 2, and orders of every signal below α.
+    /// D^α y = Σ c D^ν s; of those with friction 1 < α ≤ 2, and orders of every signal below α.
     pub equations: Vec<Equation>,
-    /// Which of them has friction.
-    pub sticks: usize,
-    /// F of − F(Dy) sgn(Dy).
-    pub friction: Law,
+    /// Which of them have friction, and F of − F(Dy) sgn(Dy).
+    pub frictions: Vec<(usize, Law)>,
 }
 
 /// A free run.
@@ -34,19 +34,15 @@ pub struct Body {
 pub struct Motion {
     /// Pulse means of each equation's output.
     pub outputs: Vec<Vec<f64>>,
-    /// Velocity of the body that may stick at the edges of the pulses, one more than there are pulses; exactly 0 at rest.
-    pub velocity: Vec<f64>,
-    /// Mean of the friction over each pulse, in the unit of its D^α y.
-    pub force: Vec<f64>,
-    /// What the body did in each pulse.
-    pub phases: Vec<Phase>,
+    /// What each body that may stick did.
+    pub bodies: Vec<Trace>,
 }
 
 impl Body {
     /// One equation by itself.
     #[must_use]
     pub fn alone(equation: Equation, friction: Law) -> Self {
-        Self { equations: vec![equation], sticks: 0, friction }
+        Self { equations: vec![equation], frictions: vec![(0, friction)] }
     }
 
     /// Refuses orders that this law does not know, and coefficients that are no numbers.
@@ -57,13 +53,17 @@ impl Body {
         let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
             Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
         };
-        let Some(own) = self.equations.get(self.sticks) else {
-            return Err(Error::Length {
-                name: "equations".into(),
-                expected: self.sticks + 1,
-                found: self.equations.len(),
-            });
-        };
+        if self.frictions.is_empty() {
+            return Err(Error::Length { name: "frictions".into(), expected: 1, found: 0 });
+        }
+        for (k, &(place, _)) in self.frictions.iter().enumerate() {
+            if place >= self.equations.len() || self.frictions[..k].iter().any(|f| f.0 == place) {
+                return Err(Error::Structure {
+                    what: format!("friction in equation {place}"),
+                    remedy: format!("there are {}, each with one friction", self.equations.len()),
+                });
+            }
+        }
         for (i, Equation { structure, coefficients }) in self.equations.iter().enumerate() {
             structure.check(signals, |_| true)?;
             check_length("coefficients", structure.terms.len(), coefficients.len())?;
@@ -75,24 +75,31 @@ impl Body {
                 });
             }
         }
-        let Law { coulomb, stribeck, speed } = self.friction;
-        check_finite("friction", &[coulomb, stribeck, speed])?;
-        let alpha = own.structure.order;
-        if !(alpha > 1.0 && alpha <= 2.0) {
-            return refuse("order of a body with friction", alpha, "(1, 2]", "a velocity needs inertia");
-        }
-        if let Some(force) = [coulomb, stribeck].into_iter().find(|f| *f < 0.0) {
-            return refuse("friction", force, "[0, ∞)", "friction takes energy, it does not give any");
-        }
-        if speed <= 0.0 {
-            return refuse("speed of Stribeck friction", speed, "(0, ∞)", "it is the speed at which friction falls");
+        for &(place, Law { coulomb, stribeck, speed }) in &self.frictions {
+            check_finite("friction", &[coulomb, stribeck, speed])?;
+            let alpha = self.equations[place].structure.order;
+            if !(alpha > 1.0 && alpha <= 2.0) {
+                return refuse("order of a body with friction", alpha, "(1, 2]", "a velocity needs inertia");
+            }
+            if let Some(force) = [coulomb, stribeck].into_iter().find(|f| *f < 0.0) {
+                return refuse("friction", force, "[0, ∞)", "friction takes energy, it does not give any");
+            }
+            if speed <= 0.0 {
+                return refuse(
+                    "speed of Stribeck friction",
+                    speed,
+                    "(0, ∞)",
+                    "it is the speed at which friction falls",
+                );
+            }
         }
         for (i, Equation { structure, .. }) in self.equations.iter().enumerate() {
             // What drives another body must not jump in its velocity; other bodies may lean on accelerations.
             let above = |order: f64| order >= structure.order - ORDER_GRAIN;
-            let wrong = |signal: usize| i == self.sticks || self.place(signal).is_none();
+            let rubs = self.frictions.iter().any(|f| f.0 == i);
+            let wrong = |signal: usize| rubs || self.place(signal).is_none();
             match structure.terms.iter().find(|t| above(t.order) && wrong(t.signal)) {
-                Some(term) if i == self.sticks => {
+                Some(term) if rubs => {
                     return refuse("order beside friction", term.order, "below that of the body", "lower it")
                 }
                 Some(term) => {
@@ -102,6 +109,11 @@ impl Body {
             }
         }
         check_regular(&self.equations)
+    }
+
+    /// Equations with friction.
+    pub(super) fn sticks(&self) -> Vec<usize> {
+        self.frictions.iter().map(|f| f.0).collect()
     }
 
     /// Which equation a signal is the output of.
@@ -128,7 +140,8 @@ impl Body {
     /// let block = Body::alone(Equation::new(structure, vec![1.0])?, Law::coulomb(2.0));
     /// let run = Record::new(0.01, vec![vec![0.0; 100], vec![0.0; 100]], None)?;
     /// let motion = block.run(&run, &[vec![(1.0, 1.0)]])?;
-    /// assert!((motion.velocity[25] - 0.5).abs() < 1e-12 && motion.velocity[50..].iter().all(|v| v.abs() < 1e-12));
+    /// let velocity = &motion.bodies[0].edges;
+    /// assert!((velocity[25] - 0.5).abs() < 1e-12 && velocity[50..].iter().all(|v| v.abs() < 1e-12));
     /// assert!((motion.outputs[0][99] - 0.25).abs() < 1e-9);
     /// # Ok(())
     /// # }
@@ -142,10 +155,10 @@ impl Body {
             check_finite("coefficients of the initial terms", &values)?;
             Initial::Powers(exponents).check()?;
         }
-        let forcing = Forcing::of(&powers, &self.links(), self.sticks, record.m(), record.step())?;
+        let forcing = Forcing::of(&powers, &self.links(), &self.sticks(), record.m(), record.step())?;
         let mut run = Run::new(self, &Operators::new(self, record)?, &forcing)?;
         add_impulses(&mut run.outputs, &impulses, record.step());
-        Ok(Motion { outputs: run.outputs, velocity: run.march.edges, force: run.march.force, phases: run.march.phases })
+        Ok(Motion { outputs: run.outputs, bodies: run.march.bodies })
     }
 
     /// Of each equation the terms of outputs that are followed.
@@ -176,24 +189,27 @@ pub(super) struct Operators {
     inverse: Vec<Vec<Kernel>>,
     /// Inverse of A's leading coefficients.
     leading: Vec<f64>,
-    /// Spectrum of what velocities of each output add to the body's at edges, where they add something.
-    edges: Vec<Option<Kernel>>,
-    /// Kernels of friction.
-    pub(super) friction: Driver,
-    /// What a pulse of force does to the velocity at the ends of pulses.
-    pub(super) response: Heads,
-    pub(super) first: f64,
-    sticks: usize,
+    /// Of each body that may stick, the spectrum of what velocities of each output add to its own at edges, where they
+    /// add something.
+    edges: Vec<Vec<Option<Kernel>>>,
+    /// Kernels of friction, of each body that may stick.
+    pub(super) frictions: Vec<Driver>,
+    /// What a pulse of force on each body (columns) does to the velocity of each (rows) at the ends of pulses.
+    pub(super) responses: Vec<Vec<Heads>>,
+    /// Their first numbers, row by row.
+    gains: Vec<f64>,
+    sticks: Vec<usize>,
 }
 
 impl Operators {
     pub(super) fn new(body: &Body, record: &Record) -> Result<Self> {
-        let (m, step, n, sticks) = (record.m(), record.step(), body.equations.len(), body.sticks);
+        let (m, step, n, sticks) = (record.m(), record.step(), body.equations.len(), body.sticks());
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
-        let mut own_edges: Vec<Option<Vec<f64>>> = vec![None; n];
+        let mut own_edges: Vec<Vec<Option<Vec<f64>>>> = vec![vec![None; n]; sticks.len()];
         let (mut drivers, mut driven, mut own) = (Vec::new(), Vec::new(), Vec::new());
         for (i, Equation { structure, coefficients }) in body.equations.iter().enumerate() {
             matrix[i][i][0] = 1.0;
+            let rubs = sticks.iter().position(|&b| b == i);
             let (mut row_drivers, mut row_driven, mut row_own) = (Vec::new(), Vec::new(), Vec::new());
             for (term, &c) in structure.terms.iter().zip(coefficients) {
                 let eta = structure.order - term.order;
@@ -204,8 +220,8 @@ impl Operators {
                 if let Some(j) = body.place(term.signal) {
                     let means = kernel_and_slope(eta, m, step);
                     matrix[i][j].iter_mut().zip(&means.0).for_each(|(a, v)| *a -= c * v);
-                    let edges = if i == sticks { edge_kernel(eta, m, step) } else { (Vec::new(), Vec::new()) };
-                    if i == sticks {
+                    let edges = if rubs.is_some() { edge_kernel(eta, m, step) } else { (Vec::new(), Vec::new()) };
+                    if let Some(own_edges) = rubs.map(|a| &mut own_edges[a]) {
                         let sum = own_edges[j].get_or_insert_with(|| vec![0.0; m]);
                         sum.iter_mut().zip(&edges.0).for_each(|(e, v)| *e += c * v);
                     }
@@ -213,7 +229,7 @@ impl Operators {
                     row_drivers.push(None);
                     row_driven.push(None);
                 } else {
-                    let driver = Driver::new(eta, m, step, i == sticks);
+                    let driver = Driver::new(eta, m, step, rubs.is_some());
                     let signal = Kernel::new(record.signal(term.signal));
                     row_driven.push(Some(driver.of(&signal, 0)));
                     row_drivers.push(Some((driver, signal)));
@@ -227,29 +243,28 @@ impl Operators {
         let leading: Vec<f64> = matrix.iter().flatten().map(|a| a.first().copied().unwrap_or(0.0)).collect();
         let leading = small::inverse(&leading, n)?;
         let inverse = Solver::new(&matrix)?.inverse_spectra(2 * m)?;
-        let edges: Vec<Option<Kernel>> = own_edges.iter().map(|e| e.as_deref().map(Kernel::new)).collect();
-        let friction = Driver::new(body.equations[sticks].structure.order, m, step, true);
-        let mut made = Self {
-            drivers,
-            driven,
-            own,
-            matrix,
-            inverse,
-            leading,
-            edges,
-            friction,
-            response: Heads::new(&[]),
-            first: 0.0,
-            sticks,
-        };
-        let mut pulse = vec![Vec::new(); n];
-        pulse[sticks].clone_from(&made.friction.velocity[0]);
-        let mut response = made.at_edges(&made.through(&pulse), m);
-        if let Some(kernels) = &made.friction.edges {
-            response.iter_mut().zip(&kernels[0]).for_each(|(g, v)| *g += v);
+        let edges = own_edges.iter().map(|row| row.iter().map(|e| e.as_deref().map(Kernel::new)).collect()).collect();
+        let frictions: Vec<Driver> =
+            sticks.iter().map(|&b| Driver::new(body.equations[b].structure.order, m, step, true)).collect();
+        let count = sticks.len();
+        let (responses, gains) = (Vec::new(), vec![0.0; count * count]);
+        let mut made =
+            Self { drivers, driven, own, matrix, inverse, leading, edges, frictions, responses, gains, sticks };
+        let mut responses: Vec<Vec<Heads>> = (0..count).map(|_| Vec::with_capacity(count)).collect();
+        for b in 0..count {
+            let mut pulse = vec![Vec::new(); n];
+            pulse[made.sticks[b]].clone_from(&made.frictions[b].velocity[0]);
+            let through = made.through(&pulse);
+            for (a, row) in responses.iter_mut().enumerate() {
+                let mut response = made.at_edges(a, &through, m);
+                if let Some(kernels) = made.frictions[b].edges.as_ref().filter(|_| a == b) {
+                    response.iter_mut().zip(&kernels[0]).for_each(|(g, v)| *g += v);
+                }
+                made.gains[a * count + b] = response.first().copied().unwrap_or(0.0);
+                row.push(Heads::new(&response));
+            }
         }
-        made.first = response.first().copied().unwrap_or(0.0);
-        made.response = Heads::new(&response);
+        made.responses = responses;
         Ok(made)
     }
 
@@ -262,10 +277,10 @@ impl Operators {
         self.inverse.iter().map(of).collect()
     }
 
-    /// What velocities of all outputs add to that of the body at the ends of pulses.
-    pub(super) fn at_edges(&self, velocities: &[Vec<f64>], m: usize) -> Vec<f64> {
+    /// What velocities of all outputs add to that of a body that may stick at the ends of pulses.
+    pub(super) fn at_edges(&self, body: usize, velocities: &[Vec<f64>], m: usize) -> Vec<f64> {
         let mut out = vec![0.0; m];
-        for (kernel, velocity) in self.edges.iter().zip(velocities) {
+        for (kernel, velocity) in self.edges[body].iter().zip(velocities) {
             if let Some(kernel) = kernel {
                 out.iter_mut().zip(product(kernel, velocity)).for_each(|(s, v)| *s += v);
             }
@@ -273,12 +288,13 @@ impl Operators {
         out
     }
 
-    /// Derivative of the first number of the response from those of the body's α (`turn`) and of each own term of each
-    /// equation: (coefficient's, integration's).
-    pub(super) fn first_slope(&self, body: &Body, turn: f64, moves: &[Vec<(f64, f64)>]) -> f64 {
-        let Some(kernels) = &self.friction.edges else { return 0.0 };
-        let (n, b) = (self.matrix.len(), self.sticks);
-        let (through, through_slope) = (self.friction.velocity[0][0], turn * self.friction.velocity[1][0]);
+    /// Derivative of the first number of a body's response to its own friction from those of its α (`turn`) and of each
+    /// own term of each equation: (coefficient's, integration's).
+    pub(super) fn first_slope(&self, body: &Body, which: usize, turn: f64, moves: &[Vec<(f64, f64)>]) -> f64 {
+        let friction = &self.frictions[which];
+        let Some(kernels) = &friction.edges else { return 0.0 };
+        let (n, b) = (self.matrix.len(), self.sticks[which]);
+        let (through, through_slope) = (friction.velocity[0][0], turn * friction.velocity[1][0]);
         // First numbers of the velocities that a pulse of force gives, and of the system's slope times them.
         let velocities: Vec<f64> = (0..n).map(|j| self.leading[j * n + b] * through).collect();
         let mut rhs = vec![0.0; n];
@@ -303,13 +319,13 @@ impl Operators {
 /// A free run with all that its derivatives are made of.
 pub(super) struct Run {
     pub(super) outputs: Vec<Vec<f64>>,
-    /// That of the body as the equations have it, without what [`at_rest`] takes away.
-    pub(super) solved: Vec<f64>,
+    /// Those of the bodies that may stick as the equations have them, without what [`at_rest`] takes away.
+    pub(super) solved: Vec<Vec<f64>>,
     /// Pulse means of the velocities.
     pub(super) velocities: Vec<Vec<f64>>,
     pub(super) march: March,
-    /// Spectrum of the friction.
-    pub(super) force: Kernel,
+    /// Spectra of the frictions.
+    pub(super) forces: Vec<Kernel>,
 }
 
 impl Run {
@@ -322,45 +338,55 @@ impl Run {
                 }
             }
         }
-        let b = body.sticks;
-        let m = total.edges.len();
-        let free = operators.at_edges(&operators.through(&total.velocity), m);
-        let linear: Vec<f64> = free.iter().zip(&total.edges).map(|(a, b)| a + b).collect();
-        if let Some(index) = linear.iter().position(|v| !v.is_finite()) {
+        let m = total.output.first().map_or(0, Vec::len);
+        let driven = operators.through(&total.velocity);
+        let linear: Vec<Vec<f64>> = (total.edges.iter().enumerate())
+            .map(|(a, edges)| operators.at_edges(a, &driven, m).iter().zip(edges).map(|(x, y)| x + y).collect())
+            .collect();
+        if let Some(index) = linear.iter().find_map(|row| row.iter().position(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
-        let march = March::new(&linear, &operators.response, operators.first, body.friction, total.start);
-        if let Some(index) = march.edges.iter().position(|v| !v.is_finite()) {
+        let laws = body.frictions.iter().map(|f| f.1).collect();
+        let rubbing = Rubbing::new(laws, operators.gains.clone())?;
+        let march = March::new(&linear, &operators.responses, rubbing, &total.start);
+        if let Some(index) = march.bodies.iter().find_map(|x| x.edges.iter().position(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
         // What friction holds back though nothing else would is a difference of two large numbers.
         let largest = |values: &[f64]| values.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-        if largest(&linear) > LOST * (largest(&march.edges) + body.friction.breakaway() * operators.first) {
-            return Err(Error::Diverged { what: "free run without its friction".into(), index: linear.len() });
+        for (a, (row, moved)) in linear.iter().zip(&march.bodies).enumerate() {
+            let held = march.rubbing().breakaway(a) * march.rubbing().own(a);
+            if largest(row) > LOST * (largest(&moved.edges) + held) {
+                return Err(Error::Diverged { what: "free run without its friction".into(), index: row.len() });
+            }
         }
-        let force = Kernel::new(&march.force);
-        let held = operators.friction.of(&force, 0);
-        total.output[b].iter_mut().zip(&held.output).for_each(|(b, v)| *b -= v);
-        total.velocity[b].iter_mut().zip(&held.velocity).for_each(|(b, v)| *b -= v);
-        let still = march.edges.iter().all(|v| *v == 0.0);
-        let mut outputs = if still && body.equations.len() == 1 {
-            vec![vec![total.levels[b]; m]]
+        let forces: Vec<Kernel> = march.bodies.iter().map(|x| Kernel::new(&x.force)).collect();
+        for ((&b, friction), force) in operators.sticks.iter().zip(&operators.frictions).zip(&forces) {
+            let held = friction.of(force, 0);
+            total.output[b].iter_mut().zip(&held.output).for_each(|(b, v)| *b -= v);
+            total.velocity[b].iter_mut().zip(&held.velocity).for_each(|(b, v)| *b -= v);
+        }
+        let alone = body.equations.len() == 1;
+        let mut outputs = if alone && march.bodies.iter().all(Trace::is_still) {
+            total.levels.iter().map(|&level| vec![level; m]).collect()
         } else {
             let rhs: Vec<&[f64]> = total.output.iter().map(Vec::as_slice).collect();
             series::solve(&operators.matrix, &rhs)?
         };
-        let solved = outputs[b].clone();
-        if still {
-            // What never leaves its rest is where it was, not where rounding puts it.
-            outputs[b] = vec![total.levels[b]; m];
-        } else if outputs.len() > 1 {
-            at_rest(&mut outputs[b], &march);
+        let solved = operators.sticks.iter().map(|&b| outputs[b].clone()).collect();
+        for (&b, moved) in operators.sticks.iter().zip(&march.bodies) {
+            if moved.is_still() {
+                // What never leaves its rest is where it was, not where rounding puts it.
+                outputs[b] = vec![total.levels[b]; m];
+            } else if !alone {
+                at_rest(&mut outputs[b], moved);
+            }
         }
         if let Some(index) = outputs.iter().find_map(|y| y.iter().position(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
         let velocities = operators.through(&total.velocity);
-        Ok(Self { outputs, solved, velocities, march, force })
+        Ok(Self { outputs, solved, velocities, march, forces })
     }
 }
 
@@ -368,9 +394,9 @@ impl Run {
 ///
 /// Its velocity is 0 at the edges of each pulse, but a force that another body exerts changes within it while friction's
 /// mean stands, which moves the mean position by a share of the square of the step.
-pub(super) fn at_rest(output: &mut [f64], march: &March) {
+pub(super) fn at_rest(output: &mut [f64], body: &Trace) {
     let (mut crept, mut before) = (0.0, output.first().copied().unwrap_or(0.0));
-    for (value, edges) in output.iter_mut().skip(1).zip(march.edges.windows(3)) {
+    for (value, edges) in output.iter_mut().skip(1).zip(body.edges.windows(3)) {
         let now = *value;
         if edges.iter().all(|v| *v == 0.0) {
             crept += now - before;

@@ -1,4 +1,4 @@
-//! Output error of a body with friction, by Levenberg–Marquardt: orders, coefficients, and the states of every run.
+//! Output error of bodies with friction, by Levenberg–Marquardt: orders, coefficients, and the states of every run.
 
 use super::model::{Evaluation, FrictionModel, Point};
 use crate::dense;
@@ -84,7 +84,7 @@ impl Problem for OutputError<'_> {
         for (j, (value, step)) in next.coefficients.iter_mut().zip(coefficients).enumerate() {
             let before = *value;
             *value = self.model.coordinates[j].shifted(before, *step);
-            if self.model.friction.rubs(j) {
+            if self.model.rubs(j) {
                 *value = value.max(0.0);
             }
             moved = moved.max(share(before, *value));
@@ -124,7 +124,7 @@ impl Problem for OutputError<'_> {
             return (value - free.bounds.0, free.bounds.1 - value);
         }
         let plain = self.model.coordinates.get(j).is_some_and(|c| c.stretch(2.0) == 1.0);
-        if plain && self.model.friction.rubs(j) {
+        if plain && self.model.rubs(j) {
             return (point.coefficients[j], f64::INFINITY);
         }
         (f64::INFINITY, f64::INFINITY)
@@ -193,8 +193,8 @@ impl Problem for Begun<'_> {
     }
 }
 
-/// Constants at which the states of a run are begun, as shares of its friction: where a body rests hangs on the sign of
-/// what is left of the two, which a descent does not cross.
+/// Constants at which the states of a run are begun, as shares of each friction while others are 0: where a body rests
+/// hangs on the sign of what is left of the two, which a descent does not cross.
 const BEGUN: [f64; 3] = [0.0, 0.5, -0.5];
 const BEGUN_SETTINGS: Settings = Settings { evaluations: 30, tolerance: 1e-6 };
 
@@ -208,10 +208,16 @@ fn begun(
     stop: &Stop,
 ) -> Vec<f64> {
     let problem = Begun { model, experiment, orders, coefficients, inputs, stop };
-    let plain = model.first_states(orders, experiment, 0.0);
+    let held: Vec<f64> = model.frictions.iter().map(|(_, law)| law.at(coefficients).breakaway()).collect();
+    let plain = model.first_states(orders, experiment, &vec![0.0; held.len()]);
     let mut best = (f64::INFINITY, plain.clone());
-    for share in BEGUN {
-        let start = model.first_states(orders, experiment, share * model.friction.at(coefficients).breakaway());
+    for (share, which) in BEGUN.iter().flat_map(|share| (0..held.len()).map(move |which| (*share, which))) {
+        if share == 0.0 && which > 0 {
+            continue;
+        }
+        let constants: Vec<f64> =
+            held.iter().enumerate().map(|(a, most)| if a == which { share * most } else { 0.0 }).collect();
+        let start = model.first_states(orders, experiment, &constants);
         if share != 0.0 && start == plain {
             continue;
         }
@@ -255,7 +261,7 @@ pub fn fit_until(
     let orders: Vec<f64> =
         start.orders.iter().zip(&model.order_bounds).map(|(o, &(low, high))| o.clamp(low, high)).collect();
     let mut coefficients = start.coefficients.clone();
-    for (_, value) in coefficients.iter_mut().enumerate().filter(|(j, _)| model.friction.rubs(*j)) {
+    for (_, value) in coefficients.iter_mut().enumerate().filter(|(j, _)| model.rubs(*j)) {
         *value = value.max(0.0);
     }
     let inputs: Vec<f64> =

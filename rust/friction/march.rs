@@ -1,74 +1,126 @@
-//! The set-valued law φ ∈ F(V) sgn(V), V = L − g ∗ φ, pulse by pulse, and what moves with it.
+//! The set-valued law φ ∈ F(V) sgn(V), V = L − g ∗ φ, of all bodies that may stick, pulse by pulse, and what moves with it.
 
-use super::law::{Law, Moves, Phase, Pulse};
+use super::law::{Moves, Phase, Pulse};
 use super::online::{Heads, Online};
+use super::pulses::Rubbing;
 
-/// A march over all pulses.
+/// What a body that may stick did.
 #[derive(Debug, Clone, PartialEq)]
-pub struct March {
-    /// Mean of the friction over each pulse, not beyond the most that it holds but for rounding.
+pub struct Trace {
+    /// Mean of the friction over each pulse, in the unit of its D^α y, not beyond the most that it holds but for rounding.
     pub force: Vec<f64>,
     /// Velocity at the edges of the pulses, one more than there are pulses; exactly 0 at rest.
     pub edges: Vec<f64>,
     /// What happened in each pulse.
     pub phases: Vec<Phase>,
-    /// Velocity at the end of each pulse if there were no friction in it.
+    /// Velocity at the end of each pulse if there were no friction of its own in it.
     free: Vec<f64>,
-    law: Law,
-    /// What a unit of force in a pulse takes from the velocity at its end.
-    first: f64,
+}
+
+impl Trace {
+    /// Whether it never left its rest.
+    #[must_use]
+    pub fn is_still(&self) -> bool {
+        self.edges.iter().all(|v| *v == 0.0)
+    }
+}
+
+/// A march over all pulses.
+#[derive(Debug, Clone, PartialEq)]
+pub struct March {
+    /// Of each body that may stick.
+    pub bodies: Vec<Trace>,
+    rubbing: Rubbing,
 }
 
 /// Share of the largest velocity without friction that may be rounding: a force that equals friction moves nothing.
 const ROUNDING: f64 = 1e-12;
 
 impl March {
-    /// Marches from a velocity: `linear` is L at the ends of the pulses, `response` g, `first` its first number.
+    /// Marches from velocities: `linear` is L of each body at the ends of the pulses, `responses` g, those of a body's
+    /// velocity to forces on each.
     #[must_use]
-    pub fn new(linear: &[f64], response: &Heads, first: f64, law: Law, start: f64) -> Self {
-        let m = linear.len();
-        let mut march = Self {
-            force: Vec::new(),
-            edges: Vec::with_capacity(m + 1),
-            phases: Vec::with_capacity(m),
-            free: Vec::with_capacity(m),
-            law,
-            first,
-        };
-        march.edges.push(start);
-        let rounding = ROUNDING * linear.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-        let mut past = Online::new(response);
-        let mut v = start;
-        for &l in linear {
-            let p = l - past.past();
-            let Pulse { force, end, phase } = law.pulse(v, p, first, rounding);
-            past.push(force);
-            march.free.push(p);
-            march.phases.push(phase);
-            march.edges.push(end);
-            v = end;
+    pub fn new(linear: &[Vec<f64>], responses: &[Vec<Heads>], rubbing: Rubbing, start: &[f64]) -> Self {
+        let n = rubbing.count();
+        let m = linear.first().map_or(0, Vec::len);
+        let mut bodies: Vec<Trace> = (start.iter())
+            .map(|&v| {
+                let (force, phases, free) = (Vec::new(), Vec::with_capacity(m), Vec::with_capacity(m));
+                let mut edges = Vec::with_capacity(m + 1);
+                edges.push(v);
+                Trace { force, edges, phases, free }
+            })
+            .collect();
+        let rounding: Vec<f64> =
+            linear.iter().map(|row| ROUNDING * row.iter().fold(0.0_f64, |a, v| a.max(v.abs()))).collect();
+        let mut pasts: Vec<Vec<Online>> = responses.iter().map(|row| row.iter().map(Online::new).collect()).collect();
+        let (mut v, mut forces) = (start.to_vec(), vec![0.0; n]);
+        let (mut p, mut at) = (vec![0.0; n], Vec::with_capacity(n));
+        for k in 0..m {
+            for ((p, row), linear) in p.iter_mut().zip(&pasts).zip(linear) {
+                *p = linear[k] - row.iter().map(Online::past).sum::<f64>();
+            }
+            rubbing.pulse(&v, &p, &rounding, &forces, &mut at);
+            for (a, &(free, Pulse { force, end, phase })) in at.iter().enumerate() {
+                pasts.iter_mut().for_each(|row| row[a].push(force));
+                let body = &mut bodies[a];
+                body.free.push(free);
+                body.phases.push(phase);
+                body.edges.push(end);
+                (v[a], forces[a]) = (end, force);
+            }
         }
-        march.force = past.into_signal();
-        march
+        if let Some(row) = pasts.into_iter().next() {
+            bodies.iter_mut().zip(row).for_each(|(body, past)| body.force = past.into_signal());
+        }
+        Self { bodies, rubbing }
     }
 
-    /// How the friction moves with a parameter: `moved` is the derivative of L − g ∗ φ at the ends of the pulses while φ
-    /// stands, `first` that of g₀, `law` those of fc, fs and vs, `start` that of the velocity at the start. None where no
-    /// friction moves.
+    /// The laws of the bodies and what moves what within a pulse.
     #[must_use]
-    pub fn slope(&self, moved: &[f64], response: &Heads, first: f64, law: [f64; 3], start: f64) -> Option<Vec<f64>> {
-        let mut past = Online::new(response);
-        let mut dv = start;
+    pub fn rubbing(&self) -> &Rubbing {
+        &self.rubbing
+    }
+
+    /// How the frictions move with a parameter: `moved` is the derivative of L − g ∗ φ of each body at the ends of the
+    /// pulses while φ stands, `first` that of its own g₀, `laws` those of its fc, fs and vs, `start` that of its velocity
+    /// at the start. None where no friction moves.
+    #[must_use]
+    pub fn slope(
+        &self,
+        moved: &[Vec<f64>],
+        responses: &[Vec<Heads>],
+        first: &[f64],
+        laws: &[[f64; 3]],
+        start: &[f64],
+    ) -> Option<Vec<Vec<f64>>> {
+        let n = self.bodies.len();
+        let m = moved.first().map_or(0, Vec::len);
+        let mut pasts: Vec<Vec<Online>> = responses.iter().map(|row| row.iter().map(Online::new).collect()).collect();
+        let mut dv = start.to_vec();
+        let (mut v, mut at, mut moves) = (Vec::with_capacity(n), Vec::with_capacity(n), Vec::with_capacity(n));
+        let mut slopes = Vec::with_capacity(n);
         let mut any = false;
-        for (k, &w) in moved.iter().enumerate() {
-            let (v, p, force) = (self.edges[k], self.free[k], self.force[k]);
-            let at = Pulse { force, end: self.edges[k + 1], phase: self.phases[k] };
-            let dp = w + first * force - past.past();
-            let (df, dend) = self.law.slope(v, p, self.first, &at, &Moves { start: dv, free: dp, first, law });
-            dv = dend;
-            any |= df != 0.0;
-            past.push(df);
+        for k in 0..m {
+            v.clear();
+            at.clear();
+            moves.clear();
+            for (a, (body, moved)) in self.bodies.iter().zip(moved).enumerate() {
+                v.push(body.edges[k]);
+                let (force, end, phase) = (body.force[k], body.edges[k + 1], body.phases[k]);
+                at.push((body.free[k], Pulse { force, end, phase }));
+                let past: f64 = pasts[a].iter().map(Online::past).sum();
+                let free = moved[k] + first[a] * force - past;
+                moves.push(Moves { start: dv[a], free, first: first[a], law: laws[a] });
+            }
+            self.rubbing.slope(&v, &at, &moves, &mut slopes);
+            for (a, &(force, end)) in slopes.iter().enumerate() {
+                dv[a] = end;
+                any |= force != 0.0;
+                pasts.iter_mut().for_each(|row| row[a].push(force));
+            }
         }
-        any.then(|| past.into_signal())
+        let row = pasts.into_iter().next()?;
+        any.then(|| row.into_iter().map(Online::into_signal).collect())
     }
 }

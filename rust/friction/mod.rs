@@ -1,9 +1,10 @@
-//! Free runs of a body with dry friction, alone or among bodies coupled to it, and their output error.
+//! Free runs of bodies with dry friction, alone or among bodies coupled to them, and their output error.
 //!
 //! D^α y = Σ c D^ν s − F(Dy) sgn(Dy) + … with 1 < α ≤ 2, sgn set-valued at rest and F(v) = fc + fs exp(−(v/vs)²)
-//! ([`law`]). Everything but friction is linear, so superposition leaves one scalar problem: the velocity at the edges of
-//! the pulses is V = L − g ∗ φ with φ ∈ F(V) sgn(V), L the velocity without friction and g what a pulse of force does to
-//! it, both of the coupled equations ([`dynamics`]). It is marched pulse by pulse ([`march`]), the sum over the past by blocked transforms ([`online`]).
+//! ([`law`]). Everything but friction is linear, so superposition leaves one number a pulse and body that may stick: the
+//! velocity at the edges of the pulses is V = L − g ∗ φ with φ ∈ F(V) sgn(V), L the velocity without friction and g what a
+//! pulse of force does to it, both of the coupled equations ([`dynamics`]). It is marched pulse by pulse ([`march`]), the
+//! frictions of several bodies decided together ([`pulses`]), the sum over the past by blocked transforms ([`online`]).
 //! A body at rest stays exactly at rest while friction can hold it.
 //!
 //! Derivatives follow the march: φ is F while the body slides, and what holds it while it sticks. Offsets and the state in
@@ -16,6 +17,7 @@ pub mod law;
 pub mod march;
 mod model;
 pub mod online;
+pub mod pulses;
 mod states;
 
 pub use dynamics::{Body, Motion};

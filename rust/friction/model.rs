@@ -1,12 +1,13 @@
-//! A body with friction whose orders and coefficients are free: its residuals on every experiment, and their derivatives.
+//! Bodies with friction whose orders and coefficients are free: residuals on every experiment, and their derivatives.
 
 use super::dynamics::{at_rest, Body, Operators, Run};
 use super::integrals::{product, Integrated};
 use super::law::Law;
-use super::states::{add_impulses, parted, together, Forcing, State};
+use super::states::{together, Forcing, State};
 use crate::equation::{Equation, Initial, Structure, Term};
 use crate::error::{check_length, Error, Result};
 use crate::estimate::output_error::{Coordinate, Experiment, FreeEquation, FreeInput, InputLaw, Monomial};
+use crate::impulses::{add_impulses, parted};
 use crate::regressors::Record;
 use crate::series::Kernel;
 
@@ -45,15 +46,13 @@ impl FreeLaw {
     }
 }
 
-/// What is estimated: equations that follow each other's outputs, one with friction of its own output's velocity.
+/// What is estimated: equations that follow each other's outputs, some with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionModel {
     /// The linear terms.
     pub equations: Vec<FreeEquation>,
-    /// Which of them has friction.
-    pub sticks: usize,
-    /// F of − F(Dy) sgn(Dy).
-    pub friction: FreeLaw,
+    /// Which of them have friction, and F of − F(Dy) sgn(Dy).
+    pub frictions: Vec<(usize, FreeLaw)>,
     /// What is free of inputs, one number of an input at most.
     pub inputs: Vec<FreeInput>,
     /// Bounds of each free order.
@@ -118,7 +117,7 @@ impl FrictionModel {
             return Err(Error::Length { name: "experiments".into(), expected: 1, found: 0 });
         };
         let known = |c: &Monomial| c.powers.iter().all(|&(i, _)| i < self.coordinates.len());
-        if self.sticks >= self.equations.len() {
+        if self.frictions.is_empty() || self.frictions.iter().any(|f| f.0 >= self.equations.len()) {
             return refuse("friction stands in an equation that is not there", "number them from 0");
         }
         for FreeEquation { output, terms, .. } in &self.equations {
@@ -126,8 +125,8 @@ impl FrictionModel {
                 return refuse("an equation names a signal or a coefficient that is not there", "number them from 0");
             }
         }
-        let numbers = self.friction.numbers();
-        if numbers.iter().any(|n| !known(n) || n.powers.len() > 1 || n.factor < 0.0) {
+        let mut numbers = self.frictions.iter().flat_map(|(_, law)| law.numbers());
+        if numbers.any(|n| !known(n) || n.powers.len() > 1 || n.factor < 0.0) {
             return refuse("friction is no multiple of one free coefficient", "give it one that is not negative");
         }
         for (k, &FreeInput { signal, law, bounds: (low, high) }) in self.inputs.iter().enumerate() {
@@ -160,6 +159,11 @@ impl FrictionModel {
         self.initial.check()
     }
 
+    /// Whether a coefficient is a force of some friction, which is not negative.
+    pub(super) fn rubs(&self, coefficient: usize) -> bool {
+        self.frictions.iter().any(|(_, law)| law.rubs(coefficient))
+    }
+
     fn body(&self, orders: &[f64], coefficients: &[f64]) -> Body {
         let at = |law: &crate::equation::AffineOrder| {
             law.constant + law.weights.iter().zip(orders).map(|(w, x)| w * x).sum::<f64>()
@@ -174,8 +178,7 @@ impl FrictionModel {
         };
         Body {
             equations: self.equations.iter().map(of).collect(),
-            sticks: self.sticks,
-            friction: self.friction.at(coefficients),
+            frictions: self.frictions.iter().map(|(place, law)| (*place, law.at(coefficients))).collect(),
         }
     }
 
@@ -190,15 +193,18 @@ impl FrictionModel {
         (State::all(&body.equations, &self.initial, &self.filtered, moves), body.equations)
     }
 
-    /// States of a run as its first samples have them: where the bodies are and how fast, a constant beside friction as
+    /// States of a run as its first samples have them: where the bodies are and how fast, constants beside frictions as
     /// given, the rest 0.
-    pub(super) fn first_states(&self, orders: &[f64], experiment: &Experiment, constant: f64) -> Vec<f64> {
+    pub(super) fn first_states(&self, orders: &[f64], experiment: &Experiment, constants: &[f64]) -> Vec<f64> {
         let (states, equations) = self.states(orders);
         let begun: Vec<(f64, f64)> = experiment.samples.iter().map(|samples| first_of(samples, experiment)).collect();
         let value = |state: &State| match *state {
             State::Level(i) => begun[i].0,
             State::Rate(i) => begun[i].1,
-            State::Offset(i, 0) if i == self.sticks => constant / libm::tgamma(equations[i].structure.order + 1.0),
+            State::Offset(i, 0) => {
+                let own = self.frictions.iter().zip(constants).find(|((place, _), _)| *place == i);
+                own.map_or(0.0, |(_, constant)| constant / libm::tgamma(equations[i].structure.order + 1.0))
+            }
             _ => 0.0,
         };
         states.iter().map(value).collect()
@@ -216,9 +222,9 @@ impl FrictionModel {
     }
 
     fn forcing(&self, orders: &[f64], coefficients: &[f64], values: &[f64], record: &Record) -> Result<Forcing> {
-        let links = self.body(orders, coefficients).links();
+        let body = self.body(orders, coefficients);
         let (powers, _) = parted(&self.powers(orders, coefficients, values));
-        Forcing::of(&powers, &links, self.sticks, record.m(), record.step())
+        Forcing::of(&powers, &body.links(), &body.sticks(), record.m(), record.step())
     }
 
     /// The record as its inputs act, none where that is as they are, and how these move with their free numbers.
@@ -281,7 +287,7 @@ impl FrictionModel {
         let body = self.body(&point.orders, &point.coefficients);
         let mut columns = vec![Vec::with_capacity(at.residuals.len()); all.len()];
         for (index, (experiment, part)) in experiments.iter().zip(&at.parts).enumerate() {
-            let spectra = Spectra::new(part, self.sticks);
+            let spectra = Spectra::new(part, &body.sticks());
             for (column, moved) in columns.iter_mut().zip(&all) {
                 if matches!(moved, Moved::State(run, _) if *run != index) {
                     column.extend(std::iter::repeat_n(0.0, self.equations.len() * experiment.compared()));
@@ -321,8 +327,7 @@ impl FrictionModel {
                 return Ok(slopes);
             }
         }
-        let Moves { alphas, terms: moves, friction: friction_moves } = self.moves(point, moved);
-        let b = self.sticks;
+        let Moves { alphas, terms: moves, frictions } = self.moves(point, moved);
         let mut total = self.forcing_slope(point, &point.states[run], record, moved)?;
         let mut add = |i: usize, weight: f64, part: &Integrated| {
             if weight != 0.0 {
@@ -353,20 +358,28 @@ impl FrictionModel {
                 }
             }
         }
-        if alphas[b] != 0.0 {
-            add(b, -alphas[b], &operators.friction.of(&motion.force, 1));
+        let sticks = body.sticks();
+        for ((&b, friction), force) in sticks.iter().zip(&operators.frictions).zip(&motion.forces) {
+            if alphas[b] != 0.0 {
+                add(b, -alphas[b], &friction.of(force, 1));
+            }
         }
-        let through = operators.at_edges(&operators.through(&total.velocity), record.m());
-        let at_ends: Vec<f64> = through.iter().zip(&total.edges).map(|(a, b)| a + b).collect();
-        let first = operators.first_slope(body, alphas[b], &moves);
-        let forces = motion.march.slope(&at_ends, &operators.response, first, friction_moves, total.start);
-        if let Some(forces) = forces {
-            let held = operators.friction.of(&Kernel::new(&forces), 0);
+        let through = operators.through(&total.velocity);
+        let at_ends: Vec<Vec<f64>> = (total.edges.iter().enumerate())
+            .map(|(a, edges)| {
+                operators.at_edges(a, &through, record.m()).iter().zip(edges).map(|(x, y)| x + y).collect()
+            })
+            .collect();
+        let first: Vec<f64> =
+            sticks.iter().enumerate().map(|(a, &b)| operators.first_slope(body, a, alphas[b], &moves)).collect();
+        let forces = motion.march.slope(&at_ends, &operators.responses, &first, &frictions, &total.start);
+        for ((&b, friction), force) in sticks.iter().zip(&operators.frictions).zip(forces.iter().flatten()) {
+            let held = friction.of(&Kernel::new(force), 0);
             total.output[b].iter_mut().zip(&held.output).for_each(|(s, v)| *s -= v);
         }
         let mut slopes = operators.through(&total.output);
         if slopes.len() > 1 {
-            at_rest(&mut slopes[b], &motion.march);
+            sticks.iter().zip(&motion.march.bodies).for_each(|(&b, moved)| at_rest(&mut slopes[b], moved));
         }
         Ok(slopes)
     }
@@ -376,7 +389,7 @@ impl FrictionModel {
         let mut out = Moves {
             alphas: vec![0.0; self.equations.len()],
             terms: self.equations.iter().map(|e| vec![(0.0, 0.0); e.terms.len()]).collect(),
-            friction: [0.0; 3],
+            frictions: vec![[0.0; 3]; self.frictions.len()],
         };
         match *moved {
             Moved::Order(j) => {
@@ -391,7 +404,9 @@ impl FrictionModel {
                 for (terms, equation) in out.terms.iter_mut().zip(&self.equations) {
                     *terms = equation.terms.iter().map(|t| (t.2.slope(&point.coefficients, j), 0.0)).collect();
                 }
-                out.friction = self.friction.numbers().map(|number| number.slope(&point.coefficients, j));
+                for (moves, (_, law)) in out.frictions.iter_mut().zip(&self.frictions) {
+                    *moves = law.numbers().map(|number| number.slope(&point.coefficients, j));
+                }
             }
             Moved::State(..) | Moved::Input(_) => {}
         }
@@ -401,7 +416,8 @@ impl FrictionModel {
     /// How what a run starts with moves: it is linear in states and coefficients, and smooth in orders.
     fn forcing_slope(&self, point: &Point, values: &[f64], record: &Record, moved: &Moved) -> Result<Forcing> {
         let idle = values.is_empty() || values.iter().all(|x| *x == 0.0);
-        let none = || Ok(Forcing::none(record.m(), self.equations.len(), self.sticks));
+        let sticks: Vec<usize> = self.frictions.iter().map(|f| f.0).collect();
+        let none = || Ok(Forcing::none(record.m(), self.equations.len(), &sticks));
         match *moved {
             Moved::State(_, state) => {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
@@ -440,11 +456,11 @@ impl FrictionModel {
     }
 }
 
-/// Derivatives of each α, of (coefficient, integration) of each term, and of fc, fs and vs.
+/// Derivatives of each α, of (coefficient, integration) of each term, and of each fc, fs and vs.
 struct Moves {
     alphas: Vec<f64>,
     terms: Vec<Vec<(f64, f64)>>,
-    friction: [f64; 3],
+    frictions: Vec<[f64; 3]>,
 }
 
 /// Level and velocity of an output as its first samples have them.
@@ -477,10 +493,11 @@ fn difference(up: &Forcing, down: &Forcing, step: f64) -> Forcing {
 struct Spectra(Vec<(Kernel, Kernel)>);
 
 impl Spectra {
-    fn new(part: &Part, sticks: usize) -> Self {
+    fn new(part: &Part, sticks: &[usize]) -> Self {
         let run = &part.run;
         let of = |(j, (y, v)): (usize, (&Vec<f64>, &Vec<f64>))| {
-            (Kernel::new(if j == sticks { &run.solved } else { y }), Kernel::new(v))
+            let solved = sticks.iter().position(|&b| b == j).map_or(y, |a| &run.solved[a]);
+            (Kernel::new(solved), Kernel::new(v))
         };
         Self(run.outputs.iter().zip(&run.velocities).enumerate().map(of).collect())
     }

@@ -4,6 +4,7 @@ use super::integrals::Integrated;
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{Error, Result};
 use crate::excess::kernel;
+use crate::impulses::is_impulse;
 use crate::kernels::power_means;
 use crate::small;
 
@@ -25,33 +26,43 @@ pub(super) struct Forcing {
     pub(super) output: Vec<Vec<f64>>,
     /// Pulse means on the level of the velocity.
     pub(super) velocity: Vec<Vec<f64>>,
-    /// The same at the ends of the pulses, of the body that may stick.
-    pub(super) edges: Vec<f64>,
-    /// The velocity of that body at the start.
-    pub(super) start: f64,
+    /// The same at the ends of the pulses, of each body that may stick.
+    pub(super) edges: Vec<Vec<f64>>,
+    /// The velocities of these bodies at the start.
+    pub(super) start: Vec<f64>,
     /// The outputs at the start.
     pub(super) levels: Vec<f64>,
-    sticks: usize,
+    m: usize,
+    /// Which bodies may stick.
+    sticks: Vec<usize>,
 }
 
 impl Forcing {
-    pub(super) fn none(m: usize, n: usize, sticks: usize) -> Self {
+    pub(super) fn none(m: usize, n: usize, sticks: &[usize]) -> Self {
         let rows = vec![vec![0.0; m]; n];
-        Self { output: rows.clone(), velocity: rows, edges: vec![0.0; m], start: 0.0, levels: vec![0.0; n], sticks }
+        Self {
+            output: rows.clone(),
+            velocity: rows,
+            edges: vec![vec![0.0; m]; sticks.len()],
+            start: vec![0.0; sticks.len()],
+            levels: vec![0.0; n],
+            m,
+            sticks: sticks.to_vec(),
+        }
     }
 
     /// The same size, nothing in it.
     pub(super) fn nothing(&self) -> Self {
-        Self::none(self.edges.len(), self.levels.len(), self.sticks)
+        Self::none(self.m, self.levels.len(), &self.sticks)
     }
 
     /// Adds another one, weighted.
     pub(super) fn add(&mut self, weight: f64, other: &Self) {
         let rows = self.output.iter_mut().chain(&mut self.velocity).zip(other.output.iter().chain(&other.velocity));
-        for (sum, part) in rows.chain([(&mut self.edges, &other.edges)]) {
+        for (sum, part) in rows.chain(self.edges.iter_mut().zip(&other.edges)) {
             sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
         }
-        self.start += weight * other.start;
+        self.start.iter_mut().zip(&other.start).for_each(|(s, v)| *s += weight * v);
         self.levels.iter_mut().zip(&other.levels).for_each(|(s, v)| *s += weight * v);
     }
 
@@ -60,8 +71,8 @@ impl Forcing {
         let add = |sum: &mut Vec<f64>, part: &[f64]| sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
         add(&mut self.output[equation], &part.output);
         add(&mut self.velocity[equation], &part.velocity);
-        if equation == self.sticks {
-            add(&mut self.edges, &part.edges);
+        if let Some(body) = self.sticks.iter().position(|&b| b == equation) {
+            add(&mut self.edges[body], &part.edges);
         }
     }
 
@@ -77,7 +88,7 @@ impl Forcing {
     pub(super) fn of(
         powers: &[Vec<(f64, f64)>],
         links: &[Vec<Link>],
-        sticks: usize,
+        sticks: &[usize],
         m: usize,
         step: f64,
     ) -> Result<Self> {
@@ -85,6 +96,7 @@ impl Forcing {
         let mut out = Self::none(m, n, sticks);
         out.levels = levels(powers, links)?;
         for (i, own) in powers.iter().enumerate() {
+            let body = sticks.iter().position(|&b| b == i);
             let mut rates: Vec<(f64, f64, f64)> = Vec::new();
             let mut rate =
                 |exponent: f64, value: f64| match rates.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN) {
@@ -93,7 +105,8 @@ impl Forcing {
                 };
             for &(exponent, value) in own {
                 if value != 0.0 {
-                    let means = if i == sticks { power_means(exponent, m, step) } else { means_of(exponent, m, step) };
+                    let means =
+                        if body.is_some() { power_means(exponent, m, step) } else { means_of(exponent, m, step) };
                     out.output[i].iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
                 }
                 if exponent.abs() >= ORDER_GRAIN {
@@ -120,15 +133,13 @@ impl Forcing {
                                 .into(),
                     });
                 }
-                let means = if i == sticks { power_means(exponent, m, step) } else { means_of(exponent, m, step) };
+                let means = if body.is_some() { power_means(exponent, m, step) } else { means_of(exponent, m, step) };
                 out.velocity[i].iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
-                if i != sticks {
-                    continue;
-                }
+                let Some(body) = body else { continue };
                 let ends = (1..=m).map(|k| libm::pow(k as f64 * step, exponent));
-                out.edges.iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
+                out.edges[body].iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
                 if exponent.abs() < ORDER_GRAIN {
-                    out.start += value;
+                    out.start[body] += value;
                 }
             }
         }
@@ -232,7 +243,7 @@ impl State {
 
     /// Whether it moves no body, only the filter of an output.
     pub(super) fn is_impulse(&self) -> bool {
-        matches!(self, Self::Power(_, e) if *e <= -1.0 && e.fract() == 0.0)
+        matches!(self, Self::Power(_, e) if is_impulse(*e))
     }
 
     /// The powers of t that a unit of it is, on the level of the outputs: equation, exponent, coefficient.
@@ -257,22 +268,6 @@ impl State {
             }
             Self::Offset(i, more) => vec![(i, equations[i].structure.order + f64::from(more), 1.0)],
             Self::Power(i, exponent) => vec![(i, exponent, 1.0)],
-        }
-    }
-}
-
-/// Powers of t that move bodies, and impulses that only the filters of their outputs get, by equation.
-#[allow(clippy::type_complexity)]
-pub(super) fn parted(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
-    powers.iter().map(|own| own.iter().partition(|(e, _)| !(*e <= -1.0 && e.fract() == 0.0))).unzip()
-}
-
-/// Adds impulses and their derivatives to pulse means of outputs.
-pub(super) fn add_impulses(outputs: &mut [Vec<f64>], impulses: &[Vec<(f64, f64)>], step: f64) {
-    for (output, own) in outputs.iter_mut().zip(impulses) {
-        for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
-            let means = power_means(exponent, output.len(), step);
-            output.iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
         }
     }
 }

@@ -1,6 +1,6 @@
-//! Free runs of a body with friction, and their output error.
+//! Free runs of bodies with friction, and their output error.
 
-use numpy::PyArray1;
+use numpy::{PyArray1, PyArray2};
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
@@ -13,6 +13,7 @@ use super::search::watch::{leavable, Stop};
 use crate::equation::Equation;
 use crate::estimate::output_error as joint;
 use crate::friction::law::Phase;
+use crate::friction::march::Trace;
 use crate::friction::{self, Body, FreeLaw, FrictionModel, Law, Start};
 
 #[pyfunction]
@@ -21,32 +22,35 @@ pub fn friction_respond<'py>(
     py: Python<'py>,
     run: RecordArg<'py>,
     equations: Vec<(StructureArg, Vec<f64>)>,
-    sticks: usize,
-    strength: (f64, f64, f64),
+    frictions: Vec<(usize, (f64, f64, f64))>,
     terms: Vec<Vec<(f64, f64)>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let record = record(&run)?;
     let inputs = vec![true; record.len()];
-    let (coulomb, stribeck, speed) = strength;
-    let friction = Law { coulomb, stribeck, speed };
+    let frictions = frictions
+        .into_iter()
+        .map(|(place, (coulomb, stribeck, speed))| (place, Law { coulomb, stribeck, speed }))
+        .collect();
     let equations = equations
         .into_iter()
         .map(|(arg, coefficients)| Ok(Equation { structure: structure(arg, record.len(), &inputs)?, coefficients }))
         .collect::<PyResult<_>>()?;
-    let body = Body { equations, sticks, friction };
+    let body = Body { equations, frictions };
     let motion = leavable(py, record.m(), None, move |_| body.run(&record, &terms))?;
     let dict = PyDict::new(py);
     dict.set_item("outputs", stacked(py, &motion.outputs)?)?;
-    dict.set_item("velocity", PyArray1::from_vec(py, motion.velocity))?;
-    dict.set_item("force", PyArray1::from_vec(py, motion.force))?;
-    let stuck = motion.phases.iter().map(|phase| *phase == Phase::Stick).collect();
-    dict.set_item("stuck", PyArray1::from_vec(py, stuck))?;
+    let rows = |of: fn(&Trace) -> &Vec<f64>| motion.bodies.iter().map(|body| of(body).clone()).collect::<Vec<_>>();
+    dict.set_item("velocity", stacked(py, &rows(|body| &body.edges))?)?;
+    dict.set_item("force", stacked(py, &rows(|body| &body.force))?)?;
+    let stuck: Vec<Vec<bool>> =
+        (motion.bodies.iter()).map(|body| body.phases.iter().map(|phase| *phase == Phase::Stick).collect()).collect();
+    dict.set_item("stuck", PyArray2::from_vec2(py, &stuck)?)?;
     Ok(dict)
 }
 
 #[pyfunction]
 #[pyo3(signature = (
-    runs, laws, sticks, strength, order_bounds, names, terms, orders, coefficients, inputs, states, evaluations,
+    runs, laws, frictions, order_bounds, names, terms, orders, coefficients, inputs, states, evaluations,
     tolerance, stop=None,
 ))]
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
@@ -54,8 +58,7 @@ pub fn friction_error<'py>(
     py: Python<'py>,
     runs: Vec<ExperimentArg<'py>>,
     laws: Vec<FreeEquationArg>,
-    sticks: usize,
-    strength: [MonomialArg; 3],
+    frictions: Vec<(usize, [MonomialArg; 3])>,
     order_bounds: Vec<(f64, f64)>,
     names: Vec<String>,
     terms: InitialArg,
@@ -68,11 +71,16 @@ pub fn friction_error<'py>(
     stop: Option<&Stop>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
-    let [coulomb, stribeck, speed] = strength.map(|(factor, powers)| joint::Monomial { factor, powers });
+    let frictions = frictions
+        .into_iter()
+        .map(|(place, numbers)| {
+            let [coulomb, stribeck, speed] = numbers.map(|(factor, powers)| joint::Monomial { factor, powers });
+            (place, FreeLaw { coulomb, stribeck, speed })
+        })
+        .collect();
     let model = FrictionModel {
         equations: laws.into_iter().map(free_equation).collect(),
-        sticks,
-        friction: FreeLaw { coulomb, stribeck, speed },
+        frictions,
         inputs: free_inputs(&inputs)?,
         order_bounds,
         coordinates: coordinates(&names)?,

@@ -218,6 +218,79 @@ def hub_and_link(
     return angles, rate
 
 
+def two_bodies(
+    force: Callable[[float], Sequence[float]], times: np.ndarray, springs: Sequence[Sequence[float]],
+    dampers: Sequence[Sequence[float]], friction: Sequence[tuple[float, float, float]],
+    start: Sequence[float] = (0.0, 0.0, 0.0, 0.0), width: float | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Two bodies on dry friction that pull at each other, between their events: positions and velocities, (2, times).
+
+    D^2 y_i = sum_j (springs_ij y_j + dampers_ij Dy_j) + F_i - (f_i + fs_i exp(-(Dy_i/vs_i)^2)) sgn(Dy_i); the start is
+    (y_1, Dy_1, y_2, Dy_2). Each of the nine ways to slide to a side or rest is an equation of its own. With a width the
+    sign is tanh(Dy / width), and no body ever rests.
+    """
+    k, d, end = np.asarray(springs), np.asarray(dampers), float(times[-1])
+    most = [f + more for f, more, _ in friction]
+    state, now = np.array(start, dtype=float), 0.0
+    places, rates = np.zeros((2, times.size)), np.zeros((2, times.size))
+    places[:, 0], rates[:, 0] = state[::2], state[1::2]
+
+    def pull(t: float, x: np.ndarray) -> np.ndarray:
+        return k @ x[::2] + d @ x[1::2] + np.asarray(force(t))
+
+    def rubs(i: int, v: float) -> float:
+        f, more, speed = friction[i]
+        return f + more * float(np.exp(-((v / speed) ** 2)))
+
+    def at_rest(i: int, t: float, x: np.ndarray) -> float:
+        there = float(pull(t, x)[i])
+        return float(np.sign(there)) if abs(there) > most[i] else 0.0
+
+    if width is not None:
+
+        def smooth(t: float, x: np.ndarray) -> list[float]:
+            a = pull(t, x) - [rubs(i, x[2 * i + 1]) * np.tanh(x[2 * i + 1] / width) for i in range(2)]
+            return [x[1], a[0], x[3], a[1]]
+
+        found = solve_ivp(smooth, (0.0, end), state, method="LSODA", t_eval=times, rtol=1e-9, atol=1e-11,
+                          max_step=end / 2000)  # fmt: skip
+        return found.y[::2], found.y[1::2]
+    sides = [float(np.sign(state[2 * i + 1])) or at_rest(i, 0.0, state) for i in range(2)]
+    while now < end:
+
+        def motion(t: float, x: np.ndarray, s: Sequence[float] = tuple(sides)) -> list[float]:
+            v = np.where(np.asarray(s) != 0.0, x[1::2], 0.0)
+            still = np.array([x[0], v[0], x[2], v[1]])
+            a = pull(t, still) - [s[i] * rubs(i, v[i]) for i in range(2)]
+            return [v[0], a[0] if s[0] else 0.0, v[1], a[1] if s[1] else 0.0]
+
+        def event_of(i: int, begun: float = now, sides: Sequence[float] = tuple(sides)):
+            def event(t: float, x: np.ndarray, s: float = sides[i]) -> float:
+                if s:
+                    return s * x[2 * i + 1] if t > begun + 1e-9 else 1.0
+                return abs(float(pull(t, x)[i])) - most[i] if t > begun + 1e-9 else -1.0
+
+            event.terminal, event.direction = True, -1.0 if sides[i] else 1.0
+            return event
+
+        found = solve_ivp(motion, (now, end), state, events=[event_of(0), event_of(1)], rtol=1e-11, atol=1e-13,
+                          method="DOP853", dense_output=True, max_step=end / 500)  # fmt: skip
+        inside = np.flatnonzero((times > now) & (times <= found.t[-1]))
+        if inside.size:
+            there = found.sol(times[inside])
+            places[:, inside] = there[::2]
+            rates[:, inside] = there[1::2] * (np.asarray(sides) != 0.0)[:, None]
+        now, state = float(found.t[-1]), found.y[:, -1].copy()
+        if found.status == 1:
+            for i in (i for i in range(2) if found.t_events[i].size):
+                if sides[i]:
+                    state[2 * i + 1] = 0.0
+                    sides[i] = at_rest(i, now, state)
+                else:
+                    sides[i] = float(np.sign(pull(now, state)[i]))
+    return places, rates
+
+
 def slope_errors(at: Callable[[np.ndarray], dict], point: np.ndarray, numbers: int) -> list[float]:
     """How far the derivatives of `at` are from central differences, each as a share of the difference's norm.
 

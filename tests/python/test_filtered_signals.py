@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 from scipy.signal import lsim
 
+import friction
 import ftlm
 from ftlm.base.arrays import Floats
 from ftlm.cli.options import StructureOptions
+from ftlm.fit.grid import Attempt, Grid
+from ftlm.fit.joint import fit_output_error
+from ftlm.fit.problem import FreeProblem
+from ftlm.judge.comparison import compare_means
 
 STEP, COUNT, FINE = 1e-3, 6001, 4
 OMEGA, ZETA = 2 * np.pi * 1.0, 0.9
@@ -120,6 +125,125 @@ def test_a_run_in_motion_starts_with_a_filter_in_motion(filtered):
     # Exponents that are given are all there is.
     given = ftlm.Model(replace(found.model.structure, initial=(0.0, 1.0))).compare(run).fit_percent["y"]
     assert given < 99.0
+
+
+#: A hub and the elastic link on it; each drives the other, the current both.
+HUB, LINK = (30.0, 0.4, -1.5), (90.0, 1.2)
+CARRIED = "D^2 x = a q + d D q - b D x + g u; D^2 q = - D^2 x - k q - e D q"
+CARRIED_TRUTH = {"a": 30.0, "d": 0.4, "b": 1.5, "g": 1.0, "k": 90.0, "e": 1.2}
+#: Where they are when the run begins, how fast, and what each one's filter holds then.
+MOVING, HELD = (0.3, 1.0, 0.05, -0.4), (0.25, 0.8, 0.07, 0.2)
+
+
+def carried_run(names: str, *, own_times: bool = False) -> ftlm.Run:
+    """Hub and link by an integrator, cut in the middle of a motion, the angles that are named behind their filters."""
+
+    def pulled(t):
+        return 6.0 * np.sin(2.1 * t) + 3.0 * np.sin(5.3 * t + 0.4)
+
+    t = np.arange(401) * 0.01
+    if own_times:
+        t[1:-1] += np.random.default_rng(0).uniform(-0.003, 0.003, t.size - 2)
+    angles, _ = friction.hub_and_link(pulled, t, HUB, LINK, 0.0, start=MOVING, low_pass=(OMEGA, ZETA), held=HELD)
+    outputs = {name: angles[k + 2 * (name in names)] for k, name in enumerate("xq")}
+    times = {"time": t, "resample": 0.01} if own_times else {"step": 0.01}
+    return ftlm.Run.from_arrays(inputs={"u": pulled(t)}, outputs=outputs, intersample={"u": "foh"}, **times)
+
+
+def carried(names: str, **options) -> ftlm.Structure:
+    return replace(ftlm.equation(CARRIED, sensor_filter=sensor(tuple(names)), **options), coupling="simulated")
+
+
+@pytest.mark.parametrize("own_times", [False, True], ids=["grid", "own times"])
+@pytest.mark.parametrize("names", ["q", "xq"])
+def test_equations_that_follow_together_start_with_their_filters_in_motion(names, own_times):
+    run = carried_run(names, own_times=own_times)
+    model = ftlm.Model(carried(names, fixed=CARRIED_TRUTH))
+    compared = model.compare(run)
+    # All that is left is the force between its samples.
+    assert min(compared.fit_percent.values()) > 99.98
+    start = compared.initial[0]
+    assert {n for n in "xq" if {-1.0, -2.0} <= set(start[n])} == set(names)
+    for name in names:
+        level, rate = HELD["xq".index(name) * 2 :][:2]
+        # A free motion of the filter is its answer to these; of an impulse's derivative it makes a jump.
+        assert OMEGA**2 * start[name][-2.0] == pytest.approx(level, abs=3e-4)
+        slope = OMEGA**2 * (start[name][-1.0] - 2 * ZETA * OMEGA * start[name][-2.0])
+        assert slope == pytest.approx(rate, abs=3e-3)
+    if own_times:
+        return
+    again = model.simulate(run, initial=start)
+    for name in "xq":
+        np.testing.assert_allclose(again[name], compared.simulated[name][0], atol=1e-6 * np.ptp(run[name]))
+    means = compare_means(model, run).simulated
+    for name in "xq":
+        # Impulses lie within the first pulses, and are read from the others.
+        middles = 0.5 * (run[name][1:] + run[name][:-1])
+        np.testing.assert_allclose(means[name][0][8:], middles[8:], atol=0.02 * np.ptp(run[name]))
+
+
+@pytest.mark.parametrize("names", ["q", "xq"])
+def test_numbers_of_equations_that_follow_together_behind_filters_in_motion(names):
+    run = carried_run(names)
+    start = {n: 1.3 * v for n, v in CARRIED_TRUTH.items()}
+    joint = fit_output_error([run], carried(names, initial="caputo"), start=start)
+    assert joint.initial_terms == 4 + 2 * len(names)
+    for name, value in CARRIED_TRUTH.items():
+        assert joint.coefficients[name] == pytest.approx(value, rel=2e-3), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("filtered", [("y",), ("y", "z")], ids="+".join)
+def test_coupled_runs_in_motion_are_identified_from_their_own_start(filtered):
+    run = run_of(measured(filtered, together=True)).slice(1.7, None)
+    structure = replace(ftlm.equation(TOGETHER, sensor_filter=sensor(filtered)), coupling="simulated")
+    found = ftlm.identify(run, structure, method="output-error")
+    for name, value in (TRUTH | SECOND).items():
+        assert found.coefficients[name] == pytest.approx(value, rel=1e-5), name
+    assert min(found.model.compare(run).fit_percent.values()) > 99.999
+    assert "filter's state 1" in str(found)
+
+
+def test_slopes_beside_a_filter_in_motion_are_those_of_finite_differences():
+    structure = ftlm.flexible_link(coupling="simulated", sensor_filter="stock")
+    structure = replace(structure, initial="caputo")
+    problem = FreeProblem.of(structure)
+    orders = {"alpha1": 1.93, "gamma1": 0.9, "beta2": 0.23, "mu2": 0.7}
+    numbers = {"a1": 500.0, "b1": -50.0, "d1": 8.0, "g1": 120.0, "j1": 0.5}
+    t, rng = np.arange(241) * 0.004, np.random.default_rng(1)
+    outputs = {n: np.sin(9.0 * t + k) + rng.normal(size=t.size) for k, n in enumerate(("theta11", "theta12"))}
+    run = ftlm.Run.from_arrays(step=0.004, inputs={"I1": np.sign(np.sin(7.0 * t))}, outputs=outputs)
+    grid = Grid(problem, [run], [1.0, 3.0], every=2)
+    names = [*problem.orders, *problem.coefficients]
+    point, count = np.array([(orders | numbers)[n] for n in names]), len(orders)
+
+    def at(values):
+        attempt = Attempt(list(values[:count]), list(values[count:]), "here", {})
+        return grid.descend(attempt, 1, plain=True).outcome
+
+    base = at(point)
+    # The hub's filter holds nothing, for it has none.
+    assert [sum(e <= -1 for e in exponents) for exponents in base["exponents"]] == [0, 2]
+    weights = np.linalg.norm(base["jacobian"], axis=1)
+    for i, name in enumerate(names):
+        shift = 1e-6 * max(abs(point[i]), 1.0) * np.eye(point.size)[i]
+        slope = (np.asarray(at(point + shift)["residuals"]) - at(point - shift)["residuals"]) / (2 * shift[i])
+        # Kaufman's projection: that of the cost is exact.
+        found, expected = (float(np.dot(row, base["residuals"])) for row in (base["jacobian"][i], slope))
+        assert found == pytest.approx(expected, rel=2e-3, abs=1e-4 * weights[i]), name
+
+
+def test_a_filter_that_holds_more_than_answers_to_impulses_is_refused_in_motion():
+    for numerator, denominator in [
+        (((1.0, 1.0), (9.0, 0.0)), ((1.0, 2.0), (3.0, 1.0), (9.0, 0.0))),
+        (((9.0, 0.0),), ((1.0, 1.5), (9.0, 0.0))),
+    ]:
+        odd = ftlm.SensorFilter(("q",), numerator, denominator)
+        run = carried_run("q")
+        structure = replace(ftlm.equation(CARRIED, sensor_filter=odd, fixed=CARRIED_TRUTH), coupling="simulated")
+        with pytest.raises(ftlm.ModelError, match="q passed a sensor filter with a zero or a fractional order"):
+            ftlm.Model(structure).compare(run)
+        ftlm.Model(replace(structure, initial="rest")).compare(run)
 
 
 @pytest.mark.parametrize("method", ["least-squares", "instrumental-variables"])

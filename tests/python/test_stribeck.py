@@ -174,7 +174,7 @@ def test_derivatives_are_those_of_finite_differences(orders) -> None:
 
     def at(point):
         return _core.friction_error(
-            runs, [law], 0, [(1.0, [(i, 1)]) for i in (2, 3, 4)], [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 5,
+            runs, [law], [(0, [(1.0, [(i, 1)]) for i in (2, 3, 4)])], [(1.05, 2.0), (0.0, 1.5)], ["plain"] * 5,
             (True, [], 1), list(point[:2]), list(point[2:7]), [], [list(point[7:10]), list(point[10:])], 1, 1e-9,
         )  # fmt: skip
 

@@ -50,7 +50,7 @@ def test_friction_is_ended_as_well() -> None:
 
     def fit(flag: _core.Stop | None) -> dict:
         return _core.friction_error(
-            runs, [law], 0, strength, [], ["plain"] * 2, (True, []), [], [1.0, 0.2], [], [], 3, 1e-9, flag
+            runs, [law], [(0, strength)], [], ["plain"] * 2, (True, []), [], [1.0, 0.2], [], [], 3, 1e-9, flag
         )  # fmt: skip
 
     assert fit(None)["evaluations"] > 1

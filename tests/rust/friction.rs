@@ -1,11 +1,13 @@
-//! A body that sticks: its march against a plain one, closed forms, derivatives against differences, refusals.
+//! Bodies that stick: their march against a plain one, all combinations of two, closed forms, derivatives against differences, refusals.
 
+use crate::common::Random;
 use ftlm::equation::{AffineOrder, Equation, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimate::output_error::{Coordinate, Experiment, FreeEquation, Monomial, Settings};
 use ftlm::friction::law::{Moves, Phase};
-use ftlm::friction::march::March;
+use ftlm::friction::march::{March, Trace};
 use ftlm::friction::online::{Heads, Online};
+use ftlm::friction::pulses::{is_p_matrix, Rubbing};
 use ftlm::friction::{fit, Body, FreeLaw, FrictionModel, Law, Start};
 use ftlm::regressors::Record;
 
@@ -32,13 +34,19 @@ fn sums_over_the_past_are_the_plain_ones() {
     assert_eq!(online.into_signal(), signal);
 }
 
+/// One body by itself, from rest.
+fn marched(linear: &[f64], response: &[f64], law: Law) -> Trace {
+    let rubbing = Rubbing::new(vec![law], vec![response[0]]).expect("one body moves only itself");
+    March::new(&[linear.to_vec()], &[vec![Heads::new(response)]], rubbing, &[0.0]).bodies.swap_remove(0)
+}
+
 #[test]
 fn a_march_obeys_its_law() {
     let m = 3000;
     let response: Vec<f64> = (0..m).map(|n| 0.01 * (-0.002 * n as f64).exp()).collect();
     let linear: Vec<f64> = force(m);
     let strength = 3.0;
-    let march = March::new(&linear, &Heads::new(&response), response[0], Law::coulomb(strength), 0.0);
+    let march = marched(&linear, &response, Law::coulomb(strength));
     assert!(march.phases.contains(&Phase::Stick) && march.phases.contains(&Phase::Slip));
     for k in 0..m {
         let past: f64 = (0..=k).map(|j| response[k - j] * march.force[j]).sum();
@@ -59,7 +67,7 @@ fn a_march_that_falls_with_speed_obeys_its_law() {
     let response: Vec<f64> = (0..m).map(|n| 0.01 * (-0.002 * n as f64).exp()).collect();
     let linear = force(m);
     let law = Law { coulomb: 2.0, stribeck: 3.0, speed: 0.05 };
-    let march = March::new(&linear, &Heads::new(&response), response[0], law, 0.0);
+    let march = marched(&linear, &response, law);
     for phase in [Phase::Slip, Phase::Stick, Phase::Turn] {
         assert!(march.phases.contains(&phase), "{phase:?}");
     }
@@ -130,11 +138,11 @@ fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
     let record = Record::new(0.01, vec![vec![0.0; 50], vec![1.0; 50]], None)?;
     for (stribeck, speed) in [(-0.1, 0.2), (0.1, 0.0), (0.1, -0.2)] {
         let mut wrong = body(1.8, 0.5);
-        wrong.friction = Law { stribeck, speed, ..wrong.friction };
+        wrong.frictions[0].1 = Law { stribeck, speed, ..wrong.frictions[0].1 };
         assert!(matches!(wrong.run(&record, &[vec![]]), Err(Error::OutOfRange { .. })));
     }
     let mut lost = body(1.8, 0.5);
-    lost.friction.speed = f64::NAN;
+    lost.frictions[0].1.speed = f64::NAN;
     assert!(matches!(lost.run(&record, &[vec![]]), Err(Error::NotFinite { .. })));
     Ok(())
 }
@@ -143,7 +151,7 @@ fn a_speed_that_is_none_is_refused() -> Result<(), Error> {
 fn what_never_leaves_its_rest_is_where_it_was() -> Result<(), Error> {
     let record = Record::new(0.01, vec![vec![0.0; 400], force(400)], None)?;
     let motion = body(2.0, 2.5).run(&record, &[vec![(0.0, 0.7), (1.0, 0.7)]])?;
-    assert!(motion.velocity.iter().all(|v| *v == 0.0));
+    assert!(motion.bodies[0].is_still());
     assert!(motion.outputs[0].iter().all(|y| (y - 0.7).abs() < 1e-15));
     Ok(())
 }
@@ -163,8 +171,7 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
             order: order(0.0, 1.0),
             terms: vec![(0, order(1.0, 0.0), free(0, -1.0)), (1, order(0.0, 0.0), free(1, 1.0))],
         }],
-        sticks: 0,
-        friction: FreeLaw::coulomb(free(2, 1.0)),
+        frictions: vec![(0, FreeLaw::coulomb(free(2, 1.0)))],
         inputs: vec![],
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],
@@ -178,8 +185,10 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
     for (value, truth) in found.coefficients.iter().zip([1.0, 1.0, 0.8]) {
         assert!((value - truth).abs() < 1e-4, "{:?}", found.coefficients);
     }
-    let strange =
-        FrictionModel { friction: FreeLaw::coulomb(Monomial { factor: -1.0, powers: vec![] }), ..model.clone() };
+    let strange = FrictionModel {
+        frictions: vec![(0, FreeLaw::coulomb(Monomial { factor: -1.0, powers: vec![] }))],
+        ..model.clone()
+    };
     assert!(matches!(strange.check(std::slice::from_ref(&experiment)), Err(Error::Structure { .. })));
     // Behind a filter that the model does not know.
     let mut series = vec![0.0; m];
@@ -210,4 +219,173 @@ fn what_has_no_velocity_is_refused() -> Result<(), Error> {
     let long = Record::new(0.05, vec![vec![0.0; 400], vec![1.0; 400]], None)?;
     assert!(matches!(tipping.run(&long, &[vec![]]), Err(Error::Diverged { .. })));
     Ok(())
+}
+
+/// Of bodies at rest with Coulomb friction, every combination of sliding to either side and resting that is consistent.
+fn consistent(most: &[f64], p: &[f64], gains: &[f64]) -> Vec<Vec<f64>> {
+    let n = most.len();
+    let mut found = Vec::new();
+    for code in 0..3_usize.pow(n as u32) {
+        let kinds: Vec<usize> = (0..n).map(|a| code / 3_usize.pow(a as u32) % 3).collect();
+        let resting: Vec<usize> = (0..n).filter(|&a| kinds[a] == 0).collect();
+        let mut forces: Vec<f64> = (0..n).map(|a| [0.0, most[a], -most[a]][kinds[a]]).collect();
+        // What holds the resting ones, by elimination.
+        let mut rows: Vec<Vec<f64>> = (resting.iter())
+            .map(|&a| {
+                let known: f64 = (0..n).map(|b| gains[a * n + b] * forces[b]).sum();
+                resting.iter().map(|&b| gains[a * n + b]).chain([p[a] - known]).collect()
+            })
+            .collect();
+        for i in 0..rows.len() {
+            let pivot = rows[i].clone();
+            for (j, row) in rows.iter_mut().enumerate() {
+                if j != i {
+                    let share = row[i] / pivot[i];
+                    row.iter_mut().zip(&pivot).for_each(|(x, y)| *x -= share * y);
+                }
+            }
+        }
+        for (i, &a) in resting.iter().enumerate() {
+            forces[a] = rows[i][resting.len()] / rows[i][i];
+        }
+        let fits = (0..n).all(|a| {
+            let end = p[a] - (0..n).map(|b| gains[a * n + b] * forces[b]).sum::<f64>();
+            match kinds[a] {
+                0 => forces[a].abs() <= most[a],
+                1 => end > 0.0,
+                _ => end < 0.0,
+            }
+        });
+        if fits {
+            found.push(forces);
+        }
+    }
+    found
+}
+
+#[test]
+fn of_all_combinations_of_bodies_at_rest_exactly_one_is_taken() {
+    let mut random = Random::new(5);
+    let (mut tried, mut kinds) = (0, std::collections::HashSet::new());
+    while tried < 4000 {
+        let n = 2 + tried % 2;
+        // Half of them inverses of inertias, each equation divided by its own, half no symmetric matrices at all.
+        let root: Vec<f64> = (0..n * n).map(|_| random.uniform(-1.0, 1.0)).collect();
+        let scales: Vec<f64> = (0..n).map(|_| random.uniform(0.2, 2.0)).collect();
+        let gains: Vec<f64> = (0..n * n)
+            .map(|at| {
+                let (i, j) = (at / n, at % n);
+                let square: f64 = (0..n).map(|k| root[i * n + k] * root[j * n + k]).sum();
+                match (tried % 4 < 2, i == j) {
+                    (true, own) => (square + if own { 0.2 } else { 0.0 }) * scales[j],
+                    (false, true) => scales[i],
+                    (false, false) => 0.45 * scales[i] * root[at],
+                }
+            })
+            .collect();
+        if !is_p_matrix(&gains, n) {
+            continue;
+        }
+        tried += 1;
+        let most: Vec<f64> = (0..n).map(|_| random.uniform(0.1, 2.0)).collect();
+        let p: Vec<f64> = (0..n).map(|_| random.uniform(-2.0, 2.0)).collect();
+        let all = consistent(&most, &p, &gains);
+        assert_eq!(all.len(), 1, "{gains:?} {p:?}");
+        let laws = most.iter().map(|f| Law::coulomb(*f)).collect();
+        let rubbing = Rubbing::new(laws, gains).expect("a P-matrix");
+        let mut at = Vec::new();
+        rubbing.pulse(&vec![0.0; n], &p, &vec![0.0; n], &vec![0.0; n], &mut at);
+        for (body, force) in at.iter().zip(&all[0]) {
+            assert!((body.1.force - force).abs() < 1e-12, "{at:?} {all:?}");
+        }
+        kinds.insert(at.iter().map(|body| body.1.phase as usize).collect::<Vec<_>>());
+    }
+    assert!(kinds.len() >= 8 + 4);
+}
+
+#[test]
+fn pulses_of_several_bodies_are_one_wherever_they_are_begun() {
+    let mut random = Random::new(6);
+    let mut seen = std::collections::HashSet::new();
+    for case in 0..3000 {
+        // Bodies that move each other by less than themselves, as inertias have it.
+        let gains: Vec<f64> = (0..4).map(|at| if at % 3 == 0 { random.uniform(0.05, 0.3) } else { 0.0 }).collect();
+        let across = random.uniform(-0.9, 0.9) * (gains[0] * gains[3]).sqrt();
+        let gains = vec![gains[0], across, across, gains[3]];
+        let stribeck = if case % 2 == 0 { 0.0 } else { 0.3 };
+        let laws: Vec<Law> = (0..2).map(|_| Law { coulomb: random.uniform(0.1, 2.0), stribeck, speed: 0.5 }).collect();
+        let (v, p): (Vec<f64>, Vec<f64>) =
+            (0..2).map(|_| (random.uniform(-0.4, 0.4), random.uniform(-0.7, 0.7))).unzip();
+        let rubbing = Rubbing::new(laws.clone(), gains.clone()).expect("a P-matrix");
+        let (mut at, mut other) = (Vec::new(), Vec::new());
+        rubbing.pulse(&v, &p, &[0.0; 2], &[0.0; 2], &mut at);
+        for begun in [[2.0, 2.0], [-2.0, 2.0], [0.3, -1.0]] {
+            rubbing.pulse(&v, &p, &[0.0; 2], &begun, &mut other);
+            assert!(at.iter().zip(&other).all(|(x, y)| (x.1.force - y.1.force).abs() < 1e-11), "{case}");
+        }
+        for a in 0..2 {
+            // Each obeys its own law beside the other's force.
+            let free = p[a] - across * at[1 - a].1.force;
+            let alone = laws[a].pulse(v[a], free, gains[3 * a], 0.0);
+            assert!((alone.force - at[a].1.force).abs() < 1e-12 && (alone.end - at[a].1.end).abs() < 1e-12, "{case}");
+        }
+        seen.insert((at[0].1.phase as usize, at[1].1.phase as usize));
+    }
+    assert_eq!(seen.len(), 9);
+    assert!(matches!(Rubbing::new(vec![Law::coulomb(1.0); 2], vec![0.1, 0.2, 0.2, 0.1]), Err(Error::Diverged { .. })));
+}
+
+#[test]
+fn slopes_of_a_pulse_of_two_bodies_are_those_of_differences() {
+    let mut random = Random::new(7);
+    let (mut compared, mut seen) = (0, std::collections::HashSet::new());
+    for _ in 0..400 {
+        let laws: Vec<Law> =
+            (0..2).map(|_| Law { coulomb: random.uniform(0.1, 2.0), stribeck: 0.4, speed: 0.5 }).collect();
+        let gains = vec![0.2, random.uniform(-0.1, 0.1), random.uniform(-0.1, 0.1), 0.1];
+        let numbers: Vec<f64> = (0..4).map(|_| random.uniform(-0.6, 0.6)).collect();
+        let ways: Vec<f64> = (0..4).map(|_| random.uniform(-1.0, 1.0)).collect();
+        let turns: Vec<f64> = (0..6).map(|_| random.uniform(-1.0, 1.0)).collect();
+        let run = |by: f64| {
+            let at: Vec<f64> = numbers.iter().zip(&ways).map(|(x, w)| x + by * w).collect();
+            let moved = (laws.iter().enumerate())
+                .map(|(a, law)| Law {
+                    coulomb: law.coulomb + by * turns[3 * a],
+                    stribeck: law.stribeck + by * turns[3 * a + 1],
+                    speed: law.speed + by * turns[3 * a + 2],
+                })
+                .collect();
+            let mut out = Vec::new();
+            Rubbing::new(moved, gains.clone()).expect("a P-matrix").pulse(
+                &at[..2],
+                &at[2..],
+                &[0.0; 2],
+                &[0.0; 2],
+                &mut out,
+            );
+            out
+        };
+        let (here, up, down) = (run(0.0), run(1e-6), run(-1e-6));
+        if (0..2).any(|a| up[a].1.phase != down[a].1.phase) {
+            continue;
+        }
+        compared += 1;
+        seen.insert((here[0].1.phase as usize, here[1].1.phase as usize));
+        let moves: Vec<Moves> = (0..2)
+            .map(|a| Moves {
+                start: ways[a],
+                free: ways[2 + a],
+                first: 0.0,
+                law: [turns[3 * a], turns[3 * a + 1], turns[3 * a + 2]],
+            })
+            .collect();
+        let mut slopes = Vec::new();
+        Rubbing::new(laws.clone(), gains.clone()).expect("a P-matrix").slope(&numbers[..2], &here, &moves, &mut slopes);
+        for (a, &(force, end)) in slopes.iter().enumerate() {
+            let (by_force, by_end) = (up[a].1.force - down[a].1.force, up[a].1.end - down[a].1.end);
+            assert!((force - by_force / 2e-6).abs() < 1e-5 * (1.0 + force.abs()), "{here:?}");
+            assert!((end - by_end / 2e-6).abs() < 1e-5 * (1.0 + end.abs()), "{here:?}");
+        }
+    }
+    assert!(compared > 350 && seen.len() == 9);
 }

@@ -69,8 +69,7 @@ fn linear(law: InputLaw) -> FreeModel {
 fn rubbing(law: InputLaw) -> FrictionModel {
     FrictionModel {
         equations: vec![equation()],
-        sticks: 0,
-        friction: FreeLaw::coulomb(free(2, 1.0)),
+        frictions: vec![(0, FreeLaw::coulomb(free(2, 1.0)))],
         inputs: limited(law),
         order_bounds: vec![(1.2, 2.0)],
         coordinates: vec![Coordinate::Plain; 3],

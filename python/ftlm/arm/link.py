@@ -165,7 +165,8 @@ def flexible_link(
     friction
         Adds Coulomb friction to the hub's equation. With ``coupling="simulated"``, in the Lagrange form, it is
         - fc_j * sign(D theta_j1) of the velocity that the model itself gives, set-valued at rest (:class:`Friction`),
-        for one stage, by output error: the hub sticks and slips while its link rings. With measured coupling it is a
+        by output error: hubs stick and slip while their links ring (with ``stage="both"`` both do; not beside inertial
+        coupling, whose accelerations stand in the equation of hub 2). With measured coupling it is a
         linear term c * coulomb_theta_j1 of the sign of the measured velocity, in the published form of both equations.
     cross_sensitivity
         Adds hub angles as they are (order 0) to the deflection's equation: strain gauges and cables make a measured
@@ -228,11 +229,17 @@ def flexible_link(
         raise ModelError(f"parameters = {parameters!r} is not known; use {' or '.join(map(repr, PARAMETERS))}")
     if coupling is None:
         coupling = "measured" if form == "lagrange" else "simulated"
-    if friction and coupling == "simulated" and (form != "lagrange" or stage == "both"):
+    if friction and coupling == "simulated" and form != "lagrange":
         raise ModelError(
-            "friction=True with coupling='simulated' follows the hub of one stage of form='lagrange', where it does "
-            "not enter the link's equation; name the stage and that form, or use coupling='measured', whose friction "
-            "has the sign of the measured velocity"
+            "friction=True with coupling='simulated' follows hubs of form='lagrange', where it does not enter the "
+            "links' equations; use that form, or coupling='measured', whose friction has the sign of the measured "
+            "velocity"
+        )
+    if friction and coupling == "simulated" and stage == "both" and cross_stage == "inertial":
+        raise ModelError(
+            "cross_stage='inertial' puts accelerations of stage 1 into the equation of hub 2, where friction=True with "
+            "coupling='simulated' has every order below alpha; use cross_stage=False, leave the friction out, or use "
+            "coupling='measured'"
         )
     if not hub and (form != "lagrange" or coupling == "simulated" or friction):
         raise ModelError(

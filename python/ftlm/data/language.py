@@ -72,7 +72,7 @@ def equation(
         never carried to another run. Default what the text says.
     coupling
         Of several equations: ``"measured"``, each is driven by the other outputs as they were measured, the default;
-        ``"simulated"``, all follow from the other signals alone, as they do by default where one of them has friction.
+        ``"simulated"``, all follow from the other signals alone, as they do by default where any of them has friction.
 
     Returns
     -------

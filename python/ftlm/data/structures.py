@@ -89,6 +89,12 @@ class SensorFilter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
         return int(bottom - top + 1e-9)
 
+    @property
+    def holds_answers(self) -> bool:
+        """Whether all that it can hold are such answers: it has no zero and no fractional order."""
+        whole = all(order == round(order) for coefficient, order in self.denominator if coefficient)
+        return whole and not any(order for coefficient, order in self.numerator if coefficient)
+
     @classmethod
     def low_pass(cls, signals: Sequence[str], frequency: float = 2.0, damping: float = 0.9) -> SensorFilter:
         """Second-order low-pass of ``frequency`` [Hz]; the default is that of the arm's stock real-time model.
@@ -262,20 +268,14 @@ class Structure:
         return any(e.friction is not None for e in self.equations)
 
     @property
-    def sticks(self) -> int:
-        """Place of the equation with friction, the first one where there are several; 0 without."""
-        return next((i for i, e in enumerate(self.equations) if e.friction is not None), 0)
+    def sticks(self) -> tuple[int, ...]:
+        """Places of the equations with friction."""
+        return tuple(i for i, e in enumerate(self.equations) if e.friction is not None)
 
     def _check_friction(self) -> None:
         """Refuse what a free run with friction does not know yet."""
-        rubbing = [e.output for e in self.equations if e.friction is not None]
+        rubbing = [self.equations[i].output for i in self.sticks]
         words = f"the equation of {rubbing[0]} has friction"
-        if len(rubbing) > 1:
-            raise ModelError(
-                f"the equations of {' and '.join(rubbing)} have friction: a free run follows one body that may stick, "
-                "and bodies that drive it and that it drives; leave the friction of the others out, or follow each in "
-                "a structure of its own, driven by the other signals as measured"
-            )
         if len(self.equations) > 1 and self.coupling == "measured":
             raise ModelError(
                 f"{words}, and the structure {len(self.equations)} equations with measured coupling: driven by "
@@ -292,8 +292,7 @@ class Structure:
         if self.free_delays:
             raise ModelError(f"{words}, and the delay of {', '.join(self.free_delays)} is free; give it in seconds")
         tied = {n for name, _, factors in self.coefficient_law for n in (name, *factors)}
-        rubs = self.equations[self.sticks].friction
-        held = [n for n in (() if rubs is None else rubs.names) if n in tied]
+        held = [n for e in self.equations if e.friction is not None for n in e.friction.names if n in tied]
         if held:
             raise ModelError(f"{words}, and a law ties its {held[0]} to other coefficients; leave one of the two out")
         if isinstance(self.initial, History) or self.initial == "history":
@@ -341,12 +340,26 @@ class Structure:
     def filter_states(self, initial: Initial) -> int:
         """How many free motions of the filter stand beside decided initial terms where signals pass it.
 
-        What was not measured through the filter is put through it from the start of the run on, so what the filter
-        still holds of the time before is unknown: its answers to an impulse and to derivatives of one. None from rest,
-        nor beside exponents that are given.
+        What the filter is applied to here, signals that were not measured through it or outputs that follow from
+        others, passes it from the start of the run on, so what the filter still holds of the time before is unknown:
+        its answers to an impulse and to derivatives of one. None from rest, nor beside exponents that are given. Of
+        outputs that follow from unfiltered signals a filter is refused that may hold more.
         """
-        moves = initial == "caputo" or isinstance(initial, History)
-        return self.sensor_filter.relative_degree if moves and self.sensor_filter is not None else 0
+        sensor = self.sensor_filter
+        if sensor is None or not (initial == "caputo" or isinstance(initial, History)):
+            return 0
+        if not (self.behind_filter or sensor.holds_answers):
+            through = [o for o in self.outputs if self.measured_through(o)]
+            raise ModelError(
+                f"{' and '.join(through)} passed a sensor filter with a zero or a fractional order, and a run starts "
+                "in motion: what such a filter still held is more than answers to impulses; use initial='rest' and "
+                "begin the run at rest, or give the exponents of its initial terms"
+            )
+        return sensor.relative_degree
+
+    def held_back(self, output: str) -> bool:
+        """Whether the filter may still hold something of the time before a run that an output lacks then."""
+        return self.behind_filter or self.measured_through(output)
 
     def measured_through(self, signal: str) -> bool:
         """Whether a signal was measured through the sensor filter."""

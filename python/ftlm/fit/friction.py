@@ -1,4 +1,4 @@
-"""Where joint fits of a body with friction start: at fits that are linear, its sign as measured or left out."""
+"""Where joint fits of bodies with friction start: at fits that are linear, its sign as measured or left out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from msgspec import UNSET, UnsetType
 
 from ftlm.base.errors import DataError, FtlmError
 from ftlm.base.statistics import noise_of
-from ftlm.data.equations import Equation, Friction, Stribeck, Term
+from ftlm.data.equations import Equation, Friction, Term
 from ftlm.data.orders import Order
 from ftlm.data.readings import read
 from ftlm.data.run import Run
@@ -37,7 +37,7 @@ STILL = 10.0
 def race_with_friction(
     alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None
 ) -> list[Attempt]:
-    """Coarse fits of a body with friction, best first, every output weighing alike.
+    """Coarse fits of bodies with friction, best first, every output weighing alike.
 
     The sign of the measured velocity makes the equation linear; where the body rests it is noise, and so are its
     numbers, but they are near enough. Beside them stand those without friction, with some of it put in. Friction that
@@ -46,67 +46,81 @@ def race_with_friction(
     problem, runs = alike.problem, alike.runs
     structure = problem.structure
     check_moves(runs, structure)
-    rubs = structure.equations[structure.sticks].friction
-    if rubs is None:
+    if not structure.has_friction:
         return race(alike, floor, threads, progress)
     coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
     starts: list[Attempt] = []
-    if rubs.stribeck is not None:
-        less = FreeProblem.of(with_friction(structure, replace(rubs, more=UNSET)))
+    if any(rubs.stribeck is not None for _, rubs in rubbing(structure)):
+        less = FreeProblem.of(with_friction(structure, lambda rubs: replace(rubs, more=UNSET)))
         reached = race_with_friction(replace(alike, problem=less), floor, threads, progress)
         for attempt in reached[:FINALISTS]:
             values = dict(zip(less.names, attempt.values.tolist(), strict=True))
-            starts += falling(coarse, values, rubs.stribeck, attempt.origin)
+            starts += falling(coarse, values, attempt.origin)
         return raced(coarse, starts, threads)
     # Driven by measured signals, each of several bodies is told from its own equation, whatever the others do.
-    signed = FreeProblem.of(replace(with_measured_sign(structure, rubs), coupling="measured"))
+    signed = FreeProblem.of(replace(with_measured_sign(structure), coupling="measured"))
     reached = race(replace(alike, problem=signed), floor, threads, progress)
     for attempt in reached[:FINALISTS]:
         values = dict(zip(signed.names, attempt.values.tolist(), strict=True))
-        starts += started(coarse, values, rubs, attempt.origin)
+        starts += started(coarse, values, attempt.origin)
     if len(structure.equations) > 1 and reached:
         values = dict(zip(signed.names, reached[0].values.tolist(), strict=True))
         starts += carrying(problem, runs, {**values, **signed.named(reached[0].coefficients)})
     return raced(coarse, starts, threads)
 
 
-def carrying(problem: FreeProblem, runs: Sequence[Run], values: dict[str, float]) -> list[Attempt]:
-    """Starts of a body by itself, with what hangs on it put back as action and reaction ask for, shares of its inertia.
+def rubbing(structure: Structure) -> list[tuple[Equation, Friction]]:
+    """Equations with friction, and theirs."""
+    return [(e, e.friction) for e in structure.equations if e.friction is not None]
 
-    The others are as they are when the measured body drives them; the body itself, driven by measured others, may be
+
+def carrying(problem: FreeProblem, runs: Sequence[Run], values: dict[str, float]) -> list[Attempt]:
+    """Starts of bodies by themselves, with what hangs on them put back as action and reaction ask for.
+
+    The others are as they are when measured bodies drive them; a body itself, driven by measured others, may be
     explained by what they tell of its motion, without what drives it and without friction.
     """
     structure = problem.structure
-    item = structure.equations[structure.sticks]
-    if item.friction is None:
-        return []
+    bounds = dict(zip(problem.orders, problem.bounds, strict=True))
+    alone = [(item, *by_itself(runs, structure, item, values, bounds)) for item, _ in rubbing(structure)]
+    told = [(item, orders, numbers) for item, orders, numbers in alone if numbers]
+    out = []
+    for share in CARRIED if told else ():
+        # What drives a body and brakes it moves the others, too.
+        found, rest = dict(values), dict(values)
+        for item, orders, numbers in told:
+            found |= reacting(structure, item, values, share)
+            found |= {n: (1.0 + share) * v for n, v in numbers.items()}
+            rest |= orders
+        free = dict(zip(problem.coefficients, problem.free_from(found), strict=True))
+        rest = {n: v for n, v in rest.items() if n in problem.names}
+        words = " and ".join(item.output for item, _, _ in told) + (", each" if len(told) > 1 else "")
+        out.append(at(problem, {**rest, **free}, f"{words} by itself, carrying {share:g} of its inertia"))
+    return out
+
+
+def by_itself(
+    runs: Sequence[Run], structure: Structure, item: Equation, values: dict[str, float],
+    bounds: dict[str, tuple[float, float]],
+) -> tuple[dict[str, float], dict[str, float]]:  # fmt: skip
+    """Orders of a body with friction that nothing hangs on, and coefficients by which it follows what drives it."""
     # A filter's lag is no part of a start.
     alone = replace(structure, sensor_filter=None).equation(item.output)
     kept = tuple(t for t in alone.equations[0].terms if t.signal not in structure.outputs or t.signal == item.output)
     if not kept:
-        return []
+        return {}, {}
     alone = replace(alone, equations=(replace(alone.equations[0], terms=kept),))
-    bounds = dict(zip(problem.orders, problem.bounds, strict=True))
     usual = {n: 0.0 for n in alone.order_names} | {
         n: 1.0 for t in kept if t.signal == item.output for n in t.order.names
     } | {n: FRICTION_BOUNDS[1] for n in item.order.names}  # fmt: skip
     shared = {n for e in structure.equations if e is not item for n in e.order_names}
     orders = {n: values[n] if n in shared and n not in item.order.names else v for n, v in usual.items()}
     orders = {n: min(max(v, bounds[n][0]), bounds[n][1]) if n in bounds else v for n, v in orders.items()}
-    numbers = slid(runs, alone.with_orders(orders))
-    out = []
-    for share in CARRIED if numbers else ():
-        # What drives it and brakes it moves the others, too.
-        found = {**values, **reacting(structure, values, share), **{n: (1.0 + share) * v for n, v in numbers.items()}}
-        free = dict(zip(problem.coefficients, problem.free_from(found), strict=True))
-        rest = {n: v for n, v in {**values, **orders}.items() if n in problem.names}
-        out.append(at(problem, {**rest, **free}, f"{item.output} by itself, carrying {share:g} of its inertia"))
-    return out
+    return orders, slid(runs, alone.with_orders(orders))
 
 
-def reacting(structure: Structure, values: dict[str, float], share: float) -> dict[str, float]:
-    """Coefficients by which others act on the body: against what moves them, by their inertia over its own."""
-    item = structure.equations[structure.sticks]
+def reacting(structure: Structure, item: Equation, values: dict[str, float], share: float) -> dict[str, float]:
+    """Coefficients by which others act on a body: against what moves them, by their inertia over its own."""
     out: dict[str, float] = {}
     for other in structure.equations:
         if other is item:
@@ -137,84 +151,90 @@ def raced(coarse: Grid, starts: list[Attempt], threads: int) -> list[Attempt]:
 
 
 def check_moves(runs: Sequence[Run], structure: Structure) -> None:
-    """Refuse runs in none of which the body moves."""
-    output = structure.outputs[structure.sticks]
-    if all(float(np.ptp(read(run[output]))) <= STILL * noise_of(run[output]) for run in runs):
-        raise DataError(
-            f"{output} never moves beyond its noise in {', '.join(r.name for r in runs)}, and a body that only rests "
-            "tells nothing but that its friction is not exceeded; add a run in which it slides"
-        )
+    """Refuse runs in none of which a body moves."""
+    for item, _ in rubbing(structure):
+        output = item.output
+        if all(float(np.ptp(read(run[output]))) <= STILL * noise_of(run[output]) for run in runs):
+            raise DataError(
+                f"{output} never moves beyond its noise in {', '.join(r.name for r in runs)}, and a body that only "
+                "rests tells nothing but that its friction is not exceeded; add a run in which it slides"
+            )
 
 
-def with_friction(structure: Structure, rubs: Friction | UnsetType) -> Structure:
-    """The structure with other friction, or none."""
-    return changed(structure, replace(structure.equations[structure.sticks], coulomb=rubs))
+def with_friction(structure: Structure, other: Callable[[Friction], Friction | UnsetType]) -> Structure:
+    """The structure with other friction of each body that has some, or none."""
+    equations = [e if e.friction is None else replace(e, coulomb=other(e.friction)) for e in structure.equations]
+    return replace(structure, equations=tuple(equations))
 
 
-def with_measured_sign(structure: Structure, rubs: Friction) -> Structure:
-    """The structure with the sign of the measured velocity as a signal in the place of friction."""
-    item = structure.equations[structure.sticks]
-    term = Term(f"{COULOMB}{item.output}", Order(), rubs.coefficient, rubs.factor)
-    return changed(structure, replace(item, terms=(*item.terms, term), coulomb=UNSET))
+def without_friction(structure: Structure) -> Structure:
+    """The structure of bodies that slide freely."""
+    return with_friction(structure, lambda _: UNSET)
 
 
-def changed(structure: Structure, item: Equation) -> Structure:
-    """The structure with another equation of the body that may stick."""
-    before = structure.equations
-    return replace(structure, equations=(*before[: structure.sticks], item, *before[structure.sticks + 1 :]))
+def with_measured_sign(structure: Structure) -> Structure:
+    """The structure with the signs of measured velocities as signals in the place of friction."""
+
+    def signed(item: Equation) -> Equation:
+        if item.friction is None:
+            return item
+        term = Term(f"{COULOMB}{item.output}", Order(), item.friction.coefficient, item.friction.factor)
+        return replace(item, terms=(*item.terms, term), coulomb=UNSET)
+
+    return replace(structure, equations=tuple(map(signed, structure.equations)))
 
 
-def started(coarse: Grid, values: dict[str, float], rubs: Friction, origin: str) -> list[Attempt]:
-    """Starts at numbers of a linear fit, with friction as it says, and as shares of the force that drives the body."""
+def started(coarse: Grid, values: dict[str, float], origin: str) -> list[Attempt]:
+    """Starts at numbers of a linear fit, with friction as it says, and as shares of the force that drives each body."""
     problem = coarse.problem
-    if not isinstance(rubs.coefficient, str):
+    free = [(e.output, rubs, rubs.coefficient) for e, rubs in rubbing(problem.structure)]
+    named = [(output, rubs, name) for output, rubs, name in free if isinstance(name, str)]
+    if not named:
         return [at(problem, values, origin)]
-    name = rubs.coefficient
-    said = values[name] if values[name] > 0 else 0.0
-    strengths = [(m * said, f"{m:g} of the measured sign") for m in MULTIPLES if said > 0]
-    out = [at(problem, {**values, name: v}, f"{origin}, friction {words}") for v, words in strengths]
-    plain = with_friction(problem.structure, UNSET)
-    linear = FreeProblem.of(plain)
+    said = {name: max(values[name], 0.0) for _, _, name in named}
+    strengths = [({n: m * v for n, v in said.items()}, f"{m:g} of the measured sign") for m in MULTIPLES]
+    out = [at(problem, values | v, f"{origin}, friction {words}") for v, words in strengths if any(said.values())]
+    linear = FreeProblem.of(without_friction(problem.structure))
     try:
         without = replace(coarse, problem=linear).descend(at(linear, values, origin), FIRST_LAP)
     except FtlmError:
         # Without any friction it runs away.
         return out
     values = {**values, **dict(zip(linear.names, without.values.tolist(), strict=True))}
-    force = driving(coarse.runs, identified_body(linear, values))
-    for share in SHARES if force > 0 else ():
-        strength = share * force / -rubs.factor
-        out.append(at(problem, {**values, name: strength}, f"{origin}, friction {share:g} of what drives"))
+    forces = {name: driving(coarse.runs, identified_body(linear, output, values)) for output, _, name in named}
+    for share in SHARES if any(force > 0 for force in forces.values()) else ():
+        strength = {name: share * forces[name] / -rubs.factor for _, rubs, name in named}
+        out.append(at(problem, values | strength, f"{origin}, friction {share:g} of what drives"))
     return out
 
 
-def falling(coarse: Grid, values: dict[str, float], more: Stribeck, origin: str) -> list[Attempt]:
-    """Starts at numbers of a fit with Coulomb friction alone, with some more of it at low speeds."""
+def falling(coarse: Grid, values: dict[str, float], origin: str) -> list[Attempt]:
+    """Starts at numbers of a fit with Coulomb friction alone, with some more of it at low speeds of each body."""
     problem = coarse.problem
-    rubs = problem.structure.equations[problem.structure.sticks].friction
-    fc = (
-        abs(rubs.factor) * values.get(str(rubs.coefficient), 0.0) if rubs is not None and rubs.strength is None else 0.0
-    )
-    fc = fc or (0.0 if rubs is None else rubs.strength or 0.0)
-    plain = FreeProblem.of(with_friction(problem.structure, UNSET))
-    size = fc or driving(coarse.runs, identified_body(plain, values))
-    pace = speed_of(coarse)
-    forces = (
-        [(NEAR[0], None)] if not isinstance(more.coefficient, str) else [(n, n * size / -more.factor) for n in NEAR]
-    )
-    speeds = [(FALLS[0], None)] if not isinstance(more.speed, str) else [(f, f * pace) for f in FALLS]
+    plain = FreeProblem.of(without_friction(problem.structure))
+    sizes: dict[str, float] = {}
+    paces: dict[str, float] = {}
+    for item, rubs in rubbing(problem.structure):
+        more = rubs.stribeck
+        if more is None:
+            continue
+        fc = abs(rubs.factor) * values.get(str(rubs.coefficient), 0.0) if rubs.strength is None else rubs.strength
+        if isinstance(more.coefficient, str):
+            size = fc or driving(coarse.runs, identified_body(plain, item.output, values))
+            sizes[more.coefficient] = size / -more.factor
+        if isinstance(more.speed, str):
+            paces[more.speed] = speed_of(coarse, item.output)
     out = []
-    for near, force in forces:
-        for fall, speed in speeds:
-            known = {str(more.coefficient): force, str(more.speed): speed}
-            here = values | {n: v for n, v in known.items() if v is not None}
-            out.append(at(problem, here, f"{origin}, Stribeck {near:g} of Coulomb below {fall:g} of the speed"))
+    for near in NEAR if sizes else NEAR[:1]:
+        for fall in FALLS if paces else FALLS[:1]:
+            known = {n: near * v for n, v in sizes.items()} | {n: fall * v for n, v in paces.items()}
+            origin_here = f"{origin}, Stribeck {near:g} of Coulomb below {fall:g} of the speed"
+            out.append(at(problem, values | known, origin_here))
     return out
 
 
-def speed_of(coarse: Grid) -> float:
-    """Root mean square of the body's measured speed, over intervals that noise does not fill."""
-    output = coarse.problem.structure.outputs[coarse.problem.structure.sticks]
+def speed_of(coarse: Grid, output: str) -> float:
+    """Root mean square of a body's measured speed, over intervals that noise does not fill."""
     parts = [np.diff(read(run[output])[:: coarse.decimation]) / (run.step * coarse.decimation) for run in coarse.runs]
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
@@ -225,11 +245,10 @@ def at(problem: FreeProblem, values: dict[str, float], origin: str) -> Attempt:
     return Attempt(orders, coefficients, origin, {}, inputs)
 
 
-def identified_body(problem: FreeProblem, values: dict[str, float]) -> Equation:
-    """The equation of the body that may stick, without its friction, at named values."""
-    structure = problem.structure
+def identified_body(problem: FreeProblem, output: str, values: dict[str, float]) -> Equation:
+    """The equation of a body that may stick, without its friction, at named values."""
     coefficients = problem.named([values[n] for n in problem.coefficients])
-    item = structure.equations[structure.sticks]
+    item = next(e for e in problem.structure.equations if e.output == output)
     return item.with_coefficients({n: coefficients[n] for n in item.coefficient_names})
 
 

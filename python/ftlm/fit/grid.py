@@ -152,7 +152,7 @@ def descend(
     A steady one goes from a free run that dies away to none that grows.
     """
     structure, signals = problem.structure, problem.structure.signals
-    states = structure.filter_states(structure.initial) if structure.behind_filter else 0
+    states = structure.filter_states(structure.initial)
     coordinates = problem.coordinates(attempt.coefficients, plain=plain)
     bounds, ends = list(problem.bounds), [item.bounds for item in problem.inputs]
     for number in (held,) if isinstance(held, int) else held:
@@ -186,11 +186,11 @@ def _with_friction(
     coordinates: list[str], inputs: Sequence[tuple[int, str, tuple[float, float], float]], evaluations: int,
     tolerance: float,
 ) -> Any:  # fmt: skip
-    """The same of a body that may stick: what its runs start with is no projection, and goes on from where it was."""
+    """The same of bodies that may stick: what their runs start with is no projection, and goes on from where it was."""
     structure = problem.structure
     known = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
     return _core.friction_error(
-        experiments, problem.laws(structure.signals), structure.sticks, problem.strength(), bounds, coordinates,
+        experiments, problem.laws(structure.signals), problem.frictions(), bounds, coordinates,
         initial_tuple(structure.initial, structure.offset, structure.filter_states(structure.initial)),
         attempt.orders, attempt.coefficients, inputs, known, evaluations, tolerance, stop(),
     )  # fmt: skip

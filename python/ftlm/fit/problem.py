@@ -85,9 +85,10 @@ class FreeProblem:
         if structure.has_friction:
             # A velocity needs inertia, and friction of it an order of 2 at most.
             ends = dict(zip(structure.order_names, bounds, strict=True))
-            body = structure.equations[structure.sticks].order
+            orders = [structure.equations[i].order for i in structure.sticks]
             inertia = {
                 n: (max(ends[n][0], FRICTION_BOUNDS[0]), min(ends[n][1], FRICTION_BOUNDS[1]))
+                for body in orders
                 for n in (body.names if body.is_single else ())
             }
             bounds = list((ends | inertia).values())
@@ -130,9 +131,11 @@ class FreeProblem:
             for e in self.structure.equations
         ]  # fmt: skip
 
-    def strength(self) -> list[tuple[float, list[tuple[int, int]]]]:
-        """Numbers fc, fs and vs of the friction of the body that may stick, as monomials in the free coefficients."""
-        rubs = self.structure.equations[self.structure.sticks].friction or Friction(0.0)
+    def frictions(self) -> list[tuple[int, list[tuple[float, list[tuple[int, int]]]]]]:
+        """Of each body that may stick its place, and fc, fs and vs as monomials in the free coefficients."""
+        return list(zip(self.structure.sticks, map(self._strength, self._rubs), strict=True))
+
+    def _strength(self, rubs: Friction) -> list[tuple[float, list[tuple[int, int]]]]:
         more = rubs.stribeck or Stribeck(0.0, 1.0)
 
         def monomial(coefficient: str | float, factor: float) -> tuple[float, list[tuple[int, int]]]:

@@ -208,7 +208,7 @@ def identify(
 
 def _check_friction(structure: Structure, method: str, reference: str | None) -> None:
     """Refuse what does not know friction."""
-    words = f"the equation of {structure.outputs[structure.sticks]} has friction, which"
+    words = f"the equation of {structure.outputs[structure.sticks[0]]} has friction, which"
     if method != "output-error":
         raise ModelError(f"{words} method={method!r} does not know; use method='output-error'")
     if reference is not None:

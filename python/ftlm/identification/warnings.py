@@ -311,16 +311,16 @@ def one_sided(model: Model, free: Sequence[Sampled]) -> list[str]:
     """Warn where friction and an offset do the same: the body slides in one direction only."""
     if not model.structure.has_friction or model.structure.offset == "none":
         return []
-    sticks = model.structure.sticks
-    output = model.outputs[sticks]
-    for run in free:
-        moved = np.diff(run.outputs[sticks])
-        least = TURNED * float(np.ptp(run.outputs[sticks]))
-        if np.any(moved > least) and np.any(moved < -least):
-            return []
+
+    def turns(samples: Floats) -> bool:
+        moved, least = np.diff(samples), TURNED * float(np.ptp(samples))
+        return bool(np.any(moved > least) and np.any(moved < -least))
+
     return [
-        f"the velocity of {output} never changes its sign in a run: while it slides, friction is a constant like the "
-        "offset, and only the rests tell them apart; add a run that moves both ways, or use offset='none'"
+        f"the velocity of {model.outputs[i]} never changes its sign in a run: while it slides, friction is a constant "
+        "like the offset, and only the rests tell them apart; add a run that moves both ways, or use offset='none'"
+        for i in model.structure.sticks
+        if not any(turns(run.outputs[i]) for run in free)
     ]
 
 

@@ -111,10 +111,7 @@ def simulate(
     for name, terms in (initial or {}).items():
         if name not in model.outputs:
             raise ModelError(f"initial terms of {name!r}, which is no output of the model: {', '.join(model.outputs)}")
-        held = model.structure.behind_filter or (
-            model.structure.has_friction and model.structure.measured_through(name)
-        )
-        check_initial([e for e in terms if not (held and e in impulses)])
+        check_initial([e for e in terms if not (model.structure.held_back(name) and e in impulses)])
     if not real_number("tolerance", tolerance) > 0:
         raise ModelError(f"tolerance = {tolerance} is not positive; the default is 1e-6")
     own = run.length - 1

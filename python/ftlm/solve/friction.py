@@ -1,4 +1,4 @@
-"""Free runs of bodies one of which may stick, and what a run of them starts with."""
+"""Free runs of bodies some of which may stick, and what a run of them starts with."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ftlm.data.equations import Equation, Friction
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.solve.instants import has_own_times
-from ftlm.solve.records import Record, initial_tuple, linear_tuple, sensor_series
+from ftlm.solve.records import Record, linear_tuple, sensor_series
 
 #: Evaluations in which level, velocity and offset of a run are found, and the share of the cost that ends the search.
 EVALUATIONS = 60
@@ -22,22 +22,20 @@ STILL = 1e-12
 
 
 def motion_with_friction(model: Solved, rec: Record, powers: Sequence[Sequence[tuple[float, float]]]) -> _core._Motion:
-    """Outputs of identified equations one of which has friction, initial terms by equation as (exponent, coefficient).
+    """Outputs of equations some of which have friction, initial terms by equation as (exponent, coefficient).
 
     Impulses (-1, -2, ...) stand in the outputs for what the filter that these pass still held.
 
     Returns
     -------
     dict
-        ``outputs`` (pulse means, a row an equation), of the body with friction ``velocity`` (at the edges of the
-        pulses, one more; exactly 0 at rest), ``force`` (mean of the friction over each pulse, in the unit of
-        D^alpha y) and ``stuck`` (whether it is at rest at the end of each).
+        ``outputs`` (pulse means, a row an equation), and with a row for each body with friction ``velocity`` (at the
+        edges of the pulses, one more; exactly 0 at rest), ``force`` (mean of the friction over each pulse, in the unit
+        of D^alpha y) and ``stuck`` (whether it is at rest at the end of each).
     """
     equations = [(linear_tuple(e, rec.signals), [float(t.fixed or 0.0) for t in e.terms]) for e in model.equations]
-    sticks = model.structure.sticks
-    return _core.friction_respond(
-        rec.core(), equations, sticks, strength(model.equations[sticks]), [list(terms) for terms in powers]
-    )
+    frictions = [(i, strength(model.equations[i])) for i in model.structure.sticks]
+    return _core.friction_respond(rec.core(), equations, frictions, [list(terms) for terms in powers])
 
 
 def strength(item: Equation) -> tuple[float, float, float]:
@@ -72,11 +70,11 @@ def begun(model: Solved, run: Run, rec: Record, every: int, near: list[float] | 
         [(None, False)] * len(rec.signals), shares, None,
     )  # fmt: skip
     laws = [known_law(item, rec.signals) for item in model.equations]
-    sticks = structure.sticks
-    rubs: list[tuple[float, list[Any]]] = [(x, []) for x in strength(model.equations[sticks])]
+    frictions: list[tuple[int, list[tuple[float, list[Any]]]]] = [
+        (i, [(x, []) for x in strength(model.equations[i])]) for i in structure.sticks
+    ]
     return _core.friction_error(
-        [experiment], laws, sticks, rubs, [], [],
-        initial_tuple(rec.initial, rec.offset, structure.filter_states(rec.initial)), [], [], [],
+        [experiment], laws, frictions, [], [], rec.start, [], [], [],
         [] if near is None else [near], EVALUATIONS, STILL,
     )  # fmt: skip
 
@@ -93,7 +91,7 @@ def known_law(item: Equation, signals: Sequence[str]) -> tuple[int, tuple[float,
 def check_regular(run: Run, model: Solved) -> None:
     """Refuse samples at times of their own."""
     if has_own_times(run, model.structure):
-        output = model.outputs[model.structure.sticks]
+        output = model.outputs[model.structure.sticks[0]]
         raise ModelError(
             f"run {run.name!r} has rows at times of their own, and the equation of {output} has friction, "
             "which is followed at regular times; resample the run yourself"

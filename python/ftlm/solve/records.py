@@ -59,7 +59,7 @@ class Record:
     offset
         Unknown constant of each equation on this run.
     states
-        Free motions of the sensor filter beside the initial terms.
+        Free motions of the sensor filter beside the initial terms of every output that passes it.
     """
 
     signals: tuple[str, ...]
@@ -151,7 +151,7 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         sensor,
         initial,
         structure.offset,
-        structure.filter_states(initial) if sensor is not None else 0,
+        structure.filter_states(initial),
     )
 
 

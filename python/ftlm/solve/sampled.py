@@ -197,7 +197,9 @@ def sampled(
     names = [
         (e.output, power)
         for e in model.equations
-        for power in initial_exponents(e, rec.initial, rec.offset, rec.states)
+        for power in initial_exponents(
+            e, rec.initial, rec.offset, rec.states if model.structure.held_back(e.output) else 0
+        )
     ]
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
     if not names:
@@ -252,7 +254,10 @@ def _fitted(
 
 
 def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
-    """Pulse means of the outputs, before the sensor filter: all together, or each driven by the measured others."""
+    """Pulse means of the outputs, before the sensor filter: all together, or each driven by the measured others.
+
+    Impulses (-1, -2, ...) stand in them for what the filter that they pass still held.
+    """
     if model.structure.has_friction:
         return motion_with_friction(model, rec, [sorted(terms[o].items()) for o in model.outputs])["outputs"]
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
@@ -332,7 +337,7 @@ def _read(
             for i, name in enumerate(names):
                 if structure.measured_through(name) and np.all(np.isfinite(means[i])):
                     gain[i] = high_frequency_gain(structure.sensor_filter)
-                    # What the filter of a body that may stick still held, of impulses as powers below.
+                    # What the filter of this output still held, of impulses as powers below.
                     if degree := structure.sensor_filter.relative_degree:
                         held[i] = terms[name].get(-float(degree), 0.0) * leading_gain(structure.sensor_filter)
                     rest[i] = _core.series_multiply(series, means[i], rec.m)

@@ -142,6 +142,11 @@ impl Experiment {
         check_length("weights", self.samples.len(), self.weights.len())
     }
 
+    /// Whether an output passes a filter before it is compared, by itself or with all of its equation.
+    pub(super) fn behind_filter(&self, output: usize) -> bool {
+        self.record.is_filtered() || self.filter.as_ref().is_some_and(|(_, applies)| applies[output])
+    }
+
     /// Samples that are compared: all that have a pulse on either side, or all that were read at times of their own.
     pub(crate) fn compared(&self) -> usize {
         match &self.own {

@@ -12,6 +12,7 @@ use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimate::least_squares;
 use crate::excess::MAX_EXCESS;
+use crate::impulses::is_impulse;
 use crate::series::{Buffers, Solver, SumOfProducts};
 
 /// Own-output orders closer to α than this make the equation say that the output equals itself.
@@ -32,7 +33,8 @@ pub(super) struct Evaluation {
     pub(super) parts: Vec<Part>,
 }
 
-/// Response of an experiment to an initial term: its equation, weighted samples, pulse means.
+/// Response of an experiment to an initial term: its equation, weighted samples, pulse means; none of what moves nothing
+/// but the filter of an output.
 struct Free {
     equation: usize,
     samples: Vec<f64>,
@@ -62,7 +64,7 @@ impl FreeModel {
             residuals: Vec::new(),
             size: 0.0,
             initial: Vec::new(),
-            exponents: structures.iter().map(|s| s.initial_exponents(&self.initial)).collect(),
+            exponents: Vec::new(),
             parts: Vec::with_capacity(experiments.len()),
         };
         let mut answers = Vec::with_capacity(experiments.len());
@@ -165,11 +167,18 @@ impl FreeModel {
         let mut inverse = None;
         let mut free = Vec::new();
         let mut basis = Vec::new();
+        out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
         if out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty() {
             let made = solver.inverse_spectra(FACTORS * m)?;
             let mut target = SumOfProducts::with_length(FACTORS * m);
             for (i, list) in out.exponents.iter().enumerate() {
                 for &exponent in list {
+                    if is_impulse(exponent) && !record.is_filtered() {
+                        let samples = shelf.impulse(experiment, i, exponent);
+                        dense::extend_orthonormal(&mut basis, samples.clone(), SPANNED);
+                        free.push(Free { equation: i, samples, means: Vec::new() });
+                        continue;
+                    }
                     let power = shelf.power(experiment, exponent);
                     let means: Vec<Vec<f64>> = made
                         .iter()

@@ -207,6 +207,12 @@ impl FreeModel {
             .collect()
     }
 
+    /// Exponents of the initial terms of equation i, of a structure of it, on an experiment: of impulses only where its
+    /// output passes a filter that may still have held something.
+    pub(super) fn exponents(&self, experiment: &Experiment, i: usize, structure: &Structure) -> Vec<f64> {
+        structure.initial_exponents(if experiment.behind_filter(i) { &self.initial } else { self.initial.unfiltered() })
+    }
+
     /// The unknown that a signal of equation i is, if it is one.
     pub(super) fn unknown(&self, i: usize, signal: usize) -> Option<usize> {
         if self.coupled {

@@ -7,7 +7,6 @@ use super::model::{FreeModel, Point};
 use super::part::Part;
 use super::shelf::{Shelf, FACTORS};
 use crate::error::{check_length, Error, Result};
-use crate::regressors::Record;
 use crate::series::{Kernel, Solver, SumOfProducts};
 
 impl FreeModel {
@@ -107,7 +106,7 @@ impl FreeModel {
                     }
                 }
                 if parameter < orders.len() {
-                    if let Some(moved) = initial_slope(self, i, parameter, orders, &initial[i], record)? {
+                    if let Some(moved) = initial_slope(self, i, parameter, orders, &initial[i], experiment)? {
                         moves[i] = true;
                         rights[i].add_series(&spectrum(&moved));
                     }
@@ -134,7 +133,7 @@ fn initial_slope(
     parameter: usize,
     orders: &[f64],
     values: &[f64],
-    record: &Record,
+    experiment: &Experiment,
 ) -> Result<Option<Vec<f64>>> {
     // Exponents move linearly with orders, and powers of t smoothly with exponents: a central difference of the
     // powers has an error of 1e−10, far below what a Jacobian needs.
@@ -146,12 +145,13 @@ fn initial_slope(
     for sign in [1.0, -1.0] {
         let mut moved = orders.to_vec();
         moved[parameter] += sign * SHIFT;
-        lists.push(model.structures(&moved)[i].initial_exponents(&model.initial));
+        lists.push(model.exponents(experiment, i, &model.structures(&moved)[i]));
     }
     if lists.iter().any(|l| l.len() != values.len()) {
         // An exponent appears or merges here: the projection follows it in the next evaluation.
         return Ok(None);
     }
+    let record = &experiment.record;
     let mut out = vec![0.0; record.m()];
     let mut moved = false;
     for ((&up, &down), &x) in lists[0].iter().zip(&lists[1]).zip(values) {

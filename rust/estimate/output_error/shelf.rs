@@ -43,6 +43,8 @@ pub(super) struct Shelf {
     drivers: HashMap<usize, Rc<Kernel>>,
     /// Spectra of powers of t that initial terms bring, by the bits of their exponents.
     powers: HashMap<u64, Rc<Kernel>>,
+    /// Weighted samples of impulses that the filter of an output gets, by output and the bits of their exponents.
+    impulses: HashMap<(usize, u64), Vec<f64>>,
 }
 
 impl Shelf {
@@ -95,5 +97,15 @@ impl Shelf {
             self.powers.clear();
         }
         self.powers.entry(exponent.to_bits()).or_insert_with(made).clone()
+    }
+
+    /// Weighted samples of an impulse, or of a derivative of one, that only the filter of an output gets.
+    pub(super) fn impulse(&mut self, experiment: &Experiment, output: usize, exponent: f64) -> Vec<f64> {
+        let made = || {
+            let mut means = vec![vec![0.0; experiment.record.m()]; experiment.samples.len()];
+            means[output] = experiment.record.initial_term(exponent);
+            experiment.sampled(&means)
+        };
+        self.impulses.entry((output, exponent.to_bits())).or_insert_with(made).clone()
     }
 }

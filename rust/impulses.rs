@@ -1,0 +1,28 @@
+//! What the sensor filter of an output still held when a run began: its answers to an impulse and to derivatives of one.
+//!
+//! They are written as powers of t below zero, −1, −2, …, among the initial terms of an equation. Where the whole
+//! equation stands behind the filter they drive it like any other; where the machine moves before its filter they move
+//! nothing, and are added to the output that passes it.
+
+use crate::kernels::power_means;
+
+/// Whether an exponent stands for an impulse or a derivative of one.
+pub(crate) fn is_impulse(exponent: f64) -> bool {
+    exponent <= -1.0 && exponent.fract() == 0.0
+}
+
+/// Initial terms that move something, and impulses, by equation.
+#[allow(clippy::type_complexity)]
+pub(crate) fn parted(powers: &[Vec<(f64, f64)>]) -> (Vec<Vec<(f64, f64)>>, Vec<Vec<(f64, f64)>>) {
+    powers.iter().map(|own| own.iter().partition(|(e, _)| !is_impulse(*e))).unzip()
+}
+
+/// Adds impulses and their derivatives to pulse means of outputs.
+pub(crate) fn add_impulses(outputs: &mut [Vec<f64>], impulses: &[Vec<(f64, f64)>], step: f64) {
+    for (output, own) in outputs.iter_mut().zip(impulses) {
+        for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
+            let means = power_means(exponent, output.len(), step);
+            output.iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
+        }
+    }
+}
