@@ -95,8 +95,18 @@ def lines_of(command, folder, hang):
 
 
 def calls(table, count, folder, only=(), hang=HANG):
-    """So many calls of each entry; the table gets the sum, its notes a line for each."""
-    kinds, made = {}, 0
+    """So many calls of each entry, or those before a Ctrl-C; the table gets their sum and a line for each."""
+    kinds = {}
+    try:
+        make_calls(table, kinds, count, folder, only, hang)
+    except KeyboardInterrupt:
+        table.notes.append("calls of the extension: interrupted")
+    table.tried(CALLS, sum(counted["calls"] for counted in kinds.values()))
+    # Refused arguments alone would prove little.
+    table.calls = kinds
+
+
+def make_calls(table, kinds, count, folder, only, hang):
     for seed in range(-(-count // BATCH)):
         size = min(BATCH, count - seed * BATCH)
         command = [sys.executable, __file__, "--batch", str(seed), "--size", str(size), "--only", ",".join(only)]
@@ -105,16 +115,13 @@ def calls(table, count, folder, only=(), hang=HANG):
             if line[:1] == "!":
                 table.broken(CALLS, f"batch {seed}: {last} {line[1:]}")
             elif line[:1] != "=":
-                last, made = line.strip(), made + 1
+                last = line.strip()
                 kinds.setdefault(last, Counter())["calls"] += 1
             else:
                 kind = line[1:].partition(":")[0]
                 kinds[last][kind] += 1
                 if ":" in line:
                     table.broken(CALLS, f"batch {seed}: {last}: {line[1:]}")
-    table.tried(CALLS, made)
-    # Refused arguments alone would prove little.
-    table.calls = kinds
 
 
 def table_of_calls(kinds):
@@ -373,6 +380,7 @@ class Table:
 
     def broken(self, what, how):
         self.breaks.setdefault(what, []).append(how)
+        print(f"{what} broken: {how[:500]}", file=sys.stderr, flush=True)
 
     def __str__(self):
         rows = [f"| {what} | {count} | {len(self.breaks.get(what, []))} |" for what, count in self.counts.items()]

@@ -338,6 +338,8 @@ def test_jumps_without_sizes_are_refused():
     places = np.array([3.0, 4.5, 7.0])
     with pytest.raises(ftlm.DataError, match="jumps has length 2, but 3 is needed"):
         _core.corners(16, places, (places, np.ones(2)), 0.5, 0.1)
+    with pytest.raises(ftlm.ModelError, match="the times of jumps fall from index 1"):
+        _core.corners(16, places, (np.array([3.0, 4.5, -1e300]), np.ones(3)), 0.5, 0.1)
 
 
 # ----------------------------------------------------------------------------------------------------------------------
