@@ -48,7 +48,7 @@ test-slow: $(VENV)/.built
 	$(BIN)/python -m pytest -m slow --timeout 7200
 
 # Attacks from outside, for minutes, in a temporary folder; a table of what was tried and what broke. So many calls of
-# each entry of the extension: ATTACK_CALLS=100000 takes some hours.
+# each entry of the extension: ATTACK_CALLS=100000 takes two hours.
 ATTACK_CALLS ?= 1300
 attack: $(VENV)/.built
 	$(BIN)/python tests/attack.py --calls $(ATTACK_CALLS)
