@@ -99,11 +99,10 @@ wheels: $(ZIG)/.tools
 # Wheels of the last commit, made in two folders from nothing: the same bytes.
 wheels-twice: WHEELS = x86_64-unknown-linux-gnu
 wheels-twice: $(ZIG)/.tools
-	rm -rf wheels-twice
-	for copy in one two/deeper; do mkdir -p wheels-twice/$$copy && git archive HEAD | tar x -C wheels-twice/$$copy && \
-		$(MAKE) -C wheels-twice/$$copy wheels ZIG=$(abspath $(ZIG)) WHEELS="$(WHEELS)" || exit 1; done
-	cd wheels-twice/one/wheels && for made in *; do cmp $$made ../../two/deeper/wheels/$$made || exit 1; done
-	rm -rf wheels-twice
+	folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && for copy in one two/deeper; do \
+		mkdir -p $$folder/$$copy && git archive HEAD | tar x -C $$folder/$$copy && \
+		$(MAKE) -C $$folder/$$copy wheels ZIG=$(abspath $(ZIG)) WHEELS="$(WHEELS)" || exit 1; done && \
+	for made in $$folder/one/wheels/*; do cmp $$made $$folder/two/deeper/wheels/$${made##*/} || exit 1; done
 
 # The wheel alone, in environments that have nothing else: what a user gets from pip. PYTHONS names several.
 PYTHONS ?= $(PYTHON)
@@ -129,4 +128,4 @@ sdist-test: $(VENV)/.tools
 	rm -rf $(VENV)-sdist sdist
 
 clean:
-	rm -rf $(VENV) $(VENV)-wheel $(VENV)-sdist $(ZIG) wheels wheels-twice sdist demo target docs/_build docs/_pictures
+	rm -rf $(VENV) $(VENV)-wheel $(VENV)-sdist $(ZIG) wheels sdist demo target docs/_build docs/_pictures
