@@ -5,10 +5,11 @@ PYTHON ?= python3
 CORE := $(shell find rust -name '*.rs') Cargo.toml Cargo.lock pyproject.toml
 export RUSTDOCFLAGS := -D warnings
 
-# The same commit in the same folder gives the same wheel: what is in it is as old as the commit.
+# The same commit gives the same wheel: what is in it is as old as the commit.
 export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct 2>/dev/null || echo 315532800)
 
-.PHONY: demo test test-slow attack test-rust test-python lint docs bench fuzz wheel wheel-test sdist-test clean
+.PHONY: demo test test-slow attack test-rust test-python lint docs bench fuzz wheel wheels wheels-twice \
+	wheel-test sdist-test clean
 
 demo: $(VENV)/.built
 	$(BIN)/ftlm demo -o demo --force
@@ -17,7 +18,7 @@ test: lint test-rust test-python docs wheel-test
 
 $(VENV)/.tools: requirements-test.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-test.txt
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-test.txt
 	@touch $@
 
 $(VENV)/.built: $(VENV)/.tools $(CORE)
@@ -46,9 +47,11 @@ test-python: $(VENV)/.built
 test-slow: $(VENV)/.built
 	$(BIN)/python -m pytest -m slow --timeout 7200
 
-# Attacks from outside, for minutes, in a temporary folder; a table of what was tried and what broke.
+# Attacks from outside, for minutes, in a temporary folder; a table of what was tried and what broke. So many calls of
+# each entry of the extension: ATTACK_CALLS=100000 takes two hours.
+ATTACK_CALLS ?= 1300
 attack: $(VENV)/.built
-	$(BIN)/python tests/attack.py
+	$(BIN)/python tests/attack.py --calls $(ATTACK_CALLS)
 
 # Pages in docs/_build/html; a warning is an error.
 docs: $(VENV)/.built
@@ -69,12 +72,45 @@ wheel: $(VENV)/.tools
 	rm -rf wheels
 	. $(BIN)/activate && maturin build --release --quiet --out wheels
 
-# The wheel alone, in an environment that has nothing else: what a user gets from pip.
+# Wheels for any Linux from this one, and the source: zig links against the oldest C library of a policy, and no folder of
+# this machine is named. WHEELS names fewer targets; rustup adds Rust's library of one that is not there.
+WHEELS ?= x86_64-unknown-linux-gnu aarch64-unknown-linux-gnu x86_64-unknown-linux-musl aarch64-unknown-linux-musl
+ZIG := $(VENV)-zig
+CARGO_HOME ?= $(HOME)/.cargo
+POLICY = $(if $(findstring musl,$(1)),musllinux_1_2,manylinux2014)
+NAMELESS = --remap-path-prefix=$(CURDIR)=/ftlm --remap-path-prefix=$(CARGO_HOME)/registry/src=/crates
+
+$(ZIG)/.tools: requirements-wheels.txt
+	$(PYTHON) -m venv $(ZIG)
+	$(ZIG)/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r requirements-wheels.txt
+	@touch $@
+
+wheels: $(ZIG)/.tools
+	rm -rf wheels
+	for target in $(WHEELS); do rustup target list --installed | grep -qx $$target || rustup target add $$target || exit 1; done
+	. $(ZIG)/bin/activate && export RUSTFLAGS="$(NAMELESS)" && $(foreach target,$(WHEELS),maturin build --release \
+		--locked --quiet --zig --target $(target) --compatibility $(call POLICY,$(target)) --out wheels &&) true
+	. $(ZIG)/bin/activate && maturin sdist --out wheels
+	$(ZIG)/bin/python tests/wheel.py --nameless wheels/*.whl
+	$(ZIG)/bin/python -m abi3audit --strict wheels/*.whl
+	for wheel in wheels/*manylinux*.whl; do test ! -e $$wheel || \
+		$(ZIG)/bin/auditwheel show --json $$wheel | $(ZIG)/bin/python tests/wheel.py || exit 1; done
+
+# Wheels of the last commit, made in two folders from nothing: the same bytes.
+wheels-twice: WHEELS = x86_64-unknown-linux-gnu
+wheels-twice: $(ZIG)/.tools
+	folder=$$(mktemp -d) && trap 'rm -rf "$$folder"' EXIT && for copy in one two/deeper; do \
+		mkdir -p $$folder/$$copy && git archive HEAD | tar x -C $$folder/$$copy && \
+		$(MAKE) -C $$folder/$$copy wheels ZIG=$(abspath $(ZIG)) WHEELS="$(WHEELS)" || exit 1; done && \
+	for made in $$folder/one/wheels/*; do cmp $$made $$folder/two/deeper/wheels/$${made##*/} || exit 1; done
+
+# The wheel alone, in environments that have nothing else: what a user gets from pip. PYTHONS names several.
+PYTHONS ?= $(PYTHON)
 wheel-test: wheel
-	rm -rf $(VENV)-wheel
-	$(PYTHON) -m venv $(VENV)-wheel
-	$(VENV)-wheel/bin/python -m pip install --quiet --disable-pip-version-check wheels/*.whl
-	cd wheels && ../$(VENV)-wheel/bin/ftlm demo --step 0.1 -o demo
+	for python in $(PYTHONS); do rm -rf $(VENV)-wheel && $$python -m venv $(VENV)-wheel && \
+		$(VENV)-wheel/bin/python -m pip install --quiet --disable-pip-version-check wheels/*.whl && \
+		(cd wheels && ../$(VENV)-wheel/bin/ftlm doctor && ../$(VENV)-wheel/bin/ftlm demo --step 0.1 -o demo --force) || \
+		exit 1; done
 	$(BIN)/python -m abi3audit --strict wheels/*.whl
 ifeq ($(shell uname -s),Linux)
 	$(BIN)/auditwheel show --json wheels/*.whl | $(BIN)/python tests/wheel.py
@@ -92,4 +128,4 @@ sdist-test: $(VENV)/.tools
 	rm -rf $(VENV)-sdist sdist
 
 clean:
-	rm -rf $(VENV) $(VENV)-wheel $(VENV)-sdist wheels sdist demo target docs/_build docs/_pictures
+	rm -rf $(VENV) $(VENV)-wheel $(VENV)-sdist $(ZIG) wheels sdist demo target docs/_build docs/_pictures

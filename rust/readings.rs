@@ -107,7 +107,9 @@ impl Readings {
         for (&place, &first) in self.places.iter().zip(&self.first) {
             let from = at.partition_point(|&p| p < place - REACH);
             let to = at.partition_point(|&p| p < (first + STENCIL) as f64);
-            for (&p, &size) in at[from..to.max(from)].iter().zip(&sizes[from..]).filter(|(_, size)| **size != 0.0) {
+            for (&p, &size) in
+                at[from..to.max(from)].iter().zip(sizes.iter().skip(from)).filter(|(_, size)| **size != 0.0)
+            {
                 let pulse = p.floor();
                 out.near.push(Near {
                     before: place - p,

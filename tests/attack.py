@@ -5,7 +5,6 @@ panic, a hang, an error without words, another answer or a live motor counts as 
 """
 
 import argparse
-import ast
 import os
 import random
 import resource
@@ -13,193 +12,128 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-STUB = HERE.parent / "python" / "ftlm" / "_core.pyi"
 #: Longest call, and what Ctrl-C may take of its own processor time [s].
 HANG, STOP = 5.0, 0.5
-BATCH = 250
+#: Calls of each entry that a child makes.
+BATCH = 50
 MEMORY = 4 << 30
 
 # ----------------------------------------------------------------------------------------------------------------------
-# Calls of every entry of the extension, with arguments that are nearly right or wild; this part runs in a child.
+# Calls of every entry of the extension; each batch is made in a child.
+
+CALLS = "calls of the extension"
+#: Refusals in words; whatever else is raised breaks the promise.
+WORDS = {"DataError", "ModelError", "ConvergenceError", "TypeError", "ValueError", "OverflowError", "MemoryError",
+         "KeyError", "UnicodeEncodeError"}  # fmt: skip
+#: What hostile callbacks raise, and what a flag that is set is for.
+ASKED_FOR = {"OursError", "KeyboardInterrupt"}
 
 
-def entries():
-    """(class or None, name, annotations of the arguments) of everything that can be called in the extension."""
-    tree = ast.parse(STUB.read_text())
-    aliases = {n.target.id: n.value for n in tree.body if isinstance(n, ast.AnnAssign) and n.value is not None}
-    found = []
-    for node in tree.body:
-        own = node.name if isinstance(node, ast.ClassDef) else None
-        for item in node.body if own else [node]:
-            if isinstance(item, ast.FunctionDef) and item.name != "panic_on_purpose":
-                skip = 1 if own else 0
-                arguments = [(a.arg, a.annotation) for a in item.args.args[skip:]]
-                if not any(isinstance(d, ast.Name) and d.id == "property" for d in item.decorator_list):
-                    found.append((own, item.name, arguments))
-    return aliases, found
+def call_batch(seed, count, only, show):
+    """Calls each entry, announced before and judged after; what hangs or ends the process is the last announced.
 
-
-class Values:
-    """Values for annotations."""
-
-    def __init__(self, seed, aliases):
-        self.random, self.aliases = random.Random(seed), aliases
-        self.wild = 0.15
-
-    def number(self):
-        r = self.random
-        wild = [float("nan"), float("inf"), -float("inf"), 0.0, -1.0, 1e308, 5e-324, 1e-300, -1e300, 1e16]
-        return r.choice(wild) if r.random() < self.wild else round(r.uniform(0, 2.5), 3)
-
-    def whole(self):
-        r = self.random
-        # Sizes between a million and what is refused are work, not an attack.
-        wild = [-1, 0, 1 << 20, (1 << 31) - 1, 1 << 31, 1 << 40, 1 << 62, (1 << 63) - 1, 1 << 64]
-        return r.choice(wild) if r.random() < self.wild else r.randrange(0, 9)
-
-    def array(self, dimensions=None):
-        import numpy as np
-
-        r = self.random
-        dimensions = dimensions or r.choice([1, 2, 2])
-        shape = [
-            r.choice([0, 1, 2, 3, 8, 33]) if r.random() < self.wild else r.choice([2, 3]) for _ in range(dimensions)
-        ]
-        shape[-1] = shape[-1] if r.random() < self.wild else 33
-        values = np.random.default_rng(r.randrange(1 << 30)).standard_normal(shape)
-        if r.random() < self.wild and values.size:
-            values.flat[r.randrange(values.size)] = self.number()
-        if r.random() < self.wild:
-            values = r.choice(
-                [values.astype(np.float32), values[..., ::2], values.T, np.asfortranarray(values), None, "x"]
-            )
-        return values
-
-    def of(self, note):
-        r = self.random
-        if isinstance(note, ast.BinOp):
-            return self.of(r.choice([note.left, note.right]))
-        if isinstance(note, ast.Constant):
-            return note.value
-        if isinstance(note, ast.Name):
-            simple = {
-                "float": self.number, "int": self.whole, "bool": lambda: r.random() < 0.5, "Any": self.number,
-                "bytes": lambda: r.randbytes(9), "str": self.word, "Guard": lambda: None, "object": lambda: None,
-                "_Floats": self.array, "_Vector": lambda: self.array(1), "_Matrix": lambda: self.array(2),
-            }  # fmt: skip
-            return simple[note.id]() if note.id in simple else self.of(self.aliases[note.id])
-        kind = note.value.id
-        inner = note.slice.elts if isinstance(note.slice, ast.Tuple) else [note.slice]
-        if kind == "Callable":
-            return lambda *_: ((0.0, 0.0), True)
-        if kind in ("Mapping", "dict"):
-            return {k: self.number() for k in ("step", "slew")}
-        if kind == "Literal":
-            return self.of(r.choice(inner))
-        if kind == "tuple":
-            return tuple(self.of(part) for part in inner)
-        count = r.choice([0, 1, 2, 3, 5]) if r.random() < 2 * self.wild else 2
-        return [self.of(inner[0]) for _ in range(count)]
-
-    def word(self):
-        known = (
-            "block-pulse", "trapezoidal", "grunwald-letnikov", "caputo", "riemann-liouville", "output-error", "l1",
-            "l2", "equation-error", "linear", "log", "delay", "dead encoder", "", "\0", "x" * 9999,
-        )  # fmt: skip
-        return self.random.choice(known)
-
-
-def guard_settings(values):
-    from ftlm import rig
-
-    return rig.Limits(late=values.number(), slew=(values.number(), 500.0)).guard(0.002)
-
-
-def call_batch(seed, count):
-    """Runs calls, each announced before it; a panic ends the batch with a word."""
-    from ftlm import _core, rig
+    With `show`, the announcement has the arguments.
+    """
+    import hostile
 
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    aliases, all_entries = entries()
-    values = Values(seed, aliases)
-    made = {"Guard": guard_settings, "VirtualArm": lambda _: rig.ArmParameters.of("linear").arm(0.002, 1.0)}
-    objects = {}
-    for index in range(count):
-        own, name, arguments = values.random.choice(all_entries)
-        given = [values.of(note) for _, note in arguments]
-        print(f"{index} {own or ''}.{name}", flush=True)
-        try:
-            if own is None:
-                getattr(_core, name)(*given)
-            elif name == "__new__":
-                objects[own] = getattr(_core, own)(*given)
-            else:
-                if own not in objects:
-                    objects[own] = (
-                        made[own](values)
-                        if own in made
-                        else getattr(_core, own)(
-                            *[
-                                values.of(note)
-                                for o, n, args in all_entries
-                                if (o, n) == (own, "__new__")
-                                for _, note in args
-                            ]
-                        )
-                    )
-                given = [made["Guard"](values) if isinstance(note, ast.Name) and note.id == "Guard" else g
-                         for g, (_, note) in zip(given, arguments, strict=True)]  # fmt: skip
-                getattr(objects[own], name)(*given)
-            print("ANSWERED", flush=True)
-        except Exception as error:
-            if type(error).__name__ == "InternalError":
-                print(f"PANIC {error}", flush=True)
-        except BaseException as error:
-            print(f"PANIC {type(error).__name__} {error}", flush=True)
+    sound = hostile.Sound(seed)
+    names = only or hostile.entries()
+    if show:
+        hostile.np.set_printoptions(threshold=20)
+    for _ in range(count):
+        for name in names:
+            call, given, named = sound.call(name)
+            kept = sound.random.random() < hostile.SOUND
+            if not kept:
+                given, named = hostile.attacked(name, given, named, sound.random)
+            os.write(1, f"{name} {f'{given} {named}' if show else ''}\n".encode(errors="backslashreplace"))
+            try:
+                call(*given, **named)
+                told = "sound" if kept else "answered"
+            except BaseException as error:
+                told = type(error).__name__
+                # An object may remember a hostile call.
+                faulty = kept and ("." not in name or name.endswith("__new__"))
+                if told not in WORDS | ASKED_FOR or faulty or (not str(error) and told in WORDS):
+                    told = f"{told}: {' '.join(str(error).split())[:300]}: {given!r:.2000} {named}".replace("\n", " ")
+            os.write(1, f"={told}\n".encode(errors="backslashreplace"))
 
 
-def calls(table, count, folder):
-    tried, names, answered = 0, set(), set()
-    answers = 0
-    for seed in range(-(-count // BATCH)):
-        with (folder / "errors").open("w") as errors:
-            command = [sys.executable, __file__, "--batch", str(seed)]
-            child = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=errors)
-        # The clock starts anew at every announcement.
-        last, at, buffer = "", time.monotonic(), ""
+def lines_of(command, folder, hang):
+    """Lines that a child writes, then in words how it ended if that was no good end; silence of `hang` s ends it."""
+    with (
+        (folder / "errors").open("w") as errors,
+        subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=errors) as child,
+    ):
+        started, at, buffer = False, time.monotonic(), b""
         os.set_blocking(child.stdout.fileno(), False)
         while True:
             got = child.stdout.read()
             if got:
-                at, buffer = time.monotonic(), buffer + got.decode()
-                *lines, buffer = buffer.split("\n")
+                started, at = True, time.monotonic()
+                *lines, buffer = (buffer + got).split(b"\n")
                 for line in lines:
-                    if line.startswith("PANIC"):
-                        table.broken("calls of the extension", f"batch {seed}: {last}: {line}")
-                    elif line == "ANSWERED":
-                        answers += 1
-                        answered.add(last.partition(" ")[2])
-                    else:
-                        last, tried = line, tried + 1
-                        names.add(last.partition(" ")[2])
+                    yield line.decode()
             elif child.poll() is not None:
                 break
-            elif time.monotonic() - at > HANG + (10 if not last else 0):
+            # Python and NumPy are imported before the first line.
+            elif time.monotonic() - at > hang + (0 if started else 20):
                 child.kill()
-                table.broken("calls of the extension", f"batch {seed}: {last} took more than {HANG} s")
-                break
+                yield f"!took more than {hang:g} s"
+                return
             else:
-                time.sleep(0.005)
-        if child.wait() not in (0, -9):
-            table.broken("calls of the extension", f"batch {seed}: {last} ended the process with {child.returncode}")
-    table.tried("calls of the extension", tried)
+                time.sleep(0.002)
+    if child.returncode:
+        words = (folder / "errors").read_text(errors="replace").strip()[-200:]
+        yield f"!ended the process with {child.returncode}: {words}"
+
+
+def calls(table, count, folder, only=(), hang=HANG):
+    """So many calls of each entry, or those before a Ctrl-C; the table gets their sum and a line for each."""
+    kinds = {}
+    try:
+        make_calls(table, kinds, count, folder, only, hang)
+    except KeyboardInterrupt:
+        table.notes.append("calls of the extension: interrupted")
+    table.tried(CALLS, sum(counted["calls"] for counted in kinds.values()))
     # Refused arguments alone would prove little.
-    table.notes.append(f"{answers} calls of {len(answered)} of {len(names)} entries were answered, the others refused")
-    table.notes += [f"never answered: {', '.join(sorted(names - answered))}"] if names - answered else []
+    table.calls = kinds
+
+
+def make_calls(table, kinds, count, folder, only, hang):
+    for seed in range(-(-count // BATCH)):
+        size = min(BATCH, count - seed * BATCH)
+        command = [sys.executable, __file__, "--batch", str(seed), "--size", str(size), "--only", ",".join(only)]
+        last = "nothing yet"
+        for line in lines_of(command, folder, hang):
+            if line[:1] == "!":
+                table.broken(CALLS, f"batch {seed}: {last} {line[1:]}")
+            elif line[:1] != "=":
+                last = line.strip()
+                kinds.setdefault(last, Counter())["calls"] += 1
+            else:
+                kind = line[1:].partition(":")[0]
+                kinds[last][kind] += 1
+                if ":" in line:
+                    table.broken(CALLS, f"batch {seed}: {last}: {line[1:]}")
+
+
+def table_of_calls(kinds):
+    """Rows of a table: entry, calls, answers to sound and to hostile arguments, refusals by kind of error."""
+    shown = ("calls", "sound", "answered")
+    others = sorted({kind for counted in kinds.values() for kind in counted} - set(shown))
+    head = ["entry", "calls", "sound, answered", "hostile, answered", *others]
+    rows = [[name, *(str(counted[kind] or "") for kind in (*shown, *others))] for name, counted in kinds.items()]
+    total = ["all", *(str(sum(counted[kind] for counted in kinds.values())) for kind in (*shown, *others))]
+    never = [name for name, counted in kinds.items() if not counted["answered"]]
+    told = f"{len(never)} of {len(kinds)} entries answered no hostile call{': ' if never else ''}{', '.join(never)}."
+    return "\n".join(["| " + " | ".join(row) + " |" for row in (head, ["---"] * len(head), *rows, total)] + ["", told])
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -438,7 +372,7 @@ class Table:
     """What was tried and what broke."""
 
     def __init__(self):
-        self.counts, self.breaks, self.notes = {}, {}, []
+        self.counts, self.breaks, self.notes, self.calls = {}, {}, [], {}
 
     def tried(self, what, count):
         self.counts[what] = count
@@ -446,22 +380,29 @@ class Table:
 
     def broken(self, what, how):
         self.breaks.setdefault(what, []).append(how)
+        print(f"{what} broken: {how[:500]}", file=sys.stderr, flush=True)
 
     def __str__(self):
         rows = [f"| {what} | {count} | {len(self.breaks.get(what, []))} |" for what, count in self.counts.items()]
         told = [f"- {what}: {how}" for what, hows in self.breaks.items() for how in hows[:10]]
-        return "\n".join(["| attack | tried | broken |", "| --- | --- | --- |", *rows, "", *self.notes, *told])
+        calls = ["", table_of_calls(self.calls)] if self.calls else []
+        return "\n".join(["| attack | tried | broken |", "| --- | --- | --- |", *rows, "", *self.notes, *told, *calls])
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--calls", type=int, default=20_000, help="calls of the extension")
+    parser.add_argument("--calls", type=int, default=1_300, help="calls of each entry of the extension")
     parser.add_argument("--files", type=int, default=1_000, help="damaged files of each kind, a twentieth of parquet")
     parser.add_argument("--kills", type=int, default=10)
+    parser.add_argument("--only-calls", action="store_true", help="nothing but calls of the extension")
+    parser.add_argument("--only", default="", help="entries of the extension to call, with commas between")
     parser.add_argument("--batch", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--show", action="store_true", help="with --batch and --size: the arguments of each call")
+    parser.add_argument("--size", type=int, help=argparse.SUPPRESS)
     given = parser.parse_args()
+    only = [name for name in given.only.split(",") if name]
     if given.batch is not None:
-        call_batch(given.batch, BATCH)
+        call_batch(given.batch, given.size, only, given.show)
         return
     table = Table()
     began = time.monotonic()
@@ -469,12 +410,13 @@ def main():
         folder = Path(name)
         os.environ |= {"HOME": name, "TMPDIR": name}
         os.chdir(folder)
-        way_out(table)
-        outputs(table, folder)
-        files(table, folder, given.files)
-        presses(table, folder)
-        kills(table, folder, given.kills)
-        calls(table, given.calls, folder)
+        if not given.only_calls:
+            way_out(table)
+            outputs(table, folder)
+            files(table, folder, given.files)
+            presses(table, folder)
+            kills(table, folder, given.kills)
+        calls(table, given.calls, folder, only)
         os.chdir("/")
     print(f"{table}\n{time.monotonic() - began:.0f} s")
     sys.exit(1 if table.breaks else 0)

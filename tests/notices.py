@@ -1,4 +1,4 @@
-"""Writes the notices of all crates that the extension links, on any platform; ``--check`` only compares.
+"""Writes notices and bill of materials of all crates that the extension links, on any platform; ``--check`` compares.
 
 python tests/notices.py [--check]
 """
@@ -7,10 +7,13 @@ import argparse
 import json
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 FILE = ROOT / "THIRD-PARTY-NOTICES.txt"
+#: maturin's own bill names the folder that it was made in.
+BILL = ROOT / "ftlm.cdx.json"
 HEAD = """The compiled part of ftlm links the Rust crates below, and the standard library of Rust (its project,
 MIT OR Apache-2.0, whose texts are below, too). Crates that only build or test ftlm are not in it. Written by
 tests/notices.py from Cargo.lock and the crates' own files.
@@ -60,17 +63,49 @@ def notices(metadata):
     return "\n".join(parts) + "\n"
 
 
+def bill(metadata, lock):
+    """What is linked, as CycloneDX has it: nothing in it depends on where or when it was written."""
+    checksums = {(p["name"], p["version"]): p.get("checksum") for p in lock["package"]}
+    packages = {package["id"]: package for package in metadata["packages"]}
+    nodes = {node["id"]: node for node in metadata["resolve"]["nodes"]}
+    root, crates = packages[metadata["resolve"]["root"]], linked(metadata)
+    within = {package["id"] for package in crates}
+
+    def reference(package):
+        return f"pkg:cargo/{package['name']}@{package['version']}"
+
+    def component(package):
+        checksum = checksums[package["name"], package["version"]]
+        return {
+            "type": "library", "bom-ref": reference(package), "name": package["name"], "version": package["version"],
+            **({"hashes": [{"alg": "SHA-256", "content": checksum}]} if checksum else {}),
+            "licenses": [{"expression": package["license"].replace("/", " OR ")}], "purl": reference(package),
+        }  # fmt: skip
+
+    def needed(package):
+        linked_in = [d["pkg"] for d in nodes[package["id"]]["deps"] if any(k["kind"] is None for k in d["dep_kinds"])]
+        return sorted(reference(packages[i]) for i in linked_in if i in within)
+
+    whole = {
+        "bomFormat": "CycloneDX", "specVersion": "1.5", "version": 1, "metadata": {"component": component(root)},
+        "components": [component(package) for package in crates],
+        "dependencies": [{"ref": reference(p), "dependsOn": needed(p)} for p in (root, *crates)],
+    }  # fmt: skip
+    return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--check", action="store_true")
     given = parser.parse_args()
     call = ["cargo", "metadata", "--format-version", "1", "--locked", "--features", "python"]
     got = subprocess.run(call, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout
-    made = notices(json.loads(got))
-    if not given.check:
-        FILE.write_text(made, encoding="utf-8")
-    elif FILE.read_text(encoding="utf-8") != made:
-        sys.exit(f"{FILE.name} is not that of Cargo.lock; run python tests/notices.py")
+    metadata, lock = json.loads(got), tomllib.loads((ROOT / "Cargo.lock").read_text(encoding="utf-8"))
+    for file, made in ((FILE, notices(metadata)), (BILL, bill(metadata, lock))):
+        if not given.check:
+            file.write_text(made, encoding="utf-8")
+        elif file.read_text(encoding="utf-8") != made:
+            sys.exit(f"{file.name} is not that of Cargo.lock; run python tests/notices.py")
 
 
 if __name__ == "__main__":

@@ -14,8 +14,11 @@ import sys
 import zipfile
 from pathlib import Path
 
-#: The C library, its mathematics, and the compiler's run time: every Linux of a manylinux policy has them.
-SYSTEM = {"libc.so.6", "libm.so.6", "libgcc_s.so.1"}
+#: The C library with its parts of old, and the compiler's run time: every Linux of a manylinux policy has them.
+SYSTEM = {
+    "libc.so.6", "libm.so.6", "libdl.so.2", "libpthread.so.0", "librt.so.1", "libgcc_s.so.1",
+    "ld-linux-x86-64.so.2", "ld-linux-aarch64.so.1",
+}  # fmt: skip
 
 
 def faults(found):
@@ -38,7 +41,7 @@ def faults(found):
 
 
 #: What every wheel brings beside its code.
-TERMS = ("LICENSE", "THIRD-PARTY-NOTICES.txt")
+TERMS = ("LICENSE", "THIRD-PARTY-NOTICES.txt", "ftlm.cdx.json")
 
 
 def folders():

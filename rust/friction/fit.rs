@@ -260,6 +260,7 @@ pub fn fit_until(
     check_finite("inputs of the start", &start.inputs)?;
     let orders: Vec<f64> =
         start.orders.iter().zip(&model.order_bounds).map(|(o, &(low, high))| o.clamp(low, high)).collect();
+    model.check_orders(&orders)?;
     let mut coefficients = start.coefficients.clone();
     for (_, value) in coefficients.iter_mut().enumerate().filter(|(j, _)| model.rubs(*j)) {
         *value = value.max(0.0);

@@ -140,6 +140,9 @@ impl FrictionModel {
                 return refuse("bounds of a limit that do not rise from 0", "give two rising values from 0");
             }
         }
+        if self.order_bounds.iter().any(|(low, high)| low.is_nan() || high.is_nan() || low > high) {
+            return refuse("bounds of an order that do not rise", "give two rising orders");
+        }
         for equation in &self.equations {
             for order in equation.terms.iter().map(|t| &t.1).chain([&equation.order]) {
                 check_length("weights of an order", self.order_bounds.len(), order.weights.len())?;
@@ -162,6 +165,12 @@ impl FrictionModel {
     /// Whether a coefficient is a force of some friction, which is not negative.
     pub(super) fn rubs(&self, coefficient: usize) -> bool {
         self.frictions.iter().any(|(_, law)| law.rubs(coefficient))
+    }
+
+    /// Refuses free orders that make no equation.
+    pub(super) fn check_orders(&self, orders: &[f64]) -> Result<()> {
+        let body = self.body(orders, &vec![0.0; self.coordinates.len()]);
+        body.equations.iter().try_for_each(|e| e.structure.check(usize::MAX, |_| true))
     }
 
     fn body(&self, orders: &[f64], coefficients: &[f64]) -> Body {

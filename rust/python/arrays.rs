@@ -3,41 +3,58 @@
 use numpy::{PyArray1, PyArray2, PyArrayMethods, PyReadonlyArray1, PyReadonlyArray2, PyUntypedArrayMethods};
 use pyo3::prelude::*;
 
+use super::lists::List;
 use crate::equation::{Equation, Initial, Structure, Term};
-use crate::error::check_finite;
+use crate::error::{check_finite, check_points, Error};
 use crate::regressors::Record;
+
+/// Values of a two-dimensional array, at most: eight gigabytes.
+const MOST_VALUES: usize = 1 << 30;
 
 /// (step, signals as rows, series of the sensor filter or None).
 pub type RecordArg<'py> = (f64, PyReadonlyArray2<'py, f64>, Option<PyReadonlyArray1<'py, f64>>);
 /// (output, alpha, [(signal, order), …]).
-pub type StructureArg = (usize, f64, Vec<(usize, f64)>);
+pub type StructureArg = (usize, f64, List<(usize, f64)>);
 /// A structure and its coefficients.
-pub type EquationArg = (StructureArg, Vec<f64>);
+pub type EquationArg = (StructureArg, List<f64>);
 /// (whether Caputo's powers, else these exponents).
 #[derive(FromPyObject)]
 pub enum InitialArg {
     /// With offset and the number of impulses that a filter holds.
-    Filtered(bool, Vec<f64>, u8, u8),
+    Filtered(bool, List<f64>, u8, u8),
     /// With offset: 0 none, 1 a constant, 2 a constant and a ramp.
-    Offset(bool, Vec<f64>, u8),
-    Plain(bool, Vec<f64>),
+    Offset(bool, List<f64>, u8),
+    Plain(bool, List<f64>),
 }
 
 /// A one-dimensional array as a vector, refused if it holds a value that is not finite.
 pub fn vector(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
-    let values: Vec<f64> = array.as_array().iter().copied().collect();
+    let values = copied(name, array)?;
     check_finite(name, &values)?;
     Ok(values)
 }
 
-/// Rows of a two-dimensional array.
-pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> Vec<Vec<f64>> {
-    array.as_array().outer_iter().map(|row| row.iter().copied().collect()).collect()
+/// A one-dimensional array as a vector, whatever it holds.
+pub fn copied(name: &str, array: &PyReadonlyArray1<'_, f64>) -> PyResult<Vec<f64>> {
+    check_points(&format!("length of {name}"), array.len())?;
+    Ok(array.as_array().iter().copied().collect())
+}
+
+/// Rows of a two-dimensional array. One whose strides are 0 may seem larger than memory.
+pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
+    let [rows, columns] = [array.shape()[0], array.shape()[1]];
+    check_points("rows of an array", rows)?;
+    check_points("columns of an array", columns)?;
+    if rows.saturating_mul(columns) > MOST_VALUES {
+        let what = format!("an array of {rows} rows and {columns} columns");
+        return Err(Error::Structure { what, remedy: format!("give at most {MOST_VALUES} values at once") }.into());
+    }
+    Ok(array.as_array().outer_iter().map(|row| row.iter().copied().collect()).collect())
 }
 
 pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
     let filter = argument.2.as_ref().map(|f| vector("filter", f)).transpose()?;
-    Ok(Record::new(argument.0, rows(&argument.1), filter)?)
+    Ok(Record::new(argument.0, rows(&argument.1)?, filter)?)
 }
 
 pub fn records(arguments: &[RecordArg<'_>]) -> PyResult<Vec<Record>> {
@@ -55,13 +72,13 @@ pub fn structure(argument: StructureArg, signals: usize, inputs: &[bool]) -> PyR
     Ok(structure)
 }
 
-pub fn equations(arguments: Vec<EquationArg>, signals: usize, inputs: &[bool]) -> PyResult<Vec<Equation>> {
+pub fn equations(arguments: List<EquationArg>, signals: usize, inputs: &[bool]) -> PyResult<Vec<Equation>> {
     arguments
         .into_iter()
         .map(|(s, coefficients)| {
             // A model that was estimated under an order law may have an order a little below 0; it is simulated as it is.
             let structure = structure(s, signals, &vec![true; inputs.len()])?;
-            Ok(Equation::new(structure, coefficients)?)
+            Ok(Equation::new(structure, coefficients.into())?)
         })
         .collect()
 }
@@ -72,7 +89,7 @@ pub fn initial(argument: InitialArg) -> PyResult<Initial> {
         InitialArg::Offset(caputo, powers, offset) => (caputo, powers, offset, 0),
         InitialArg::Plain(caputo, powers) => (caputo, powers, 0, 0),
     };
-    let powers = Initial::Powers(powers);
+    let powers = Initial::Powers(powers.into());
     powers.check()?;
     let under = match powers {
         _ if caputo => Initial::Caputo,

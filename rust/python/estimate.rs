@@ -6,14 +6,15 @@ use pyo3::types::PyDict;
 
 use super::arrays::{initial, record, records, rows, stacked, structure, vector, InitialArg, RecordArg, StructureArg};
 use super::errors::{attached, detached};
+use super::lists::{nested, List};
 use super::search::watch::{leavable, Stop};
 use crate::equation::{AffineOrder, Initial};
-use crate::error::{check_finite, Error};
+use crate::error::{check_finite, check_length, Error};
 use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::estimate::streaming::Streaming as StreamingFit;
 use crate::estimate::{iv as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint};
-use crate::readings::Readings;
+use crate::readings::{Jumps, Readings};
 use crate::regressors::Record;
 
 /// (coefficients, initial terms per record, exponents, dropped (record, position) pairs).
@@ -37,10 +38,10 @@ fn tuple(estimate: Estimate) -> EstimateTuple {
 #[allow(clippy::needless_pass_by_value)]
 pub fn least_squares(
     py: Python<'_>,
-    runs: Vec<RecordArg<'_>>,
+    runs: List<RecordArg<'_>>,
     equation: StructureArg,
-    inputs: Vec<bool>,
-    fixed: Vec<Option<f64>>,
+    inputs: List<bool>,
+    fixed: List<Option<f64>>,
     terms: InitialArg,
 ) -> PyResult<EstimateTuple> {
     let records = records(&runs)?;
@@ -54,10 +55,10 @@ pub fn least_squares(
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value, clippy::type_complexity)]
 pub fn multi_innovation<'py>(
     py: Python<'py>,
-    runs: Vec<RecordArg<'py>>,
+    runs: List<RecordArg<'py>>,
     equation: StructureArg,
-    inputs: Vec<bool>,
-    fixed: Vec<Option<f64>>,
+    inputs: List<bool>,
+    fixed: List<Option<f64>>,
     terms: InitialArg,
     length: usize,
     prior_covariance: f64,
@@ -88,10 +89,10 @@ type InstrumentTuple = (Vec<EstimateTuple>, Vec<Vec<f64>>, usize, bool, bool);
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
 pub fn instrumental_variables(
     py: Python<'_>,
-    runs: Vec<RecordArg<'_>>,
-    equations: Vec<StructureArg>,
-    inputs: Vec<bool>,
-    fixed: Vec<Vec<Option<f64>>>,
+    runs: List<RecordArg<'_>>,
+    equations: List<StructureArg>,
+    inputs: List<bool>,
+    fixed: List<List<Option<f64>>>,
     terms: InitialArg,
     iterations: usize,
     tolerance: f64,
@@ -99,9 +100,9 @@ pub fn instrumental_variables(
     let measured = records(&runs)?;
     let structures =
         equations.into_iter().map(|e| structure(e, inputs.len(), &inputs)).collect::<PyResult<Vec<_>>>()?;
-    let initial = initial(terms)?;
+    let (initial, fixed) = (initial(terms)?, nested(fixed));
     let settings = instruments::Settings { iterations, tolerance };
-    let points = pulses(&measured) * iterations.max(1);
+    let points = pulses(&measured).saturating_mul(iterations.max(1));
     let fit = leavable(py, points, None, move |stop| {
         let at_rest = initial == Initial::Rest;
         let measured = measured
@@ -122,14 +123,14 @@ pub fn instrumental_variables(
 }
 
 /// (constant, weight of each free order).
-pub type AffineArg = (f64, Vec<f64>);
+pub type AffineArg = (f64, List<f64>);
 /// (known factor, (coefficient, power) pairs).
-pub type MonomialArg = (f64, Vec<(usize, i32)>);
+pub type MonomialArg = (f64, List<(usize, i32)>);
 /// (output, alpha, [(signal, order, coefficient), …]).
-pub type FreeEquationArg = (usize, AffineArg, Vec<(usize, AffineArg, MonomialArg)>);
+pub type FreeEquationArg = (usize, AffineArg, List<(usize, AffineArg, MonomialArg)>);
 /// (places of the samples in pulses, places and sizes of the jumps of each signal that holds in between).
 pub type OwnTimesArg<'py> =
-    (PyReadonlyArray1<'py, f64>, Vec<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
+    (PyReadonlyArray1<'py, f64>, List<Option<(PyReadonlyArray1<'py, f64>, PyReadonlyArray1<'py, f64>)>>);
 /// (record, pulses a sample interval, samples of each output, filter of simulated outputs, weight of each output,
 /// (values at the samples, whether it holds) of each signal, shares of the compared samples of each output, times of
 /// their own).
@@ -137,19 +138,34 @@ pub type ExperimentArg<'py> = (
     RecordArg<'py>,
     usize,
     PyReadonlyArray2<'py, f64>,
-    Option<(PyReadonlyArray1<'py, f64>, Vec<bool>)>,
-    Vec<f64>,
-    Vec<(Option<PyReadonlyArray1<'py, f64>>, bool)>,
+    Option<(PyReadonlyArray1<'py, f64>, List<bool>)>,
+    List<f64>,
+    List<(Option<PyReadonlyArray1<'py, f64>>, bool)>,
     Option<PyReadonlyArray2<'py, f64>>,
     Option<OwnTimesArg<'py>>,
 );
 
 fn affine((constant, weights): AffineArg) -> AffineOrder {
-    AffineOrder { constant, weights }
+    AffineOrder { constant, weights: weights.into() }
+}
+
+/// The jumps of a held signal near the readings.
+pub fn jumps_near(
+    readings: &Readings,
+    places: &PyReadonlyArray1<'_, f64>,
+    sizes: &PyReadonlyArray1<'_, f64>,
+) -> PyResult<Jumps> {
+    let (places, sizes) = (vector("times of jumps", places)?, vector("jumps", sizes)?);
+    check_length("jumps", places.len(), sizes.len())?;
+    if let Some(k) = places.windows(2).position(|pair| pair[0] > pair[1]) {
+        let what = format!("the times of jumps fall from index {k}");
+        return Err(Error::Structure { what, remedy: "give them in ascending order".into() }.into());
+    }
+    Ok(readings.jumps(&places, &sizes))
 }
 
 pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
-    let (record, samples, weights) = (record(&argument.0)?, rows(&argument.2), argument.4.clone());
+    let (record, samples, weights) = (record(&argument.0)?, rows(&argument.2)?, argument.4.to_vec());
     let experiment = match &argument.7 {
         None => joint::Experiment::new(record, argument.1, samples, weights)?,
         Some((places, jumps)) => {
@@ -157,7 +173,7 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
             let jumps = (jumps.iter())
                 .map(|near| {
                     let Some((places, sizes)) = near else { return Ok(None) };
-                    Ok(Some(readings.jumps(&vector("times of jumps", places)?, &vector("jumps", sizes)?)))
+                    Ok(Some(jumps_near(&readings, places, sizes)?))
                 })
                 .collect::<PyResult<Vec<_>>>()?;
             joint::Experiment::with_own_times(record, samples, weights, joint::OwnTimes { readings, jumps })?
@@ -165,7 +181,7 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     };
     let experiment = match &argument.6 {
         None => experiment,
-        Some(shares) => experiment.with_shares(rows(shares))?,
+        Some(shares) => experiment.with_shares(rows(shares)?)?,
     };
     let instants = (argument.5.iter())
         .map(|(values, held)| {
@@ -176,7 +192,7 @@ pub fn experiment(argument: &ExperimentArg<'_>) -> PyResult<joint::Experiment> {
     let experiment = experiment.with_instants(instants)?;
     Ok(match &argument.3 {
         None => experiment,
-        Some((series, applies)) => experiment.with_filter(vector("filter", series)?, applies.clone())?,
+        Some((series, applies)) => experiment.with_filter(vector("filter", series)?, applies.to_vec())?,
     })
 }
 
@@ -187,7 +203,9 @@ pub fn free_equation((output, order, terms): FreeEquationArg) -> joint::FreeEqua
         order: affine(order),
         terms: terms
             .into_iter()
-            .map(|(signal, order, (factor, powers))| (signal, affine(order), joint::Monomial { factor, powers }))
+            .map(|(signal, order, (factor, powers))| {
+                (signal, affine(order), joint::Monomial { factor, powers: powers.into() })
+            })
             .collect(),
     }
 }
@@ -244,15 +262,15 @@ pub(super) fn free_inputs(inputs: &[FreeInputArg]) -> PyResult<Vec<joint::FreeIn
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
 pub fn output_error<'py>(
     py: Python<'py>,
-    runs: Vec<ExperimentArg<'py>>,
-    laws: Vec<FreeEquationArg>,
-    order_bounds: Vec<(f64, f64)>,
-    coordinates: Vec<String>,
+    runs: List<ExperimentArg<'py>>,
+    laws: List<FreeEquationArg>,
+    order_bounds: List<(f64, f64)>,
+    coordinates: List<String>,
     coupled: bool,
     terms: InitialArg,
-    start_orders: Vec<f64>,
-    start_coefficients: Vec<f64>,
-    inputs: Vec<FreeInputArg>,
+    start_orders: List<f64>,
+    start_coefficients: List<f64>,
+    inputs: List<FreeInputArg>,
     evaluations: usize,
     tolerance: f64,
     steady: bool,
@@ -260,10 +278,11 @@ pub fn output_error<'py>(
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
     let equations = laws.into_iter().map(free_equation).collect();
+    let order_bounds = order_bounds.into();
     let coordinates = self::coordinates(&coordinates)?;
     let start = joint::Point {
-        orders: start_orders,
-        coefficients: start_coefficients,
+        orders: start_orders.into(),
+        coefficients: start_coefficients.into(),
         inputs: inputs.iter().map(|input| input.3).collect(),
     };
     let free = free_inputs(&inputs)?;
@@ -290,7 +309,7 @@ pub fn output_error<'py>(
 /// Whether s^alpha less the own terms (coefficient, order) has a zero to the right of the imaginary axis, or on it.
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn grows(py: Python<'_>, alpha: f64, own_terms: Vec<(f64, f64)>) -> PyResult<bool> {
+pub fn grows(py: Python<'_>, alpha: f64, own_terms: List<(f64, f64)>) -> PyResult<bool> {
     detached(py, || {
         check_finite("alpha", &[alpha])?;
         own_terms.iter().try_for_each(|&(c, order)| check_finite("own terms", &[c, order]))?;
@@ -312,14 +331,14 @@ impl Streaming {
         py: Python<'_>,
         step: f64,
         longest: usize,
-        inputs: Vec<bool>,
-        equations: Vec<(StructureArg, Vec<Option<f64>>)>,
+        inputs: List<bool>,
+        equations: List<(StructureArg, List<Option<f64>>)>,
         length: usize,
         prior_covariance: f64,
     ) -> PyResult<Self> {
         let equations = equations
             .into_iter()
-            .map(|(equation, fixed)| Ok((structure(equation, inputs.len(), &inputs)?, fixed)))
+            .map(|(equation, fixed)| Ok((structure(equation, inputs.len(), &inputs)?, fixed.into())))
             .collect::<PyResult<Vec<_>>>()?;
         let inner = detached(py, || StreamingFit::new(step, longest, &inputs, &equations, length, prior_covariance))?;
         Ok(Self { inner })
@@ -328,7 +347,7 @@ impl Streaming {
     /// Takes samples, shape (n, signals).
     #[allow(clippy::needless_pass_by_value)]
     fn push(&mut self, py: Python<'_>, samples: PyReadonlyArray2<'_, f64>) -> PyResult<()> {
-        let samples = rows(&samples);
+        let samples = rows(&samples)?;
         let inner = &mut self.inner;
         detached(py, || samples.iter().try_for_each(|sample| inner.push(sample)))
     }

@@ -9,6 +9,7 @@ use super::estimate::{
     coordinates, evaluated, experiment, free_equation, free_inputs, status, ExperimentArg, FreeEquationArg,
     FreeInputArg, MonomialArg,
 };
+use super::lists::{nested, List};
 use super::search::watch::{leavable, Stop};
 use crate::equation::Equation;
 use crate::estimate::output_error as joint;
@@ -21,9 +22,9 @@ use crate::friction::{self, Body, FreeLaw, FrictionModel, Law, Start};
 pub fn friction_respond<'py>(
     py: Python<'py>,
     run: RecordArg<'py>,
-    equations: Vec<(StructureArg, Vec<f64>)>,
-    frictions: Vec<(usize, (f64, f64, f64))>,
-    terms: Vec<Vec<(f64, f64)>>,
+    equations: List<(StructureArg, List<f64>)>,
+    frictions: List<(usize, (f64, f64, f64))>,
+    terms: List<List<(f64, f64)>>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let record = record(&run)?;
     let inputs = vec![true; record.len()];
@@ -33,10 +34,13 @@ pub fn friction_respond<'py>(
         .collect();
     let equations = equations
         .into_iter()
-        .map(|(arg, coefficients)| Ok(Equation { structure: structure(arg, record.len(), &inputs)?, coefficients }))
+        .map(|(arg, coefficients)| {
+            let structure = structure(arg, record.len(), &inputs)?;
+            Ok(Equation { structure, coefficients: coefficients.into() })
+        })
         .collect::<PyResult<_>>()?;
     let body = Body { equations, frictions };
-    let motion = leavable(py, record.m(), None, move |_| body.run(&record, &terms))?;
+    let motion = leavable(py, record.m(), None, move |_| body.run(&record, &nested(terms)))?;
     let dict = PyDict::new(py);
     dict.set_item("outputs", stacked(py, &motion.outputs)?)?;
     let rows = |of: fn(&Trace) -> &Vec<f64>| motion.bodies.iter().map(|body| of(body).clone()).collect::<Vec<_>>();
@@ -56,16 +60,16 @@ pub fn friction_respond<'py>(
 #[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
 pub fn friction_error<'py>(
     py: Python<'py>,
-    runs: Vec<ExperimentArg<'py>>,
-    laws: Vec<FreeEquationArg>,
-    frictions: Vec<(usize, [MonomialArg; 3])>,
-    order_bounds: Vec<(f64, f64)>,
-    names: Vec<String>,
+    runs: List<ExperimentArg<'py>>,
+    laws: List<FreeEquationArg>,
+    frictions: List<(usize, [MonomialArg; 3])>,
+    order_bounds: List<(f64, f64)>,
+    names: List<String>,
     terms: InitialArg,
-    orders: Vec<f64>,
-    coefficients: Vec<f64>,
-    inputs: Vec<FreeInputArg>,
-    states: Vec<Vec<f64>>,
+    orders: List<f64>,
+    coefficients: List<f64>,
+    inputs: List<FreeInputArg>,
+    states: List<List<f64>>,
     evaluations: usize,
     tolerance: f64,
     stop: Option<&Stop>,
@@ -74,7 +78,8 @@ pub fn friction_error<'py>(
     let frictions = frictions
         .into_iter()
         .map(|(place, numbers)| {
-            let [coulomb, stribeck, speed] = numbers.map(|(factor, powers)| joint::Monomial { factor, powers });
+            let [coulomb, stribeck, speed] =
+                numbers.map(|(factor, powers)| joint::Monomial { factor, powers: powers.into() });
             (place, FreeLaw { coulomb, stribeck, speed })
         })
         .collect();
@@ -82,7 +87,7 @@ pub fn friction_error<'py>(
         equations: laws.into_iter().map(free_equation).collect(),
         frictions,
         inputs: free_inputs(&inputs)?,
-        order_bounds,
+        order_bounds: order_bounds.into(),
         coordinates: coordinates(&names)?,
         initial: initial(terms)?,
         filtered: experiments
@@ -90,7 +95,12 @@ pub fn friction_error<'py>(
             .and_then(|e| e.filter.as_ref())
             .map_or_else(Vec::new, |(_, passes)| passes.clone()),
     };
-    let start = Start { orders, coefficients, inputs: inputs.iter().map(|input| input.3).collect(), states };
+    let start = Start {
+        orders: orders.into(),
+        coefficients: coefficients.into(),
+        inputs: inputs.iter().map(|input| input.3).collect(),
+        states: nested(states),
+    };
     let settings = joint::Settings { evaluations, tolerance };
     let points = evaluated(&experiments, evaluations);
     let fit =

@@ -5,6 +5,7 @@ mod arrays;
 mod errors;
 mod estimate;
 mod friction;
+mod lists;
 mod operators;
 mod search;
 mod simulate;

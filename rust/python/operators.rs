@@ -3,8 +3,9 @@
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
-use super::arrays::{columns, matrix, rows, stacked, vector};
+use super::arrays::{columns, copied, matrix, rows, stacked, vector};
 use super::errors::detached;
+use super::lists::List;
 use super::search::watch::leavable;
 use crate::equation::Filter;
 use crate::error::{check_dense, check_finite, check_length, check_points, check_step, Error};
@@ -60,7 +61,7 @@ fn transformed<'py>(
     x: &PyReadonlyArray2<'py, f64>,
     work: fn(&mut [f64]) -> crate::error::Result<()>,
 ) -> PyResult<Matrix<'py>> {
-    let mut all = rows(x);
+    let mut all = rows(x)?;
     let all = detached(py, || {
         for row in &mut all {
             check_finite("x", row)?;
@@ -154,7 +155,7 @@ pub fn fractional_integral<'py>(
         "grunwald-letnikov" => IntegralRule::GrunwaldLetnikov,
         other => return Err(choice("rule", other, "block-pulse, trapezoidal, grunwald-letnikov").into()),
     };
-    let all = rows(&x);
+    let all = rows(&x)?;
     let points = all.iter().map(Vec::len).sum();
     let out = leavable(py, points, None, move |stop| {
         let integral = |row: &Vec<f64>| {
@@ -181,7 +182,7 @@ pub fn fractional_derivative<'py>(
         "caputo" => Derivative::Caputo,
         other => return Err(choice("definition", other, "grunwald-letnikov, riemann-liouville, caputo").into()),
     };
-    let (all, starts) = (rows(&x), rows(&initial));
+    let (all, starts) = (rows(&x)?, rows(&initial)?);
     let points = all.iter().map(Vec::len).sum();
     let out = leavable(py, points, None, move |stop| {
         check_length("initial", all.len(), starts.len())?;
@@ -213,7 +214,7 @@ pub fn pulse_means<'py>(
 
 #[pyfunction]
 pub fn point_samples<'py>(py: Python<'py>, means: PyReadonlyArray1<'py, f64>) -> PyResult<Array<'py>> {
-    let values: Vec<f64> = means.as_array().iter().copied().collect();
+    let values = copied("means", &means)?;
     Ok(PyArray1::from_vec(py, detached(py, || Ok(means::point_samples(&values)))?))
 }
 
@@ -231,11 +232,11 @@ pub fn delayed<'py>(
 #[pyfunction]
 pub fn filter_series(
     py: Python<'_>,
-    numerator: Vec<(f64, f64)>,
-    denominator: Vec<(f64, f64)>,
+    numerator: List<(f64, f64)>,
+    denominator: List<(f64, f64)>,
     m: usize,
     step: f64,
 ) -> PyResult<Array<'_>> {
-    let filter = Filter { numerator, denominator };
+    let filter = Filter { numerator: numerator.into(), denominator: denominator.into() };
     Ok(PyArray1::from_vec(py, detached(py, || filter.series(m, step))?))
 }

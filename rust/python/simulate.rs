@@ -4,9 +4,12 @@ use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
 
 use super::arrays::{
-    equations, initial, record, rows, stacked, structure, vector, EquationArg, InitialArg, RecordArg, StructureArg,
+    copied, equations, initial, record, rows, stacked, structure, vector, EquationArg, InitialArg, RecordArg,
+    StructureArg,
 };
 use super::errors::detached;
+use super::estimate::jumps_near;
+use super::lists::{nested, List};
 use super::search::watch::leavable;
 use crate::readings::Readings;
 use crate::simulate::{self, OutputFilter};
@@ -16,13 +19,13 @@ use crate::simulate::{self, OutputFilter};
 pub fn respond<'py>(
     py: Python<'py>,
     run: RecordArg<'py>,
-    model: Vec<EquationArg>,
-    inputs: Vec<bool>,
-    terms: Vec<Vec<(f64, f64)>>,
+    model: List<EquationArg>,
+    inputs: List<bool>,
+    terms: List<List<(f64, f64)>>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
     let record = record(&run)?;
     let equations = equations(model, record.len(), &inputs)?;
-    let outputs = leavable(py, record.m(), None, move |_| simulate::respond(&equations, &record, &terms))?;
+    let outputs = leavable(py, record.m(), None, move |_| simulate::respond(&equations, &record, &nested(terms)))?;
     stacked(py, &outputs)
 }
 
@@ -32,9 +35,9 @@ pub fn respond<'py>(
 pub fn respond_and_units<'py>(
     py: Python<'py>,
     run: RecordArg<'py>,
-    model: Vec<EquationArg>,
-    inputs: Vec<bool>,
-    units: Vec<(usize, f64)>,
+    model: List<EquationArg>,
+    inputs: List<bool>,
+    units: List<(usize, f64)>,
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, Bound<'py, PyArray2<f64>>)> {
     let record = record(&run)?;
     let equations = equations(model, record.len(), &inputs)?;
@@ -48,10 +51,10 @@ pub fn respond_and_units<'py>(
 pub fn respond_with_initial<'py>(
     py: Python<'py>,
     run: RecordArg<'py>,
-    model: Vec<EquationArg>,
-    inputs: Vec<bool>,
+    model: List<EquationArg>,
+    inputs: List<bool>,
     terms: InitialArg,
-    filter: Option<(PyReadonlyArray1<'py, f64>, Vec<bool>)>,
+    filter: Option<(PyReadonlyArray1<'py, f64>, List<bool>)>,
 ) -> PyResult<(Bound<'py, PyArray2<f64>>, Vec<Vec<f64>>, Vec<Vec<f64>>)> {
     let record = record(&run)?;
     let equations = equations(model, record.len(), &inputs)?;
@@ -70,11 +73,11 @@ pub fn equation_error<'py>(
     py: Python<'py>,
     run: RecordArg<'py>,
     equation: EquationArg,
-    inputs: Vec<bool>,
+    inputs: List<bool>,
     terms: InitialArg,
 ) -> PyResult<Bound<'py, PyArray1<f64>>> {
     let record = record(&run)?;
-    let equations = equations(vec![equation], record.len(), &inputs)?;
+    let equations = equations(vec![equation].into(), record.len(), &inputs)?;
     let initial = initial(terms)?;
     let found = leavable(py, record.m(), None, move |_| simulate::equation_error(&equations[0], &record, &initial))?;
     Ok(PyArray1::from_vec(py, found))
@@ -86,10 +89,10 @@ pub fn explicit_euler<'py>(
     py: Python<'py>,
     signals: PyReadonlyArray2<'py, f64>,
     step: f64,
-    model: Vec<EquationArg>,
-    inputs: Vec<bool>,
+    model: List<EquationArg>,
+    inputs: List<bool>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
-    let signals = rows(&signals);
+    let signals = rows(&signals)?;
     let equations = equations(model, signals.len(), &inputs)?;
     let outputs = detached(py, || simulate::explicit_euler(&equations, &signals, step))?;
     stacked(py, &outputs)
@@ -101,19 +104,19 @@ pub fn trace_errors<'py>(
     py: Python<'py>,
     run: RecordArg<'py>,
     equation: StructureArg,
-    inputs: Vec<bool>,
+    inputs: List<bool>,
     trace: PyReadonlyArray2<'py, f64>,
 ) -> PyResult<Bound<'py, PyArray1<f64>>> {
     let record = record(&run)?;
     let structure = structure(equation, record.len(), &inputs)?;
-    let rows = rows(&trace);
+    let rows = rows(&trace)?;
     let found = leavable(py, record.m(), None, move |_| simulate::trace_errors(&structure, &record, &rows))?;
     Ok(PyArray1::from_vec(py, found))
 }
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn nyquist_margin(py: Python<'_>, own_terms: Vec<(f64, f64)>, step: f64) -> PyResult<f64> {
+pub fn nyquist_margin(py: Python<'_>, own_terms: List<(f64, f64)>, step: f64) -> PyResult<f64> {
     detached(py, || Ok(simulate::nyquist_margin(&own_terms, step)))
 }
 
@@ -125,7 +128,7 @@ pub fn metrics(
     residuals: PyReadonlyArray1<'_, f64>,
 ) -> PyResult<(f64, f64, f64, f64)> {
     let measured = vector("measured", &measured)?;
-    let residuals: Vec<f64> = residuals.as_array().iter().copied().collect();
+    let residuals = copied("residuals", &residuals)?;
     let found = detached(py, || crate::metrics::metrics(&measured, &residuals))?;
     Ok((found.error, found.rmse, found.nr, found.fit_percent))
 }
@@ -134,8 +137,8 @@ pub fn metrics(
 #[allow(clippy::needless_pass_by_value)]
 pub fn correlation<'py>(
     py: Python<'py>,
-    x: Vec<PyReadonlyArray1<'py, f64>>,
-    y: Vec<PyReadonlyArray1<'py, f64>>,
+    x: List<PyReadonlyArray1<'py, f64>>,
+    y: List<PyReadonlyArray1<'py, f64>>,
     lags: usize,
 ) -> PyResult<(Bound<'py, PyArray1<f64>>, f64, usize)> {
     let x = x.iter().map(|a| vector("x", a)).collect::<PyResult<Vec<_>>>()?;
@@ -151,7 +154,7 @@ pub fn read_at<'py>(
     means: PyReadonlyArray2<'py, f64>,
     places: PyReadonlyArray1<'py, f64>,
 ) -> PyResult<Bound<'py, PyArray2<f64>>> {
-    let (means, places) = (rows(&means), vector("times of readings", &places)?);
+    let (means, places) = (rows(&means)?, vector("times of readings", &places)?);
     let m = means.first().map_or(0, Vec::len);
     let read = detached(py, || {
         let readings = Readings::new(places, m)?;
@@ -171,10 +174,8 @@ pub fn corners<'py>(
     step: f64,
 ) -> PyResult<Bound<'py, PyArray1<f64>>> {
     let places = vector("times of readings", &places)?;
-    let (at, sizes) = (vector("times of jumps", &jumps.0)?, vector("jumps", &jumps.1)?);
-    let lacking = detached(py, || {
-        let readings = Readings::new(places, m)?;
-        Ok(readings.corners(&readings.jumps(&at, &sizes), order, step))
-    })?;
+    let readings = Readings::new(places, m)?;
+    let jumps = jumps_near(&readings, &jumps.0, &jumps.1)?;
+    let lacking = detached(py, || Ok(readings.corners(&jumps, order, step)))?;
     Ok(PyArray1::from_vec(py, lacking))
 }

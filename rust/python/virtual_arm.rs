@@ -5,6 +5,7 @@ use pyo3::prelude::*;
 
 use super::arrays::{equations, stacked, vector, EquationArg};
 use super::errors::{attached, detached};
+use super::lists::List;
 use crate::error::{check_length, Error};
 use crate::memory::integral_by_memory;
 use crate::rig::arm::{Arm, Parameters, SIGNALS};
@@ -119,7 +120,7 @@ impl Guard {
 #[derive(FromPyObject)]
 #[pyo3(from_item_all)]
 struct ArmArg {
-    equations: Vec<EquationArg>,
+    equations: List<EquationArg>,
     coulomb: [f64; 2],
 }
 

@@ -121,15 +121,12 @@ impl Options {
         match self.estimator {
             Estimator::LeastSquares => {}
             Estimator::MultiInnovation(innovation) => innovation.check()?,
-            Estimator::InstrumentalVariables(Settings { iterations, tolerance }) => {
-                if iterations == 0 {
+            Estimator::InstrumentalVariables(settings) => {
+                if settings.iterations == 0 {
                     let remedy = "take at least one step, or rank by least squares";
                     return Err(out_of_range("steps of instrumental variables", 0.0, "[1, ∞)", remedy));
                 }
-                if !(tolerance >= 0.0 && tolerance.is_finite()) {
-                    let remedy = "give the relative change at which the steps end";
-                    return Err(out_of_range("tolerance of instrumental variables", tolerance, "[0, ∞)", remedy));
-                }
+                settings.check()?;
             }
         }
         if let Initial::Powers(powers) = self.initial.under() {

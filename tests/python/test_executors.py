@@ -278,6 +278,9 @@ def test_a_cluster_that_loses_a_worker_gives_the_same_bytes(run, expected, tmp_p
 def test_a_cluster_gives_the_same_bytes_of_a_stage(stage_run, stage_expected, tmp_path):
     with cluster(tmp_path) as (client, _):
         assert bytes_of(search_stage(stage_run, client.get_executor())) == stage_expected
+        # The client itself is none, whose futures have other methods.
+        with pytest.raises(ftlm.ModelError, match=r"Client.*is no executor .*; pass .*Client\(…\)\.get_executor\(\)"):
+            search_stage(stage_run, client)
 
 
 @pytest.mark.slow

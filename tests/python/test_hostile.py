@@ -303,6 +303,45 @@ def test_an_order_that_is_no_number_does_not_turn_for_ever():
             _core.grows(1.135, terms)
 
 
+class Liar:
+    """A sequence that hands over other than it tells of."""
+
+    def __init__(self, told):
+        self.told = told
+
+    def __len__(self):
+        return self.told
+
+    def __getitem__(self, _):
+        return 1.0
+
+
+@pytest.mark.parametrize("values", [range(2**40), Liar(2**60), Liar(3), np.broadcast_to(1.0, 2**34)])
+def test_a_sequence_is_not_believed_when_it_tells_its_length(values):
+    with pytest.raises(ftlm.ModelError, match="a sequence "):
+        _core.lattice_size((0, values, []), [True])
+    assert _core.lattice_size((0, np.array([1.0, 2.0]), []), [True]) == 2
+    assert _core.lattice_size((0, range(1, 3), []), [True]) == 2
+    for words in ("12", {1.0: 2.0}, {1.0, 2.0}):
+        with pytest.raises(TypeError, match="is no sequence"):
+            _core.lattice_size((0, words, []), [True])
+
+
+def test_an_array_that_repeats_one_number_is_not_copied_beyond_memory():
+    for shape in ((2**34,), (2**34, 3), (3, 2**34), (2**20, 2**20)):
+        values = np.broadcast_to(1.0, shape)
+        with pytest.raises(ftlm.ModelError, match=r"array|length"):
+            _core.metrics(values, values) if len(shape) == 1 else _core.haar_transform(values)
+
+
+def test_jumps_without_sizes_are_refused():
+    places = np.array([3.0, 4.5, 7.0])
+    with pytest.raises(ftlm.DataError, match="jumps has length 2, but 3 is needed"):
+        _core.corners(16, places, (places, np.ones(2)), 0.5, 0.1)
+    with pytest.raises(ftlm.ModelError, match="the times of jumps fall from index 1"):
+        _core.corners(16, places, (np.array([3.0, 4.5, -1e300]), np.ones(3)), 0.5, 0.1)
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # The command line
 
@@ -322,6 +361,27 @@ def test_a_full_output_is_one_line(written):
     assert done.stderr.startswith("ftlm: the system refuses: No space left on device")
     assert "Traceback" not in done.stderr
     assert "Exception ignored" not in done.stderr
+
+
+def test_what_a_reader_that_has_gone_leaves_is_nobodys_loss(written):
+    read, write = os.pipe()
+    os.close(read)
+    done = ftlm_child("inspect", str(written), stdout=write)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(os.name == "nt", reason="a shell that closes an output")
+@pytest.mark.parametrize(("closed", "said"), [("<&- >&-", ""), (">&- -u x", "ftlm: ")])
+def test_an_output_that_was_closed_stays_closed(written, closed, said):
+    call = f'"$0" -m ftlm inspect "$1" {closed}'
+    done = subprocess.run(
+        ["sh", "-c", call, sys.executable, str(written)], check=False, timeout=120, capture_output=True, text=True
+    )  # fmt: skip
+    assert done.stderr[:6] == said
+    assert "Traceback" not in done.stderr
+    assert "Exception ignored" not in done.stderr
+    assert (done.returncode == 0) == (not said)
 
 
 def test_a_terminal_that_knows_ascii_alone_gets_its_result(tmp_path):

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import platform
+import subprocess
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -26,6 +30,35 @@ def digits_of(jacobian: np.ndarray, squares: float) -> np.ndarray:
         inverse = (matrix * matrix.T) ** -1
         count = jacobian.shape[1] - jacobian.shape[0]
         return np.array((inverse * squares / count).tolist(), dtype=float)
+
+
+FITTED = """
+import json
+import numpy as np
+import ftlm
+t = 0.05 * np.arange(300)
+u = np.sign(np.sin(1.3 * t)) + 0.3 * np.sin(0.7 * t)
+y = np.convolve(u, 0.05 * np.exp(-0.6 * t))[: t.size] + 0.02 * np.random.default_rng(3).standard_normal(t.size)
+run = ftlm.Run.from_arrays(inputs={"u": u}, outputs={"y": y}, step=0.05)
+found = ftlm.identify(run, ftlm.equation("D^alpha y = c y + b u"), intervals="quadratic")
+print(json.dumps([found.to_dict()[key] for key in ("coefficients", "orders", "standard_errors")]))
+"""
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="kernels of another processor, by name")
+def test_another_linear_algebra_moves_last_digits_alone() -> None:
+    told = []
+    for kernels in ("Prescott", "Nehalem"):
+        done = subprocess.run(
+            [sys.executable, "-c", FITTED], check=True, capture_output=True, text=True, timeout=120,
+            env={**os.environ, "OPENBLAS_CORETYPE": kernels, "OPENBLAS_NUM_THREADS": "1"},
+        )  # fmt: skip
+        told.append(json.loads(done.stdout))
+    (*numbers, spread), (*others, again) = told
+    for one, other in zip(numbers, others, strict=True):
+        assert one == pytest.approx(other, rel=1e-9)
+    assert again == pytest.approx(spread, rel=1e-9)
+    assert len(spread) == 3
 
 
 @pytest.mark.parametrize("apart", [1.0, 1e-4, 1e-7, 1e-10])

@@ -1,5 +1,6 @@
-"""What checks a wheel sees what it is for, and the notices are those of what is linked."""
+"""What checks a wheel sees what it is for; notices and bill are of what is linked; pins have hashes."""
 
+import json
 import re
 import runpy
 import subprocess
@@ -7,6 +8,8 @@ import sys
 import tomllib
 import zipfile
 from pathlib import Path
+
+import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
 WHEEL = runpy.run_path(str(ROOT / "tests" / "wheel.py"))
@@ -18,21 +21,22 @@ def test_a_wheel_without_terms_or_with_a_folder_of_its_maker_is_seen(tmp_path):
     with zipfile.ZipFile(path, "w") as wheel:
         wheel.writestr("a/LICENSE", "free")
         wheel.writestr("a/THIRD-PARTY-NOTICES.txt", "free, too")
+        wheel.writestr("a/ftlm.cdx.json", "{}")
         wheel.writestr("a/_core.so", b"\0/house/me/src/lib.rs\0/housely/lib.rs")
     assert WHEEL["lacks"](path, []) == []
     assert WHEEL["lacks"](path, ["/house/you", "/house/m", "/hous", "/"]) == []
     assert WHEEL["lacks"](path, ["/house/me"]) == ["a/_core.so names /house/me"]
     with zipfile.ZipFile(path, "w") as wheel:
         wheel.writestr("a/LICENSE", "free")
-    assert WHEEL["lacks"](path, []) == ["it lacks THIRD-PARTY-NOTICES.txt"]
+    assert WHEEL["lacks"](path, []) == ["it lacks THIRD-PARTY-NOTICES.txt", "it lacks ftlm.cdx.json"]
 
 
 def test_the_check_of_a_wheel_ends_with_its_verdict(tmp_path):
     path = tmp_path / "a.whl"
     call = [sys.executable, str(ROOT / "tests" / "wheel.py"), "--holds", str(path)]
     for names, code, told in (
-        (("LICENSE", "THIRD-PARTY-NOTICES.txt"), 0, ""),
-        (("LICENSE",), 1, f"{path}: it lacks THIRD-PARTY-NOTICES.txt\n"),
+        (("LICENSE", "THIRD-PARTY-NOTICES.txt", "ftlm.cdx.json"), 0, ""),
+        (("LICENSE", "ftlm.cdx.json"), 1, f"{path}: it lacks THIRD-PARTY-NOTICES.txt\n"),
     ):
         with zipfile.ZipFile(path, "w") as wheel:
             for name in names:
@@ -72,3 +76,64 @@ def test_what_is_linked_has_terms_that_are_allowed():
     for name, expression in terms.items():
         choices = re.split(r" OR |/", expression)
         assert any(set(choice.strip("()").split(" AND ")) <= allowed for choice in choices), f"{name}: {expression}"
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Pins, and what a hosted machine is told to do
+
+
+def pins(name):
+    """(name, version) of each pinned package; refuse a line that is neither a pin nor one of its hashes."""
+    text = (ROOT / name).read_text(encoding="utf-8").replace("\\\n", "")
+    found = []
+    for line in text.splitlines():
+        if not line.startswith("#"):
+            package, *hashes = line.split()
+            assert hashes, line
+            assert all(re.fullmatch(r"--hash=sha256:[0-9a-f]{64}", h) for h in hashes), line
+            found.append(tuple(re.fullmatch(r"([a-z0-9.-]+)==([^;]+)", package).groups()))
+    assert len(dict(found)) == len(found)
+    return dict(found)
+
+
+def test_every_pin_has_its_hashes_and_every_dependency_its_pin():
+    tested, made = pins("requirements-test.txt"), pins("requirements-wheels.txt")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    asked = [*project["dependencies"], *(n for extra in project["optional-dependencies"].values() for n in extra)]
+    assert {re.match(r"[\w-]+", n)[0].lower() for n in (*asked, "maturin")} <= set(tested)
+    # Wheels are made and checked with what made and checked them in the tests.
+    assert {name: tested[name] for name in made if name in tested} == {n: v for n, v in made.items() if n in tested}
+    assert set(made) - set(tested) == {"ziglang"}
+
+
+def test_hosted_machines_are_told_what_there_is():
+    text = (ROOT / ".github" / "workflows" / "release.yml").read_text(encoding="utf-8")
+    jobs = yaml.safe_load(text)["jobs"]
+    systems = {job["runs-on"] for job in jobs.values()} | {
+        os for job in jobs.values() for os in job.get("strategy", {}).get("matrix", {}).get("os", [])
+    }
+    assert {system.split("-")[0] for system in systems if "$" not in system} == {"ubuntu", "macos", "windows"}
+    assert jobs["tried"]["strategy"]["matrix"]["python"] == ["3.11", "3.12", "3.13", "3.14"]
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([\w-]+):(?!=)", makefile, re.MULTILINE))
+    phony = set(re.search(r"^\.PHONY:((?:[^\n\\]|\\\n)*)$", makefile, re.MULTILINE)[1].replace("\\", "").split())
+    assert phony == targets
+    called = {word for run in re.findall(r"run: make (.*)", text) for word in run.split()}
+    assert {"wheels", "wheels-twice", "sdist-test"} <= called <= phony
+    for file in re.findall(r"-r (\S+\.txt)", text):
+        assert (ROOT / file).is_file()
+
+
+def test_the_bill_is_the_notices_with_checksums():
+    whole = json.loads((ROOT / "ftlm.cdx.json").read_text(encoding="utf-8"))
+    text = (ROOT / "THIRD-PARTY-NOTICES.txt").read_text(encoding="utf-8").split("-" * 80)[0]
+    named = set(re.findall(r"^(\S+) (\d\S*): (?=\S)", text, re.MULTILINE))
+    assert {(c["name"], c["version"]) for c in whole["components"]} == named
+    packages = tomllib.loads((ROOT / "Cargo.lock").read_text())["package"]
+    locked = {(p["name"], p["version"]): p.get("checksum") for p in packages}
+    for component in whole["components"]:
+        assert component["hashes"] == [{"alg": "SHA-256", "content": locked[component["name"], component["version"]]}]
+    references = {c["bom-ref"] for c in (whole["metadata"]["component"], *whole["components"])}
+    assert {d["ref"] for d in whole["dependencies"]} == references
+    assert {on for d in whole["dependencies"] for on in d["dependsOn"]} <= references
+    assert "path+file" not in json.dumps(whole)

@@ -190,6 +190,14 @@ fn its_numbers_are_found_again() -> Result<(), Error> {
         ..model.clone()
     };
     assert!(matches!(strange.check(std::slice::from_ref(&experiment)), Err(Error::Structure { .. })));
+    // Orders that make no equation: their states would fill memory.
+    let mut endless = model.clone();
+    endless.equations[0].terms[1].1.constant = 1e308;
+    let falling = FrictionModel { order_bounds: vec![(1.2, -1.0)], ..model.clone() };
+    for wrong in [&endless, &falling] {
+        let found = fit(wrong, std::slice::from_ref(&experiment), &start, Settings::default());
+        assert!(matches!(found, Err(Error::OutOfRange { .. } | Error::Structure { .. })), "{found:?}");
+    }
     // Behind a filter that the model does not know.
     let mut series = vec![0.0; m];
     series[..2].copy_from_slice(&[0.5, 0.5]);

@@ -88,6 +88,12 @@ fn regressions_that_cannot_be_made() {
     refused(least_squares::fit(&[], &there, &[None], &Initial::Rest));
     refused(least_squares::solve(&[vec![1.0; 3]], &[1.0; 4], 1));
     refused(iv::fit(&run, &[], &[], &Initial::Rest, iv::Settings::default()));
+    for wrong in [
+        iv::Settings { iterations: 1 << 62, ..iv::Settings::default() },
+        iv::Settings { tolerance: f64::NAN, ..iv::Settings::default() },
+    ] {
+        refused(iv::fit(&run, &[structure(0, 1.0, &[(1, 0.0)])], &[vec![None]], &Initial::Rest, wrong));
+    }
     refused(iv::fit(&run, &[structure(0, 1.0, &[(7, 0.0)])], &[vec![None]], &Initial::Rest, iv::Settings::default()));
 }
 

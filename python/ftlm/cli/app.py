@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 from typing import Annotated
 
@@ -48,6 +49,9 @@ for _command in (
 
 def main() -> None:
     """Entry point."""
+    # Who closes an output, as `>&-` does, wants none; what is opened next must not take its place.
+    sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115
     for stream in (sys.stdout, sys.stderr):
         # A terminal that knows no Greek must not take a result away after an hour's work.
         if isinstance(stream, io.TextIOWrapper):

@@ -1,6 +1,10 @@
 //! What the estimators by instrumental variables share: settings, solutions, sums of products, long-run covariances.
 
 use crate::equation::{Equation, Structure};
+use crate::error::{Error, Result};
+
+/// Steps, at most: what has not stood still by then goes round.
+const MOST_STEPS: usize = 1000;
 
 /// How long to iterate.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -14,6 +18,35 @@ pub struct Settings {
 impl Default for Settings {
     fn default() -> Self {
         Self { iterations: 30, tolerance: 1e-7 }
+    }
+}
+
+impl Settings {
+    /// Refuses settings with which no iteration ends.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`] for more than a thousand steps, and for a tolerance that is negative or no number.
+    ///
+    /// ```
+    /// # use ftlm::estimate::iv::Settings;
+    /// assert!(Settings::default().check().is_ok());
+    /// assert!(Settings { iterations: 1 << 20, ..Settings::default() }.check().is_err());
+    /// ```
+    pub fn check(&self) -> Result<()> {
+        let refuse = |name: &str, value: f64, range: &str, remedy: &str| {
+            Err(Error::OutOfRange { name: name.into(), value, range: range.into(), remedy: remedy.into() })
+        };
+        if self.iterations > MOST_STEPS {
+            #[allow(clippy::cast_precision_loss)]
+            let steps = self.iterations as f64;
+            let remedy = "what has not stood still by then goes round";
+            return refuse("steps of instrumental variables", steps, &format!("[0, {MOST_STEPS}]"), remedy);
+        }
+        if !(self.tolerance >= 0.0 && self.tolerance.is_finite()) {
+            let remedy = "give the relative change at which the steps end";
+            return refuse("tolerance of instrumental variables", self.tolerance, "[0, ∞)", remedy);
+        }
+        Ok(())
     }
 }
 

@@ -58,7 +58,8 @@ pub struct Fit {
 /// O(iterations · Σ (terms · m log m + n² m log² m)).
 ///
 /// # Errors
-/// As least squares; [`Error::Singular`] where instruments cannot tell the terms apart; [`Error::Length`].
+/// As least squares and [`Settings::check`]; [`Error::Singular`] where instruments cannot tell the terms apart;
+/// [`Error::Length`].
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
@@ -85,6 +86,7 @@ pub fn fit(
     initial: &Initial,
     settings: Settings,
 ) -> Result<Fit> {
+    settings.check()?;
     check_length("fixed coefficients", structures.len(), fixed.len())?;
     if structures.is_empty() {
         return Err(Error::Length { name: "equations".into(), expected: 1, found: 0 });

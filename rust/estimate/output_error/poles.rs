@@ -38,7 +38,7 @@ pub fn grows(alpha: f64, own: &[(f64, f64)]) -> bool {
     }
     let share = (ALONE * powers.len() as f64).ln();
     // ln ω at which another power, of a higher or a lower order, is as small as that beside the one at the end.
-    let apart = |end: (f64, f64), &(c, p): &(f64, f64)| ((end.0 / c).abs().ln() - share) / (p - end.1);
+    let apart = |end: (f64, f64), &(c, p): &(f64, f64)| (end.0.abs().ln() - c.abs().ln() - share) / (p - end.1);
     let ends = |end: (f64, f64)| powers.iter().filter(move |(_, p)| *p != end.1).map(move |power| apart(end, power));
     let (first, last) = (ends(low).fold(f64::INFINITY, f64::min), ends(high).fold(f64::NEG_INFINITY, f64::max));
     let steps = ((last - first) / WIDEST).ceil().clamp(1.0, 1e6);
@@ -85,8 +85,8 @@ fn turn(powers: &[(f64, f64)], from: (f64, (f64, f64)), to: (f64, (f64, f64))) -
     if angle.abs() <= TURN {
         return angle;
     }
-    // Far out neighbouring numbers are wider apart than the narrowest step.
-    if b - a < NARROWEST || middle <= a || middle >= b {
+    // Far out neighbouring numbers are wider apart than the narrowest step, and beyond all of them the curve is no number.
+    if b - a < NARROWEST || !(middle > a && middle < b) || angle.is_nan() {
         // The curve passes through 0, to either side by rounding: a zero lies on the axis, and whatever turns, grows.
         return f64::NEG_INFINITY;
     }
@@ -122,6 +122,19 @@ mod tests {
             if (angle - 0.3 * PI).abs() > 1e-3 {
                 assert_eq!(grows(1.2, &[(c, 0.6), (-1.0, 0.0)]), angle < 0.3 * PI, "c = {c}");
             }
+        }
+    }
+
+    #[test]
+    fn powers_and_coefficients_at_the_ends_of_all_numbers_end() {
+        // Once without end: to come back is what is asked.
+        for (alpha, own) in [
+            (1e-9, [(-0.954, 0.0), (5e-324, 0.5)]),
+            (0.0, [(1e308, 0.0), (-0.468, 0.5)]),
+            (1e308, [(1.0, 0.0), (-1.0, -1e308)]),
+            (1.6, [(-5e-324, 0.0), (1e308, 0.5)]),
+        ] {
+            std::hint::black_box(grows(alpha, &own));
         }
     }
 

@@ -4,6 +4,7 @@ use pyo3::prelude::*;
 use pyo3::types::PyDict;
 
 use super::super::arrays::{initial, records, InitialArg, RecordArg};
+use super::super::lists::{lists, nested, List};
 use crate::equation::{AffineOrder, Initial};
 use crate::error::Error;
 use crate::estimate::iv::{with_projections, Settings};
@@ -91,12 +92,12 @@ pub struct Given<F> {
 impl<F> Given<F> {
     pub fn new(
         runs: &[RecordArg<'_>],
-        inputs: Vec<bool>,
+        inputs: List<bool>,
         fixed: F,
         terms: InitialArg,
         settings: SettingsArg,
     ) -> PyResult<Self> {
-        Ok(Self { records: records(runs)?, inputs, fixed, options: settings.options(terms)? })
+        Ok(Self { records: records(runs)?, inputs: inputs.into(), fixed, options: settings.options(terms)? })
     }
 
     /// Records, with the clean signals that the estimator asks for.
@@ -111,7 +112,7 @@ impl<F> Given<F> {
 }
 
 /// (output, values of alpha, [(signal, values, interchangeable), …]).
-type OrdersTuple = (usize, Vec<f64>, Vec<(usize, Vec<f64>, bool)>);
+type OrdersTuple = (usize, List<f64>, List<(usize, List<f64>, bool)>);
 
 /// The axes of a lattice.
 pub struct OrdersArg {
@@ -125,8 +126,8 @@ impl<'py> FromPyObject<'_, 'py> for OrdersArg {
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
         let (output, alphas, axes): OrdersTuple = object.extract()?;
-        let axis = |(signal, values, interchangeable)| TermAxis { signal, values, interchangeable };
-        Ok(Self { output, alphas, axes: axes.into_iter().map(axis).collect() })
+        let axis = |(signal, values, interchangeable)| TermAxis { signal, values: Vec::from(values), interchangeable };
+        Ok(Self { output, alphas: alphas.into(), axes: axes.into_iter().map(axis).collect() })
     }
 }
 
@@ -137,9 +138,9 @@ impl OrdersArg {
 }
 
 /// (constant, weight of each free order).
-type AffineTuple = (f64, Vec<f64>);
+type AffineTuple = (f64, List<f64>);
 /// (output, alpha, [(signal, order), …]).
-type LawTuple = (usize, AffineTuple, Vec<(usize, AffineTuple)>);
+type LawTuple = (usize, AffineTuple, List<(usize, AffineTuple)>);
 
 /// The order laws of one equation.
 pub struct LawArg(LawEquation);
@@ -149,7 +150,7 @@ impl<'py> FromPyObject<'_, 'py> for LawArg {
 
     fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
         let (output, order, terms): LawTuple = object.extract()?;
-        let affine = |(constant, weights)| AffineOrder { constant, weights };
+        let affine = |(constant, weights)| AffineOrder { constant, weights: Vec::from(weights) };
         let terms = terms.into_iter().map(|(signal, order)| (signal, affine(order))).collect();
         Ok(Self(LawEquation { output, order: affine(order), terms }))
     }
@@ -158,7 +159,7 @@ impl<'py> FromPyObject<'_, 'py> for LawArg {
 /// The lattice of a stage from the values of its free orders.
 pub fn law_lattice(
     axes: &[Vec<f64>],
-    laws: Vec<LawArg>,
+    laws: List<LawArg>,
     inputs: &[bool],
     fixed: &[Vec<Option<f64>>],
 ) -> Result<LawLattice, Error> {
@@ -188,11 +189,11 @@ pub fn named(failure: Failure) -> &'static str {
 }
 
 /// (index, raw score, coefficients, initial terms by record).
-type RowArg = (u64, f64, Vec<f64>, Vec<Vec<f64>>);
+type RowArg = (u64, f64, List<f64>, List<List<f64>>);
 /// Candidates, kept, beaten, bounded, stopped, singular, diverged.
 type CountsArg = (u64, u64, u64, u64, u64, u64, u64);
 /// Rows, counts, (index, whether diverged rather than singular) of failures.
-pub type PartArg = (Vec<RowArg>, CountsArg, Vec<(u64, bool)>);
+pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
 /// (round, followed, end, size, limit, order), whether the stretch was begun anew, and what it came to.
 pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 
@@ -200,7 +201,7 @@ pub type CheckpointArg = ((u64, u64, u64, u64, f64, u64), bool, PartArg);
 pub fn part_of(part: Part) -> PartArg {
     let c = part.counts;
     (
-        part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients, r.initial)).collect(),
+        part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients.into(), lists(r.initial))).collect(),
         (c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged),
         part.failures.into_iter().map(|(index, f)| (index, f == Failure::Diverged)).collect(),
     )
@@ -212,7 +213,12 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
     Part {
         rows: rows
             .into_iter()
-            .map(|(index, score, coefficients, initial)| Row { index, score, coefficients, initial })
+            .map(|(index, score, coefficients, initial)| Row {
+                index,
+                score,
+                coefficients: coefficients.into(),
+                initial: nested(initial),
+            })
             .collect(),
         counts: Counts { candidates, kept, beaten, bounded, stopped, singular, diverged },
         failures: failures

@@ -7,6 +7,7 @@ use pyo3::types::PyDict;
 
 use super::super::arrays::{InitialArg, RecordArg};
 use super::super::errors::detached;
+use super::super::lists::List;
 use super::arguments::{
     checkpoint, counted, named, part, part_of, CheckpointArg, Given, OrdersArg, PartArg, SettingsArg,
 };
@@ -19,7 +20,7 @@ use crate::search::threads::pool;
 
 #[pyfunction]
 #[allow(clippy::needless_pass_by_value)]
-pub fn lattice_size(py: Python<'_>, orders: OrdersArg, inputs: Vec<bool>) -> PyResult<u64> {
+pub fn lattice_size(py: Python<'_>, orders: OrdersArg, inputs: List<bool>) -> PyResult<u64> {
     detached(py, || Ok(orders.lattice(&inputs)?.count()))
 }
 
@@ -27,10 +28,10 @@ pub fn lattice_size(py: Python<'_>, orders: OrdersArg, inputs: Vec<bool>) -> PyR
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn search<'py>(
     py: Python<'py>,
-    runs: Vec<RecordArg<'py>>,
+    runs: List<RecordArg<'py>>,
     orders: OrdersArg,
-    inputs: Vec<bool>,
-    fixed: Vec<Option<f64>>,
+    inputs: List<bool>,
+    fixed: List<Option<f64>>,
     terms: InitialArg,
     settings: SettingsArg,
     progress: Option<Py<PyAny>>,
@@ -91,7 +92,7 @@ impl Found {
 pub fn search_plan(
     py: Python<'_>,
     orders: OrdersArg,
-    inputs: Vec<bool>,
+    inputs: List<bool>,
     terms: InitialArg,
     settings: SettingsArg,
     algorithm: Option<u64>,
@@ -111,11 +112,11 @@ pub fn search_plan(
 pub fn search_join<'py>(
     py: Python<'py>,
     orders: OrdersArg,
-    inputs: Vec<bool>,
+    inputs: List<bool>,
     terms: InitialArg,
     settings: SettingsArg,
     samples: usize,
-    parts: Vec<PartArg>,
+    parts: List<PartArg>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let options = settings.options(terms)?;
     let found = detached(py, || {
@@ -149,10 +150,10 @@ impl OrderSearch {
     #[allow(clippy::needless_pass_by_value)]
     fn new(
         py: Python<'_>,
-        runs: Vec<RecordArg<'_>>,
+        runs: List<RecordArg<'_>>,
         orders: OrdersArg,
-        inputs: Vec<bool>,
-        fixed: Vec<Option<f64>>,
+        inputs: List<bool>,
+        fixed: List<Option<f64>>,
         terms: InitialArg,
         settings: SettingsArg,
     ) -> PyResult<Self> {
@@ -173,7 +174,7 @@ impl OrderSearch {
         py: Python<'_>,
         first: u64,
         last: u64,
-        seed: Vec<(u64, f64)>,
+        seed: List<(u64, f64)>,
         start: Option<CheckpointArg>,
         threads: usize,
         progress: Option<Py<PyAny>>,

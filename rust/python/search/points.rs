@@ -5,6 +5,7 @@ use pyo3::prelude::*;
 
 use super::super::arrays::{records, rows, RecordArg};
 use super::super::errors::detached;
+use super::super::lists::List;
 use super::watch::watched;
 use crate::error::{check_length, Error};
 use crate::search::options::Norm;
@@ -23,15 +24,15 @@ impl Points {
     #[allow(clippy::needless_pass_by_value)]
     fn new(
         py: Python<'_>,
-        runs: Vec<RecordArg<'_>>,
+        runs: List<RecordArg<'_>>,
         output: usize,
-        signals: Vec<usize>,
-        inputs: Vec<bool>,
+        signals: List<usize>,
+        inputs: List<bool>,
         squares: bool,
     ) -> PyResult<Self> {
         let width = signals.len();
         let norm = if squares { Norm::L2 } else { Norm::L1 };
-        let records = records(&runs)?;
+        let (records, signals, inputs) = (records(&runs)?, signals.into(), inputs.into());
         Ok(Self { inner: detached(py, || PointsOf::new(records, output, signals, inputs, norm))?, width })
     }
 
@@ -44,7 +45,7 @@ impl Points {
         limit: f64,
         threads: usize,
     ) -> PyResult<Bound<'py, PyArray1<f64>>> {
-        let (rows, Self { inner, width }) = (rows(&candidates), self);
+        let (rows, Self { inner, width }) = (rows(&candidates)?, self);
         let found = watched(py, None, |control| {
             let point = |row: Vec<f64>| {
                 check_length("a candidate", 1 + 2 * *width, row.len())?;

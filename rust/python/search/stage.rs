@@ -8,6 +8,7 @@ use pyo3::types::{PyBytes, PyDict};
 
 use super::super::arrays::{InitialArg, RecordArg};
 use super::super::errors::detached;
+use super::super::lists::{nested, List};
 use super::arguments::{counted, law_lattice, named, span, verdicts, verdicts_of, Given, LawArg, SettingsArg, SpanArg};
 use super::watch::watched;
 use crate::error::Error;
@@ -20,16 +21,17 @@ use crate::search::threads::pool;
 #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
 pub fn search_stage<'py>(
     py: Python<'py>,
-    runs: Vec<RecordArg<'py>>,
-    axes: Vec<Vec<f64>>,
-    laws: Vec<LawArg>,
-    inputs: Vec<bool>,
-    fixed: Vec<Vec<Option<f64>>>,
-    scales: Vec<f64>,
+    runs: List<RecordArg<'py>>,
+    axes: List<List<f64>>,
+    laws: List<LawArg>,
+    inputs: List<bool>,
+    fixed: List<List<Option<f64>>>,
+    scales: List<f64>,
     terms: InitialArg,
     settings: SettingsArg,
     progress: Option<Py<PyAny>>,
 ) -> PyResult<Bound<'py, PyDict>> {
+    let (axes, fixed) = (nested(axes), nested(fixed));
     let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
     let found = watched(py, progress.as_ref(), |control| {
         let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
@@ -105,16 +107,17 @@ impl StageSearch {
     #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
     fn new(
         py: Python<'_>,
-        runs: Vec<RecordArg<'_>>,
-        axes: Vec<Vec<f64>>,
-        laws: Vec<LawArg>,
-        inputs: Vec<bool>,
-        fixed: Vec<Vec<Option<f64>>>,
-        scales: Vec<f64>,
+        runs: List<RecordArg<'_>>,
+        axes: List<List<f64>>,
+        laws: List<LawArg>,
+        inputs: List<bool>,
+        fixed: List<List<Option<f64>>>,
+        scales: List<f64>,
         terms: InitialArg,
         settings: SettingsArg,
         keeps_course: bool,
     ) -> PyResult<Self> {
+        let (axes, fixed) = (nested(axes), nested(fixed));
         let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
         let (stage, course) = watched(py, None, |control| {
             let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
@@ -142,7 +145,7 @@ impl StageSearch {
     fn follow<'py>(
         &self,
         py: Python<'py>,
-        spans: Vec<SpanArg>,
+        spans: List<SpanArg>,
         threads: usize,
         progress: Option<Py<PyAny>>,
     ) -> PyResult<(Bound<'py, PyBytes>, Bound<'py, PyBytes>)> {

@@ -1,0 +1,626 @@
+"""Calls of every entry of the extension: arguments that hang together, and the same with one or two hostile values.
+
+Arguments by chance contradict each other and are refused at the first check, which proves little of what lies behind.
+So each entry has a recipe of sound arguments, which it answers, and a hostile call is a sound one in which a number, a
+word, an array or a list was exchanged.
+"""
+
+import ast
+import itertools
+import math
+import random
+import re
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+
+from ftlm import _core, rig
+
+STUB = Path(__file__).resolve().parent.parent / "python" / "ftlm" / "_core.pyi"
+#: It panics by its purpose, so no attack calls it; tests of the attack do.
+PANICS = "panic_on_purpose"
+#: How often sound arguments stay sound, and get two hostile values rather than one.
+SOUND, TWICE = 0.1, 0.3
+#: Rows or columns of an array beyond memory, all of them one number; a rig that is run on so many samples runs on.
+LARGE = 1 << 34
+ENDLESS = {"VirtualArm.rest", "VirtualArm.run"}
+
+
+class OursError(Exception):
+    """What a hostile callback raises."""
+
+
+def entries():
+    """Names of everything that can be called or read in the extension, those of a class behind its own."""
+    found = []
+    for node in ast.parse(STUB.read_text()).body:
+        own = f"{node.name}." if isinstance(node, ast.ClassDef) else ""
+        found += [own + n.name for n in (node.body if own else [node]) if isinstance(n, ast.FunctionDef)]
+    return [name for name in found if name != PANICS and not name.startswith("_")]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Sound arguments: a method a name of the extension, `a_b` for `A.b`; what is given by name comes last, as a dictionary,
+# and the object of a method first.
+
+
+def snake(name):
+    return re.sub("(?<=[a-z])(?=[A-Z])", "_", name).lower()
+
+
+class Sound:
+    """Arguments that hang together, otherwise by chance."""
+
+    def __init__(self, seed):
+        self.random, self.normal = random.Random(seed), np.random.default_rng(seed).standard_normal
+        self.kept = {}
+
+    def call(self, name):
+        """(what is called, its arguments, those given by name)."""
+        own, _, attribute = name.rpartition(".")
+        made = getattr(self, f"{snake(own)}_{attribute.strip('_')}" if own else name)()
+        target = None
+        if own and attribute != "__new__":
+            target, made = made[0], made[1]
+            bound = getattr(type(target), attribute)
+            if not callable(bound):
+                return (lambda: getattr(target, attribute)), [], {}
+            target = getattr(target, attribute)
+        *given, named = made if made and isinstance(made[-1], dict) and name in NAMED else (*made, {})
+        return target or getattr(_core, own or name), given, named
+
+    def one(self, *choices):
+        return self.random.choice(choices)
+
+    def number(self, low, high):
+        return round(self.random.uniform(low, high), 3)
+
+    def order(self):
+        return self.one(0.4, 0.5, 1.0, 1.6, 2.0, self.number(0.1, 2.5))
+
+    def m(self):
+        return self.one(8, 16, 32, 64)
+
+    def step(self):
+        return self.one(0.01, 0.05, 0.1)
+
+    def samples(self, count=None):
+        return self.normal(count or self.m())
+
+    def sensor(self, m, step):
+        return _core.filter_series([(1.0, 0.0)], [(0.1, 1.0), (1.0, 0.0)], m, step)
+
+    # ------------------------------------------------------------------------------------------ kernels and transforms
+
+    def block_pulse_kernel(self):
+        return self.order(), self.m(), self.step(), {"derivative": self.one(True, False)}
+
+    def grunwald_letnikov_weights(self):
+        return self.order(), self.m()
+
+    def haar_transform(self):
+        return (self.normal((self.one(1, 3), self.m())),)
+
+    haar_inverse = haar_transform
+
+    def haar_matrix(self):
+        return (self.m(),)
+
+    def block_pulse_matrix(self):
+        return self.order(), self.m(), self.step()
+
+    def operational_matrix(self):
+        return *self.block_pulse_matrix(), {"dense": self.one(True, False)}
+
+    def series_multiply(self):
+        m = self.m()
+        return self.samples(m), self.samples(m), m, {"naive": self.one(True, False)}
+
+    def series_divide(self):
+        m = self.m()
+        divisor = 0.1 * self.samples(m)
+        divisor[0] = 1.0
+        return self.samples(m), divisor, {"naive": self.one(True, False)}
+
+    def fractional_integral(self):
+        rule = self.one("block-pulse", "trapezoidal", "grunwald-letnikov")
+        return self.normal((self.one(1, 2), self.m())), self.order(), self.step(), rule
+
+    def fractional_derivative(self):
+        rows, order = self.one(1, 2), self.order()
+        definition = self.one("grunwald-letnikov", "riemann-liouville", "caputo")
+        initial = np.zeros((rows, math.ceil(order) if definition == "caputo" else 0))
+        return self.normal((rows, self.m())), order, self.step(), definition, initial
+
+    # ---------------------------------------------------------------------------------------------- samples to records
+
+    def pulse_means(self):
+        m = self.m()
+        return self.samples(m * self.one(1, 2, 3) + 1), m, self.one(True, False)
+
+    def point_samples(self):
+        return (self.samples(),)
+
+    def delayed(self):
+        return self.samples(), self.number(0, 5), self.number(-1, 1)
+
+    def filter_series(self):
+        return [(1.0, 0.0), (0.1, 0.5)], [(0.1, 1.6), (0.3, 0.5), (1.0, 0.0)], self.m(), self.step()
+
+    # ------------------------------------------------------------------------------------------------------ estimators
+    #
+    # Records hold two outputs and one input.
+
+    INPUTS = (False, False, True)
+
+    def record(self, m=None, sensor=True):
+        m, step = m or self.m(), self.step()
+        series = self.sensor(m, step) if sensor and self.random.random() < 0.2 else None
+        return step, self.normal((3, m)), series
+
+    def runs(self):
+        return [self.record() for _ in range(self.one(1, 1, 2))]
+
+    def structure(self, output=0):
+        alpha = self.one(0.8, 1.0, 1.6, 2.0)
+        terms = [(output, 0.0), (2, 0.0)]
+        if alpha > 1:
+            terms.insert(1, (output, self.one(0.5, 0.9)))
+        if self.random.random() < 0.3:
+            terms.append((1 - output, self.one(0.0, 0.3)))
+        return output, alpha, terms
+
+    def equation(self, output=0):
+        structure = self.structure(output)
+        return structure, [self.number(-2, -0.1) if s == output else self.number(-1, 1) for s, _ in structure[2]]
+
+    def fixed(self, structure):
+        return [self.number(-1, 1) if self.random.random() < 0.2 else None for _ in structure[2]]
+
+    def terms(self):
+        return self.one((True, []), (False, []), (False, [0.0]), (True, [], 1), (False, [0.0, 1.0], 2))
+
+    def least_squares(self):
+        structure = self.structure()
+        return self.runs(), structure, list(self.INPUTS), self.fixed(structure), self.terms()
+
+    def multi_innovation(self):
+        return (
+            *self.least_squares(), self.one(1, 2, 7), self.one(1.0, 1e6), self.one(True, False), self.one(True, False)
+        )  # fmt: skip
+
+    def instrumental_variables(self):
+        structures = [self.structure(0), self.structure(1)]
+        fixed = [[None] * len(s[2]) for s in structures]
+        runs = [(step, means, None) for step, means, _ in self.runs()]
+        return runs, structures, list(self.INPUTS), fixed, self.terms(), self.one(1, 4), 1e-4
+
+    def experiments(self, own=False):
+        """Records of one output and one input with samples of the output; with `own`, at times of their own."""
+        filtered = self.random.random() < 0.2
+        return [self.experiment(own, filtered) for _ in range(self.one(1, 2))]
+
+    def experiment(self, own, filtered):
+        m, every, step = self.one(16, 32, 64), self.one(1, 2), self.step()
+        places = self.places(m)
+        count = len(places) if own else m // every + 1
+        # The first and the last regular sample are not compared.
+        shares = np.ones((1, count if own else count - 2)) if self.random.random() < 0.2 else None
+        series = (self.sensor(m, step), [True]) if filtered else None
+        instants = [(None, False), (self.samples(count), True)] if self.random.random() < 0.2 else []
+        jumps = (self.places(m)[:3], self.samples(3))
+        return (
+            (step, self.normal((2, m)), None), every, self.normal((1, count)), series, [1.0], instants, shares,
+            (places, [None, self.one(None, jumps)]) if own else None,
+        )  # fmt: skip
+
+    def free_inputs(self, *laws):
+        """What is free of the second signal."""
+        value = {"delay": ((0.0, 0.1), 0.05), "saturation": ((0.1, 3.0), 1.0), "dead_zone": ((0.0, 1.0), 0.1)}
+        return [(1, law, *value[law]) for law in self.one((), *((law,) for law in laws))]
+
+    def output_error(self):
+        coupled = self.one(True, False)
+        law = (0, (0.0, [1.0]), [(0, (0.0, [0.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0]), (1.0, [(1, 1)]))])
+        bounds, start = [(0.5, 2.0)], [self.number(0.8, 1.8)]
+        free = self.free_inputs("delay", "saturation", "dead_zone")
+        return (
+            self.experiments(own=not free and self.one(True, False)), [law], bounds,
+            [self.one("plain", "logarithm"), self.one("plain", "held")], coupled, self.terms(), start, [1.5, 0.7],
+            free, self.one(1, 3, 20), 1e-6, self.one(True, False), self.one(None, _core.Stop()),
+        )  # fmt: skip
+
+    def friction_error(self):
+        own, force = (0, (0.0, [0.0, 1.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0, 0.0]), (1.0, [(1, 1)]))
+        law = (0, (0.0, [1.0, 0.0]), [own, force])
+        strength = [(1.0, [(2, 1)]), self.one((0.0, []), (0.3, [(2, 1)])), (1.0, [])]
+        return (
+            self.experiments(), [law], [(0, strength)], [(1.05, 2.0), (0.0, 1.0)],
+            ["plain", "plain", self.one("plain", "logarithm")], self.one((True, []), (True, [], 1)),
+            [self.number(1.5, 2.0), self.number(0.3, 0.9)], [0.7, 1.1, 0.2],
+            self.free_inputs("saturation", "dead_zone"), [], self.one(1, 3, 10), 1e-6,
+            self.one(None, _core.Stop()),
+        )  # fmt: skip
+
+    def friction_respond(self):
+        law = self.one((0.3, 0.0, 1.0), (0.3, 0.1, 0.5), (0.0, 0.0, 1.0))
+        (_, _, terms), coefficients = self.equation()
+        equation = (0, self.one(1.6, 2.0), [(s, v) for s, v in terms if s != 1])
+        kept = [c for (s, _), c in zip(terms, coefficients, strict=True) if s != 1]
+        return self.record(sensor=False), [(equation, kept)], [(0, law)], [[(0.0, 0.1), (1.0, -0.2)]]
+
+    def grows(self):
+        return self.one(1.0, 1.6, 2.0), [(self.number(-3, -0.1), 0.0), (self.number(-1, 0.1), 0.5)]
+
+    def streaming_new(self):
+        structure = (0, 1.6, [(0, 0.0), (2, 0.0)])
+        return 0.01, 64, list(self.INPUTS), [(structure, self.fixed(structure))], self.one(1, 3), 1e3
+
+    def streaming_push(self):
+        stream = self.one_of("Streaming")
+        return stream, (self.normal((2, 3)),)
+
+    def streaming_coefficients(self):
+        return self.one_of("Streaming"), ()
+
+    streaming_pulses = streaming_coefficients
+
+    # ------------------------------------------------------------------------------------------------------ simulation
+
+    def powers(self):
+        return [(0.0, self.number(-1, 1)), (1.0, self.number(-1, 1))] if self.random.random() < 0.5 else []
+
+    def model(self):
+        return [self.equation(output) for output in range(self.one(1, 2))]
+
+    def respond(self):
+        model = self.model()
+        return self.record(), model, list(self.INPUTS), [self.powers() for _ in model]
+
+    def respond_and_units(self):
+        model = self.model()
+        units = [(self.random.randrange(len(model)), e) for e in self.one([], [0.0], [0.0, 1.5])]
+        return self.record(), model, list(self.INPUTS), units
+
+    def respond_with_initial(self):
+        model, record = self.model(), self.record(sensor=False)
+        applies = self.sensor(record[1].shape[1], record[0]), [True, False][: len(model)]
+        return record, model, list(self.INPUTS), self.terms(), self.one(None, None, applies)
+
+    def equation_error(self):
+        return self.record(), self.equation(), list(self.INPUTS), self.terms()
+
+    def explicit_euler(self):
+        model = [((0, 2.0, [(0, 0.0), (0, 1.0), (2, 0.0)]), [-3.0, self.number(-1, 0), 1.0])]
+        return self.normal((3, self.m())), self.step(), model, list(self.INPUTS)
+
+    def trace_errors(self):
+        record, structure = self.record(), self.structure()
+        trace = 0.1 * self.normal((record[1].shape[1], len(structure[2])))
+        return record, structure, list(self.INPUTS), trace
+
+    def nyquist_margin(self):
+        return self.grows()[1], self.step()
+
+    def correlation(self):
+        lengths = [self.one(16, 40) for _ in range(self.one(1, 2))]
+        return [self.samples(n) for n in lengths], [self.samples(n) for n in lengths], self.one(3, 10)
+
+    def places(self, m):
+        return np.sort(np.array([self.random.uniform(0.5, m - 0.5) for _ in range(9)]))
+
+    def read_at(self):
+        m = self.m()
+        return self.normal((self.one(1, 2), m)), self.places(m)
+
+    def corners(self):
+        m = self.m()
+        return m, self.places(m), (self.places(m), self.samples(9)), self.order(), self.step()
+
+    def metrics(self):
+        count = self.m()
+        return self.samples(count), 0.1 * self.samples(count)
+
+    def fractional_memory(self):
+        return self.samples(), self.number(0.1, 0.9), self.step(), self.one(1e-6, 1e-10)
+
+    # -------------------------------------------------------------------------------------------------------- searches
+
+    def orders(self):
+        own = sorted({self.number(0, 0.9) for _ in range(3)})
+        return 0, [1.0, 1.2, 1.6], [(0, own, self.one(True, False)), (2, [0.0, 0.3], False)]
+
+    def settings(self):
+        instruments = 3 if self.random.random() < 0.2 else 0
+        return (
+            self.one("output-error", "equation-error"), self.one("l1", "l2"), self.one(0, 3), 1e4,
+            self.one(True, False), self.one(1, 5, 20), self.one(1, 2), self.one(True, False), instruments, 1 << 31,
+        )  # fmt: skip
+
+    def progress(self):
+        return self.one(None, lambda *_: None)
+
+    def lattice_size(self):
+        return self.orders(), list(self.INPUTS)
+
+    def asked(self):
+        """What the search of one equation takes."""
+        runs = [(step, means, None) for step, means, _ in self.runs()]
+        return runs, self.orders(), list(self.INPUTS), [None, None], self.terms(), self.settings()
+
+    def search(self):
+        return *self.asked(), self.progress()
+
+    order_search_new = asked
+
+    def portable(self):
+        return (self.one(True, False),)
+
+    def search_plan(self):
+        _, orders, inputs, _, terms, settings = self.asked()
+        return orders, inputs, terms, settings, self.one(None, 0, 1)
+
+    def search_join(self):
+        if "parts" not in self.kept or self.random.random() < 0.05:
+            asked = self.asked()
+            runs, orders, inputs, _, terms, settings = asked
+            whole = _core.OrderSearch(*asked)
+            _, waves, _ = _core.search_plan(orders, inputs, terms, settings, None)
+            ends = [0, *waves] if waves[0] else waves
+            parts = [whole.rounds(a, b, [], None, 1, None, None) for a, b in itertools.pairwise(ends)]
+            samples = sum(run[1].shape[1] for run in runs)
+            self.kept["parts"] = orders, inputs, terms, settings, samples, parts
+        return self.kept["parts"]
+
+    def order_search_rounds(self):
+        place = ((0, 0, 0, 0, math.inf, 0), True, ([], (0,) * 7, []))
+        seed = self.one([], [(0, 10.0)], [(0, 10.0), (3, 12.0)])
+        save = self.one(None, lambda _: None)
+        return self.one_of("OrderSearch"), (0, 1, seed, self.one(None, place), 1, self.progress(), save)
+
+    def stage(self):
+        """What the search of a stage takes."""
+        weights = [(1.0, 0.0), (0.0, 1.0)]
+        laws = [(output, (0.0, [1.0, 0.0]), [(output, (0.0, list(weights[1]))), (2, (0.0, [0.0, 0.0]))])
+                for output in (0, 1)]  # fmt: skip
+        runs = [(step, means, None) for step, means, _ in self.runs()]
+        axes = [[1.05, 1.4, 1.8], [0.0, 0.4, 0.8]]
+        return (
+            runs, axes, laws, list(self.INPUTS), [[None, None]] * 2, [1.0, 2.0], self.terms(), self.settings()
+        )  # fmt: skip
+
+    def search_stage(self):
+        return *self.stage(), self.progress()
+
+    def stage_search_new(self):
+        return *self.stage(), True
+
+    def stage_search_wanted(self):
+        return self.one_of("StageSearch"), ()
+
+    stage_search_state = stage_search_wanted
+
+    def stage_search_follow(self):
+        search = self.one_of("StageSearch")
+        return search, (search.wanted(), 1, self.progress())
+
+    def stage_search_take(self):
+        search = self.one_of("StageSearch")
+        if not search.wanted():
+            search = self.one_of("StageSearch", new=True)
+        values, kinds = search.follow(search.wanted(), 1, None)
+        return search, (values, kinds, 1)
+
+    def stage_search_outcome(self):
+        search = self.one_of("StageSearch")
+        while search.wanted():
+            search.take(*search.follow(search.wanted(), 1, None), 1)
+        return search, ()
+
+    def points_new(self):
+        return self.runs(), 0, [0, 2], list(self.INPUTS), self.one(True, False)
+
+    def points_scores(self):
+        rows = [[self.order(), 0.0, 0.0, self.number(-2, 0), 1.0] for _ in range(self.one(1, 4))]
+        return self.one_of("Points"), (np.array(rows), self.one(math.inf, 10.0), 1)
+
+    # ------------------------------------------------------------------------------------------------------------- rig
+
+    def made_by(self, name, make):
+        """Arguments with which ftlm makes an object of the extension."""
+        with mock.patch.object(_core, name) as seen:
+            make()
+        return seen.call_args.args
+
+    def guard_new(self):
+        return self.made_by("Guard", lambda: rig.Limits().guard(0.002, self.one(None, (0.01, 0.7))))
+
+    def virtual_arm_new(self):
+        return self.made_by("VirtualArm", lambda: rig.ArmParameters.of("linear").arm(0.002, 1.0))
+
+    def reading(self):
+        return [self.number(-1, 1) for _ in range(4)], [self.random.randrange(-99, 99), 7], [1, 1, 1, 1]
+
+    def guard_rest(self):
+        return self.one_of("Guard"), self.reading()
+
+    def guard_read(self):
+        return self.one_of("Guard"), (*self.reading(), self.one(0.0, 0.01))
+
+    def guard_command(self):
+        return self.one_of("Guard"), ([self.number(-1, 1), 0.0],)
+
+    def guard_fail(self):
+        return self.one_of("Guard"), (self.one("", "a cable hangs loose"),)
+
+    def guard_fault(self):
+        return self.one_of("Guard"), ()
+
+    guard_written = guard_bias = guard_missed = guard_fault
+
+    def virtual_arm_start(self):
+        return self.one_of("VirtualArm"), (self.one(True, False),)
+
+    def virtual_arm_read(self):
+        return self.one_of("VirtualArm"), ([self.number(-1, 1) for _ in range(4)],)
+
+    def virtual_arm_advance(self):
+        return self.one_of("VirtualArm"), ([self.number(-1, 1), 0.1], self.one(True, False))
+
+    def virtual_arm_inject(self):
+        what = self.one("dead encoder", "saturated gauge", "limit switch", "deflection", "lost samples")
+        return self.one_of("VirtualArm"), (what, self.one(0, 1), self.one(0, 3, 50), self.number(0, 0.1))
+
+    def virtual_arm_rest(self):
+        guard = _core.Guard(*self.guard_new())
+        return self.one_of("VirtualArm"), (guard, self.normal((5, 4)), lambda a, b: ((a, b), True))
+
+    def virtual_arm_run(self):
+        guard, noise, out = self.virtual_arm_rest()[1]
+        return self.one_of("VirtualArm"), (guard, 0.1 * self.normal((5, 2)), noise, out)
+
+    def virtual_arm_take(self):
+        return self.one_of("VirtualArm"), ()
+
+    virtual_arm_sample = virtual_arm_angles = virtual_arm_memory = virtual_arm_take
+
+    def stop_new(self):
+        return ()
+
+    def stop_set(self):
+        return _core.Stop(), ()
+
+    stop_is_set = stop_set
+
+    def panic_on_purpose(self):
+        return ("call",)
+
+    def one_of(self, name, new=False):
+        """An object of this class, kept for some calls."""
+        if new or name not in self.kept or self.random.random() < 0.1:
+            self.kept[name] = getattr(_core, name)(*getattr(self, f"{snake(name)}_new")())
+        return self.kept[name]
+
+
+#: Entries whose last arguments are given by name.
+NAMED = {"block_pulse_kernel", "operational_matrix", "series_multiply", "series_divide"}
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Hostile values
+
+
+NUMBERS = (
+    math.nan, math.inf, -math.inf, 0.0, -0.0, -1.0, 1.0, 2.0, 1e308, -1e308, 5e-324, 1e-300, -1e300, 1e16, 1e-9,
+)  # fmt: skip
+FLOATS = (*NUMBERS, None, "x", 1j, 10**400)
+#: Sizes between a million and what is refused are work, not an attack.
+WHOLES = (
+    -1, 0, 1, 2, 3, 1 << 20, (1 << 31) - 1, 1 << 31, 1 << 40, 1 << 62, (1 << 63) - 1, 1 << 63, 1 << 64, -(1 << 63),
+    None, 0.5, "x",
+)  # fmt: skip
+WORDS = (
+    "", "\0", "x" * 9999, "\ud800", "linear", "held", "excess", "delay", "late", "grunwald-letnikov", None, 3, b"l1",
+)  # fmt: skip
+ODD = (None, 0, "x", {}, float)
+
+
+def raises(*_):
+    raise OursError
+
+
+class Liar:
+    """A list that says that it is longer than memory."""
+
+    def __len__(self):
+        return 1 << 60
+
+    def __getitem__(self, _):
+        return 1.0
+
+
+def hostile_array(array, r, large):
+    """Another array, or none."""
+    if array.size > 1 << 22:
+        return array
+    how = r.randrange(12)
+    if how < 4 and array.size and array.dtype == float:
+        array = array.copy()
+        if how == 3:
+            array[...] = r.choice(NUMBERS)
+        else:
+            array.flat[r.randrange(array.size)] = r.choice(NUMBERS)
+        return array
+    ways = [
+        lambda: array.astype(np.float32), lambda: array.astype(">f8"), lambda: array.astype(np.int64),
+        lambda: array[..., ::2], lambda: array[..., ::-1], lambda: array.T, lambda: array[..., :0], lambda: array[:0],
+        lambda: array[..., :1], lambda: array[:1], lambda: array[..., None], lambda: np.asfortranarray(array),
+        lambda: np.concatenate([array, array]), array.tolist, lambda: None,
+    ]  # fmt: skip
+    if large:
+        ways += [
+            lambda: np.broadcast_to(np.float64(1.0), (*array.shape[:-1], LARGE)),
+            lambda: np.broadcast_to(np.float64(1.0), (LARGE, *array.shape[1:])),
+        ]
+    return r.choice(ways)()
+
+
+def hostile(value, r, large=True):
+    """Something else than this."""
+    if isinstance(value, np.ndarray):
+        return hostile_array(value, r, large)
+    if isinstance(value, bool):
+        return r.choice([not value, not value, None, 2])
+    if isinstance(value, int):
+        return r.choice(WHOLES)
+    if isinstance(value, float):
+        return r.choice(FLOATS)
+    if isinstance(value, str):
+        return r.choice(WORDS)
+    if isinstance(value, bytes):
+        at = r.randrange(len(value) + 1)
+        return r.choice([value[:at], value[:at] + b"\xff" + value[at + 1 :], value + value, b"", "x", None])
+    if isinstance(value, dict):
+        return r.choice([{}, None, dict(list(value.items())[1:])])
+    if isinstance(value, (list, tuple)):
+        same = type(value)
+        shorter, longer = same(value[:-1]), same([*value, *value[:1]])
+        return r.choice([shorter, longer, same(reversed(value)), same(), same(value * 9), *ODD, range(1 << 40), Liar()])
+    if callable(value):
+        return r.choice([raises, lambda *_: None, lambda *_: ((math.nan, math.inf), True), lambda: None, *ODD])
+    if isinstance(value, _core.Stop):
+        told = _core.Stop()
+        told.set()
+        return r.choice([told, *ODD])
+    return r.choice([*ODD, math.nan, -1, raises])
+
+
+def places(value, path=()):
+    """Where something can be exchanged: paths of what is within, and within that."""
+    items = value.items() if isinstance(value, dict) else enumerate(value)
+    for key, item in items:
+        yield (*path, key)
+        if isinstance(item, (list, tuple, dict)):
+            yield from places(item, (*path, key))
+
+
+def exchanged(value, path, change):
+    """The same with what lies at the path changed."""
+    if not path:
+        return change(value)
+    if isinstance(value, dict):
+        return {**value, path[0]: exchanged(value[path[0]], path[1:], change)}
+    parts = list(value)
+    parts[path[0]] = exchanged(parts[path[0]], path[1:], change)
+    return type(value)(parts)
+
+
+def attacked(name, given, named, r):
+    """Arguments of which one or two were exchanged."""
+    arguments = (list(given), dict(named))
+    large = name not in ENDLESS
+    for _ in range(2 if r.random() < TWICE else 1):
+        spots = [path for path in places(arguments) if len(path) > 1]
+        if spots:
+            arguments = exchanged(arguments, r.choice(spots), lambda value: hostile(value, r, large))
+    return arguments

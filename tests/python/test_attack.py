@@ -1,0 +1,86 @@
+"""The attack on the extension reaches every entry behind its first check, and sees what breaks."""
+
+import random
+import runpy
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import house
+from ftlm import _core
+
+TESTS = Path(__file__).resolve().parents[1]
+ATTACK = runpy.run_path(str(TESTS / "attack.py"))
+HOSTILE = runpy.run_path(str(TESTS / "hostile.py"))
+
+
+def test_every_entry_of_the_bindings_is_attacked():
+    bodies, _ = house.entries(TESTS.parent / "rust" / "python")
+    bound = {name.rpartition("::")[2].replace(".new", ".__new__") for name in bodies} | {"portable"}
+    # VirtualArm and Guard have private helpers that are no entries.
+    assert set(HOSTILE["entries"]()) | {HOSTILE["PANICS"]} == bound
+
+
+def test_sound_arguments_are_answered():
+    for seed in range(3):
+        sound = HOSTILE["Sound"](seed)
+        for name in HOSTILE["entries"]():
+            call, given, named = sound.call(name)
+            call(*given, **named)
+    _core.portable(False)
+
+
+def test_hostile_values_leave_no_number_untouched():
+    r = random.Random(0)
+    given = [(0.1, np.ones((2, 8)), None), [1.0, 2], "l1", True, lambda: None]
+    touched = Counter()
+    for _ in range(4000):
+        (other,), _ = HOSTILE["attacked"]("respond", [given], {}, r)
+        if not isinstance(other, list):
+            continue
+        touched.update(
+            k for k, (a, b) in enumerate(zip(given, other, strict=False)) if a is not b and repr(a) != repr(b)
+        )
+    assert set(touched) == {0, 1, 2, 3, 4}
+    assert given[1] == [1.0, 2]
+    assert given[0][1].sum() == 16
+
+
+def test_hostile_calls_end_in_an_answer_or_in_words(tmp_path):
+    table = ATTACK["Table"]()
+    ATTACK["calls"](table, 4, tmp_path)
+    assert table.breaks == {}
+    names = HOSTILE["entries"]()
+    assert set(table.calls) == set(names)
+    assert table.counts == {ATTACK["CALLS"]: 4 * len(names)}
+    assert all(counted["calls"] == 4 == counted.total() - 4 for counted in table.calls.values())
+    shown = str(table)
+    assert f"| all | {4 * len(names)} |" in shown
+    assert "entries answered no hostile call" in shown
+
+
+def test_a_panic_is_seen(tmp_path):
+    table = ATTACK["Table"]()
+    ATTACK["calls"](table, 20, tmp_path, only=["panic_on_purpose", "metrics"])
+    (told, *_) = table.breaks[ATTACK["CALLS"]]
+    assert "panic_on_purpose: InternalError: internal fault: on purpose" in told
+    assert table.calls["metrics"]["calls"] == 20
+
+
+@pytest.mark.parametrize(
+    ("does", "told"),
+    [
+        ("os.abort()", ["first", "!ended the process with -6: "]),
+        ("time.sleep(60)", ["first", "!took more than 0.3 s"]),
+        ("sys.exit(0)", ["first"]),
+        ("raise SystemError('no words')", ["first", "!ended the process with 1: "]),
+    ],
+)
+def test_a_process_that_ends_or_hangs_is_seen(does, told, tmp_path):
+    command = [sys.executable, "-c", f"import os, sys, time\nos.write(1, b'first\\n')\n{does}"]
+    lines = list(ATTACK["lines_of"](command, tmp_path, 0.3))
+    assert len(lines) == len(told)
+    assert all(line.startswith(begin) for line, begin in zip(lines, told, strict=True))
