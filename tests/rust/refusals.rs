@@ -64,7 +64,7 @@ fn equations_that_miss_something() {
     }
     let good = std::slice::from_ref(&whole);
     refused(simulate::respond(good, &run, &[vec![(0.0, f64::NAN)]]));
-    refused(simulate::respond(good, &run, &[vec![(-1.0, 1.0)]]));
+    refused(simulate::respond(good, &run, &[vec![(-1.5, 1.0)]]));
     refused(simulate::respond(good, &run, &[vec![], vec![]]));
     refused(simulate::respond_with_initial(good, &run, &Initial::Powers(vec![-2.0]), None));
     let filter = |series, applies| Some(OutputFilter { series, applies });
