@@ -288,14 +288,12 @@ def test_what_one_end_does_not_need_goes_to_the_others(found: ftlm.Identificatio
     free = profiled(valley, valley.names, 0.95)
     took = {n: i.evaluations for n, i in free.intervals.items()}
     # Dealt out evenly alone, this budget would not do for the number that takes most.
-    scarce = sum(took.values()) + 6 * len(took)
+    scarce = sum(took.values()) + 10 * len(took)
     assert max(took.values()) > scarce / len(took)
     dealt = profiled(valley, valley.names, 0.95, most=scarce)
     assert dealt.left == ()
     for name, interval in dealt.intervals.items():
-        # A refit that was cut short goes on with its damping anew.
-        ends = (free.intervals[name].low, free.intervals[name].high)
-        assert (interval.low, interval.high) == pytest.approx(ends, rel=1e-9)
+        assert (interval.low, interval.high) == (free.intervals[name].low, free.intervals[name].high)
     assert max(took, key=took.__getitem__) in profiled(valley, valley.names, 0.95, most=max(took.values())).left
 
 
@@ -371,7 +369,7 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
         calls.append(values)
         if len(calls) > 1:
             return valley
-        orders, coefficients, delays = valley.grid.problem.split((valley.best.values + 0.5 * valley.errors).tolist())
+        orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
         off = valley.grid.descend(Attempt(orders, coefficients, "beside", {}, delays), 1, plain=True)
         return replace(valley, best=off)
 

@@ -6,7 +6,6 @@ import json
 import os
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,9 @@ from ftlm import _core
 from ftlm.cli.options import StructureOptions
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.profile import Valley, profiled
 from ftlm.fit.race import distinct, without_vanished
 from ftlm.fit.simpler import whole
 from ftlm.fit.steady import dissipative, forced, grows, nearest_stable
-from ftlm.identification.intervals import valley_of
 from measured import DATA, needs_data
 
 ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}
@@ -302,20 +299,3 @@ def test_starts_that_came_to_one_optimum_go_on_as_one_and_stay_counted() -> None
     assert [(a.origin, a.alike) for a in kept] == [("a", ("b", "d")), ("c", ())]
     assert reached[0].alike == ()
     assert [(a.origin, a.alike) for a in distinct([ended(1.0, 0.5, "e"), kept[1]])] == [("e", ("c",))]
-
-
-def test_a_valley_is_looked_at_on_the_coarsest_grid_that_noise_hides() -> None:
-    run = swing(-0.5, noise=0.1)
-    found = ftlm.identify(run, ftlm.equation("D^2 y = a y + d D y + b u"), threads=1, intervals="quadratic")
-    assert found.joint is not None
-    assert found.joint.unnoticed < found.joint.refinement
-    coarse = valley_of(found)
-    problem, runs = coarse.grid.problem, coarse.grid.runs
-    fine = Valley.of(replace(found.joint, unnoticed=found.joint.refinement), problem, runs)
-    assert (coarse.grid.every, fine.grid.every) == (found.joint.unnoticed, found.joint.refinement)
-    for valley in (coarse, fine):
-        np.testing.assert_allclose(valley.best.values + valley.shift, found.joint.values, rtol=1e-9)
-    (one, two) = (profiled(v, v.names, 0.95).intervals for v in (coarse, fine))
-    for name, error in found.joint.standard_errors.items():
-        assert one[name].low == pytest.approx(two[name].low, abs=0.02 * error)
-        assert one[name].high == pytest.approx(two[name].high, abs=0.02 * error)

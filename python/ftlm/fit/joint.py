@@ -65,8 +65,6 @@ class JointFit:
         Number of residuals, of samples that were read.
     refinement
         Pulses a sample interval on the finest grid; the estimates are the limit that it and the next coarser one tell.
-    unnoticed
-        Pulses a sample interval from which on halving the step moves samples by less than noise shows.
     settled
         Whether halving the step moved no estimate by a tenth of its standard error.
     converged
@@ -118,7 +116,6 @@ class JointFit:
     origin: str = "the start that was given"
     profiles: Mapping[str, ProfileInterval] = field(default_factory=dict)
     growth: Growth | None = None
-    unnoticed: int = FINEST
 
     @property
     def choice(self) -> str:
@@ -224,14 +221,13 @@ def fit_output_error(
     # Where a step passes faster than the samples see, a grid as coarse as the samples has an optimum of its own.
     while weighed.every < FINEST and weighed.matters(contenders[0]):
         weighed = weighed.finer
-    unnoticed = weighed.every
     best = weighed.descend(winner(contenders, replace(alike, every=weighed.every)), LAST_LAP)
     best, weighed = with_settled_weights(best, weighed, loss)
     best, weighed, growth = steadied(best, weighed, reached)
     if growth is not None and not growth.kept:
         best, weighed = with_settled_weights(best, weighed, loss)
     optimum = refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True)
-    return replace(joint_fit(optimum, starts), growth=growth, unnoticed=unnoticed)
+    return replace(joint_fit(optimum, starts), growth=growth)
 
 
 def given(problem: FreeProblem, values: Mapping[str, float]) -> Attempt:

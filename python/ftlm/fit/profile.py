@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Any
 
@@ -73,7 +73,7 @@ class _LowerError(Exception):
 
 @dataclass(frozen=True)
 class Valley:
-    """The cost of a joint fit around its optimum, on one of its grids.
+    """The cost of a joint fit around its optimum, on its last grid.
 
     Parameters
     ----------
@@ -97,20 +97,12 @@ class Valley:
 
     @classmethod
     def of(cls, joint: JointFit, problem: FreeProblem, runs: Sequence[Run]) -> Valley:
-        """The valley in which a fit ended, on the coarsest grid whose step noise hides and whose optimum is its own."""
+        """The valley in which a fit ended."""
         weights = [1.0 / max(joint.noise[o], 1e-300) for o in problem.structure.outputs]
         # Where a growing optimum was left, its valley is not this one.
         steady = joint.growth is not None and not joint.growth.kept
-        last = Grid(problem, runs, weights, joint.refinement, shares=joint.shares, steady=steady)
-        if joint.unnoticed < joint.refinement:
-            try:
-                coarse = cls.at(replace(last, every=joint.unnoticed), joint.on_grid, np.zeros(len(joint.names)))
-            except FtlmError:
-                # It has no finite free run there.
-                return cls.at(last, joint.on_grid, joint.values - joint.on_grid)
-            if np.all(np.abs(coarse.best.values - joint.on_grid) <= coarse.errors):
-                return replace(coarse, shift=joint.values - coarse.best.values)
-        return cls.at(last, joint.on_grid, joint.values - joint.on_grid)
+        grid = Grid(problem, runs, weights, joint.refinement, shares=joint.shares, steady=steady)
+        return cls.at(grid, joint.on_grid, joint.values - joint.on_grid)
 
     @classmethod
     def at(cls, grid: Grid, values: Floats, shift: Floats) -> Valley:

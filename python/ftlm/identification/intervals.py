@@ -50,7 +50,7 @@ def with_intervals(
             # No finite free run where the weights of the last descent are taken anew: what is known stays.
             return joint, warnings
         names = valley.names if intervals == "profile" else bent_numbers(valley, PRINTED)
-        pulses, least = joint.samples * valley.grid.every, FEWEST * 2 * len(names)
+        pulses, least = joint.samples * joint.refinement, FEWEST * 2 * len(names)
         allowed = (UNASKED - spent) // pulses
         if intervals == "auto" and least > STRETCH * allowed:
             found = Profiles({}, None, tuple(names))
