@@ -14,6 +14,7 @@ import argparse
 import statistics
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -97,20 +98,26 @@ def sledge(seed: int, noise: float, rows: int = 601) -> ftlm.Run:
                                 name=f"sledge {seed}")  # fmt: skip
 
 
+def covered(
+    structure: ftlm.Structure, records: Iterable[list[ftlm.Run]], truth: dict[str, float]
+) -> tuple[np.ndarray, str, list[float]]:
+    """Scores of fits to each of some records, how many intervals hold the truth, and processor time of each."""
+    scores, inside, taken = [], [], []
+    for runs in records:
+        begun = time.process_time()
+        found = ftlm.identify(runs, structure, threads=1)
+        taken.append(time.process_time() - begun)
+        scores.append([(found.coefficients[n] - v) / found.standard_errors[n] for n, v in truth.items()])
+        inside.append([found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in truth.items()])
+    counts = ", ".join(f"{n} {c}" for n, c in zip(truth, np.sum(inside, axis=0), strict=True))
+    return np.array(scores), counts, taken
+
+
 def stribeck(seeds: int) -> None:
     """Coverage of 95 % intervals of a body that sticks and slips, a run a fit."""
     structure = ftlm.equation(SLEDGE, initial="rest")
     for noise in (0.002, 0.005, 0.02):
-        scores, inside, taken = [], [], []
-        for seed in range(seeds):
-            run = sledge(seed, noise)
-            begun = time.process_time()
-            found = ftlm.identify(run, structure, threads=1)
-            taken.append(time.process_time() - begun)
-            scores.append([(found.coefficients[n] - v) / found.standard_errors[n] for n, v in STICKS.items()])
-            inside.append([found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in STICKS.items()])
-        z = np.array(scores)
-        counts = ", ".join(f"{n} {c}" for n, c in zip(STICKS, np.sum(inside, axis=0), strict=True))
+        z, counts, taken = covered(structure, ([sledge(seed, noise)] for seed in range(seeds)), STICKS)
         mean = ", ".join(f"{v:+.2f}" for v in z.mean(axis=0))
         print(f"| {noise:g} | {counts} of {seeds} | {mean} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
               flush=True)  # fmt: skip
@@ -136,19 +143,11 @@ def coupled(seeds: int) -> None:
     """Coverage of 95 % intervals of a hub that sticks and its link: one run from rest, two in motion with offsets."""
     for noise, moving in ((0.003, False), (0.02, False), (0.003, True)):
         more = {"initial": "caputo", "offset": "constant"} if moving else {"initial": "rest"}
-        scores, inside, taken = [], [], []
-        for seed in range(seeds):
-            runs = [arm(seed, noise)]
-            if moving:
-                pairs = ((0.5, (0.2, 0.8, 0.02, -0.1)), (-0.3, (0.0, 0.0, 0.03, 0.0)))
-                runs = [arm(2 * seed + k, noise, offset=o, start=s) for k, (o, s) in enumerate(pairs)]
-            begun = time.process_time()
-            found = ftlm.identify(runs, ftlm.equation(ARM, **more), threads=1)
-            taken.append(time.process_time() - begun)
-            scores.append([(found.coefficients[n] - v) / found.standard_errors[n] for n, v in ARM_TRUTH.items()])
-            inside.append([found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in ARM_TRUTH.items()])
-        z = np.array(scores)
-        counts = ", ".join(f"{n} {c}" for n, c in zip(ARM_TRUTH, np.sum(inside, axis=0), strict=True))
+        pairs = ((0.5, (0.2, 0.8, 0.02, -0.1)), (-0.3, (0.0, 0.0, 0.03, 0.0)))
+        moved = ([arm(2 * seed + k, noise, offset=o, start=s) for k, (o, s) in enumerate(pairs)]
+                 for seed in range(seeds))  # fmt: skip
+        still = ([arm(seed, noise)] for seed in range(seeds))
+        z, counts, taken = covered(ftlm.equation(ARM, **more), moved if moving else still, ARM_TRUTH)
         kind = "two runs in motion, offsets" if moving else "one run from rest"
         print(f"| {noise:g} | {kind} | {counts} of {seeds} | "
               f"{np.abs(z).max():.2f} | {statistics.median(taken):.2g} |", flush=True)  # fmt: skip
@@ -159,16 +158,7 @@ def two(seeds: int) -> None:
     truth = {**two_frictions.TRUTH, **two_frictions.STRENGTH}
     for start in ((0.0,) * 4, (0.2, 0.8, -0.1, -0.6)):
         structure = ftlm.equation(two_frictions.WORDS, initial="caputo" if any(start) else "rest")
-        scores, inside, taken = [], [], []
-        for seed in range(seeds):
-            run = two_frictions.noisy(seed, start)
-            begun = time.process_time()
-            found = ftlm.identify(run, structure, threads=1)
-            taken.append(time.process_time() - begun)
-            scores.append([(found.coefficients[n] - v) / found.standard_errors[n] for n, v in truth.items()])
-            inside.append([found.intervals[n][0] <= v <= found.intervals[n][1] for n, v in truth.items()])
-        z = np.array(scores)
-        counts = ", ".join(f"{n} {c}" for n, c in zip(truth, np.sum(inside, axis=0), strict=True))
+        z, counts, taken = covered(structure, ([two_frictions.noisy(seed, start)] for seed in range(seeds)), truth)
         kind = "in motion" if any(start) else "from rest"
         print(f"| {kind} | {counts} of {seeds} | {np.abs(z).max():.2f} | {statistics.median(taken):.2g} |",
               flush=True)  # fmt: skip
