@@ -2,14 +2,16 @@
 //! runs.
 //!
 //! The outputs follow from the equations as every linear free run does, friction being one more input once it is known. The
-//! velocities obey the same equations, all that drives them differentiated once. At an edge the velocity of a body that
-//! may stick is what the pulses before it add up to there, exactly for what is constant within each.
+//! velocities obey the same equations, all that drives them differentiated once, and so do their values at the edges of
+//! the pulses: what drives them is there what its pulses add up to, exactly for what is constant within each, and they
+//! themselves are lines between edges, whose integrals have the kernels of pulse means
+//! ([`crate::kernels::block_pulse_kernel`]). So a body feels at once what carries it, friction of the pulse included.
 
-use super::integrals::{edge_kernel, product, Driver, Integrated};
+use super::integrals::{product, Driver, Integrated};
 use super::law::Law;
 use super::march::{March, Trace};
 use super::online::Heads;
-use super::pulses::Rubbing;
+use super::pulses::{is_p_matrix, Rubbing};
 use super::states::{Forcing, Link};
 use crate::equation::{Equation, Initial, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, Error, Result};
@@ -23,7 +25,8 @@ use crate::small;
 /// Equations that follow each other's outputs, some of them with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Body {
-    /// D^α y = Σ c D^ν s; of those with friction 1 < α ≤ 2, and orders of every signal below α.
+    /// D^α y = Σ c D^ν s; of those with friction 1 < α ≤ 2. Orders of inputs are below α; other bodies may lean on
+    /// accelerations.
     pub equations: Vec<Equation>,
     /// Which of them have friction, and F of − F(Dy) sgn(Dy).
     pub frictions: Vec<(usize, Law)>,
@@ -94,21 +97,44 @@ impl Body {
             }
         }
         for (i, Equation { structure, .. }) in self.equations.iter().enumerate() {
-            // What drives another body must not jump in its velocity; other bodies may lean on accelerations.
+            // An input must not jump in a velocity; other bodies, which it moves, may lean on each other's accelerations.
             let above = |order: f64| order >= structure.order - ORDER_GRAIN;
-            let rubs = self.frictions.iter().any(|f| f.0 == i);
-            let wrong = |signal: usize| rubs || self.place(signal).is_none();
-            match structure.terms.iter().find(|t| above(t.order) && wrong(t.signal)) {
-                Some(term) if rubs => {
-                    return refuse("order beside friction", term.order, "below that of the body", "lower it")
-                }
-                Some(term) => {
-                    return refuse("order of what drives a body", term.order, "below that of the body", "lower it")
-                }
-                None => {}
+            if let Some(term) = structure.terms.iter().find(|t| above(t.order) && self.place(t.signal).is_none()) {
+                let rubs = self.frictions.iter().any(|f| f.0 == i);
+                let name = if rubs { "order beside friction" } else { "order of what drives a body" };
+                return refuse(name, term.order, "below that of the body", "lower it");
             }
         }
-        check_regular(&self.equations)
+        check_regular(&self.equations)?;
+        self.check_yields()
+    }
+
+    /// Refuses accelerations that bodies hand each other by which a force on one would move it against the force, so that
+    /// what friction does has no one answer. Orders above a body's own are left to the grid, which sees the same.
+    fn check_yields(&self) -> Result<()> {
+        let (n, sticks, links) = (self.equations.len(), self.sticks(), self.links());
+        if sticks.len() < 2 || links.iter().flatten().any(|link| link.integration < -ORDER_GRAIN) {
+            return Ok(());
+        }
+        let mut matrix = vec![0.0; n * n];
+        for (i, row) in links.iter().enumerate() {
+            matrix[i * n + i] = 1.0;
+            for link in row.iter().filter(|link| link.integration.abs() < ORDER_GRAIN) {
+                matrix[i * n + link.output] -= link.coefficient;
+            }
+        }
+        let inverse = small::inverse(&matrix, n)?;
+        let moved: Vec<f64> =
+            sticks.iter().flat_map(|&a| sticks.iter().map(move |&b| (a, b))).map(|(a, b)| inverse[a * n + b]).collect();
+        if is_p_matrix(&moved, sticks.len()) {
+            return Ok(());
+        }
+        Err(Error::Structure {
+            what: "bodies with friction hand each other so much of their accelerations that a force on one moves it \
+                   against the force"
+                .into(),
+            remedy: "make the coefficients of each other's accelerations smaller, as those of inertias are".into(),
+        })
     }
 
     /// Equations with friction.
@@ -155,7 +181,7 @@ impl Body {
             check_finite("coefficients of the initial terms", &values)?;
             Initial::Powers(exponents).check()?;
         }
-        let forcing = Forcing::of(&powers, &self.links(), &self.sticks(), record.m(), record.step())?;
+        let forcing = Forcing::of(&powers, &self.links(), record.m(), record.step())?;
         let mut run = Run::new(self, &Operators::new(self, record)?, &forcing)?;
         add_impulses(&mut run.outputs, &impulses, record.step());
         Ok(Motion { outputs: run.outputs, bodies: run.march.bodies })
@@ -181,17 +207,14 @@ pub(super) struct Operators {
     pub(super) drivers: Vec<Vec<Option<(Driver, Kernel)>>>,
     /// Each driver's signal, integrated.
     pub(super) driven: Vec<Vec<Option<Integrated>>>,
-    /// Kernel of each term of a followed output on means and, in the body's equation, at edges, with slopes.
-    pub(super) own: Vec<Vec<Option<[Vec<f64>; 4]>>>,
+    /// Kernel of each term of a followed output, on means and at edges, and its slope.
+    pub(super) own: Vec<Vec<Option<[Vec<f64>; 2]>>>,
     /// A of A y = b.
     matrix: Vec<Vec<Vec<f64>>>,
     /// Spectra of A⁻¹.
     inverse: Vec<Vec<Kernel>>,
     /// Inverse of A's leading coefficients.
     leading: Vec<f64>,
-    /// Of each body that may stick, the spectrum of what velocities of each output add to its own at edges, where they
-    /// add something.
-    edges: Vec<Vec<Option<Kernel>>>,
     /// Kernels of friction, of each body that may stick.
     pub(super) frictions: Vec<Driver>,
     /// What a pulse of force on each body (columns) does to the velocity of each (rows) at the ends of pulses.
@@ -205,11 +228,9 @@ impl Operators {
     pub(super) fn new(body: &Body, record: &Record) -> Result<Self> {
         let (m, step, n, sticks) = (record.m(), record.step(), body.equations.len(), body.sticks());
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];
-        let mut own_edges: Vec<Vec<Option<Vec<f64>>>> = vec![vec![None; n]; sticks.len()];
         let (mut drivers, mut driven, mut own) = (Vec::new(), Vec::new(), Vec::new());
         for (i, Equation { structure, coefficients }) in body.equations.iter().enumerate() {
             matrix[i][i][0] = 1.0;
-            let rubs = sticks.iter().position(|&b| b == i);
             let (mut row_drivers, mut row_driven, mut row_own) = (Vec::new(), Vec::new(), Vec::new());
             for (term, &c) in structure.terms.iter().zip(coefficients) {
                 let eta = structure.order - term.order;
@@ -218,18 +239,13 @@ impl Operators {
                     return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
                 }
                 if let Some(j) = body.place(term.signal) {
-                    let means = kernel_and_slope(eta, m, step);
-                    matrix[i][j].iter_mut().zip(&means.0).for_each(|(a, v)| *a -= c * v);
-                    let edges = if rubs.is_some() { edge_kernel(eta, m, step) } else { (Vec::new(), Vec::new()) };
-                    if let Some(own_edges) = rubs.map(|a| &mut own_edges[a]) {
-                        let sum = own_edges[j].get_or_insert_with(|| vec![0.0; m]);
-                        sum.iter_mut().zip(&edges.0).for_each(|(e, v)| *e += c * v);
-                    }
-                    row_own.push(Some([means.0, means.1, edges.0, edges.1]));
+                    let (kernel, slope) = kernel_and_slope(eta, m, step);
+                    matrix[i][j].iter_mut().zip(&kernel).for_each(|(a, v)| *a -= c * v);
+                    row_own.push(Some([kernel, slope]));
                     row_drivers.push(None);
                     row_driven.push(None);
                 } else {
-                    let driver = Driver::new(eta, m, step, rubs.is_some());
+                    let driver = Driver::new(eta, m, step);
                     let signal = Kernel::new(record.signal(term.signal));
                     row_driven.push(Some(driver.of(&signal, 0)));
                     row_drivers.push(Some((driver, signal)));
@@ -243,29 +259,19 @@ impl Operators {
         let leading: Vec<f64> = matrix.iter().flatten().map(|a| a.first().copied().unwrap_or(0.0)).collect();
         let leading = small::inverse(&leading, n)?;
         let inverse = Solver::new(&matrix)?.inverse_spectra(2 * m)?;
-        let edges = own_edges.iter().map(|row| row.iter().map(|e| e.as_deref().map(Kernel::new)).collect()).collect();
         let frictions: Vec<Driver> =
-            sticks.iter().map(|&b| Driver::new(body.equations[b].structure.order, m, step, true)).collect();
+            sticks.iter().map(|&b| Driver::new(body.equations[b].structure.order, m, step)).collect();
         let count = sticks.len();
-        let (responses, gains) = (Vec::new(), vec![0.0; count * count]);
-        let mut made =
-            Self { drivers, driven, own, matrix, inverse, leading, edges, frictions, responses, gains, sticks };
+        let mut gains = vec![0.0; count * count];
         let mut responses: Vec<Vec<Heads>> = (0..count).map(|_| Vec::with_capacity(count)).collect();
-        for b in 0..count {
-            let mut pulse = vec![Vec::new(); n];
-            pulse[made.sticks[b]].clone_from(&made.frictions[b].velocity[0]);
-            let through = made.through(&pulse);
+        for (b, friction) in frictions.iter().enumerate() {
             for (a, row) in responses.iter_mut().enumerate() {
-                let mut response = made.at_edges(a, &through, m);
-                if let Some(kernels) = made.frictions[b].edges.as_ref().filter(|_| a == b) {
-                    response.iter_mut().zip(&kernels[0]).for_each(|(g, v)| *g += v);
-                }
-                made.gains[a * count + b] = response.first().copied().unwrap_or(0.0);
+                let response = product(&inverse[sticks[a]][sticks[b]], &friction.edges[0]);
+                gains[a * count + b] = response.first().copied().unwrap_or(0.0);
                 row.push(Heads::new(&response));
             }
         }
-        made.responses = responses;
-        Ok(made)
+        Ok(Self { drivers, driven, own, matrix, inverse, leading, frictions, responses, gains, sticks })
     }
 
     /// A⁻¹ of right-hand sides, empty ones being zero.
@@ -277,42 +283,32 @@ impl Operators {
         self.inverse.iter().map(of).collect()
     }
 
-    /// What velocities of all outputs add to that of a body that may stick at the ends of pulses.
-    pub(super) fn at_edges(&self, body: usize, velocities: &[Vec<f64>], m: usize) -> Vec<f64> {
-        let mut out = vec![0.0; m];
-        for (kernel, velocity) in self.edges[body].iter().zip(velocities) {
-            if let Some(kernel) = kernel {
-                out.iter_mut().zip(product(kernel, velocity)).for_each(|(s, v)| *s += v);
+    /// Velocities at the ends of pulses of the bodies that may stick, without their friction.
+    pub(super) fn at_edges(&self, total: &Forcing) -> Vec<Vec<f64>> {
+        let of = |&b: &usize| {
+            let mut out = vec![total.start[b]; total.edges[b].len()];
+            for (kernel, edges) in self.inverse[b].iter().zip(&total.edges) {
+                out.iter_mut().zip(product(kernel, edges)).for_each(|(s, v)| *s += v);
             }
-        }
-        out
+            out
+        };
+        self.sticks.iter().map(of).collect()
     }
 
     /// Derivative of the first number of a body's response to its own friction from those of its α (`turn`) and of each
     /// own term of each equation: (coefficient's, integration's).
     pub(super) fn first_slope(&self, body: &Body, which: usize, turn: f64, moves: &[Vec<(f64, f64)>]) -> f64 {
-        let friction = &self.frictions[which];
-        let Some(kernels) = &friction.edges else { return 0.0 };
         let (n, b) = (self.matrix.len(), self.sticks[which]);
-        let (through, through_slope) = (friction.velocity[0][0], turn * friction.velocity[1][0]);
-        // First numbers of the velocities that a pulse of force gives, and of the system's slope times them.
-        let velocities: Vec<f64> = (0..n).map(|j| self.leading[j * n + b] * through).collect();
-        let mut rhs = vec![0.0; n];
-        rhs[b] = through_slope;
-        let (mut edge, mut edge_slope) = (vec![0.0; n], 0.0);
+        let [first, first_slope] = [0, 1].map(|k| self.frictions[which].edges[k].first().copied().unwrap_or(0.0));
+        let mut moved = 0.0;
         for (i, Equation { structure, coefficients }) in body.equations.iter().enumerate() {
             for (k, (own, &c)) in self.own[i].iter().zip(coefficients).enumerate() {
-                let (Some([mean, mean_slope, end, end_slope]), (dc, deta)) = (own, moves[i][k]) else { continue };
+                let (Some([kernel, slope]), (dc, deta)) = (own, moves[i][k]) else { continue };
                 let Some(j) = body.place(structure.terms[k].signal) else { continue };
-                rhs[i] += (dc * mean[0] + c * deta * mean_slope[0]) * velocities[j];
-                if i == b {
-                    edge[j] += c * end[0];
-                    edge_slope += (dc * end[0] + c * deta * end_slope[0]) * velocities[j];
-                }
+                moved += self.leading[b * n + i] * (dc * kernel[0] + c * deta * slope[0]) * self.leading[j * n + b];
             }
         }
-        let moved: f64 = (0..n).map(|j| edge[j] * (0..n).map(|i| self.leading[j * n + i] * rhs[i]).sum::<f64>()).sum();
-        turn * kernels[1][0] + edge_slope + moved
+        moved * first + turn * self.leading[b * n + b] * first_slope
     }
 }
 
@@ -321,8 +317,8 @@ pub(super) struct Run {
     pub(super) outputs: Vec<Vec<f64>>,
     /// Those of the bodies that may stick as the equations have them, without what [`at_rest`] takes away.
     pub(super) solved: Vec<Vec<f64>>,
-    /// Pulse means of the velocities.
-    pub(super) velocities: Vec<Vec<f64>>,
+    /// Velocities at the ends of pulses, less those at the start.
+    pub(super) moved: Vec<Vec<f64>>,
     pub(super) march: March,
     /// Spectra of the frictions.
     pub(super) forces: Vec<Kernel>,
@@ -339,24 +335,23 @@ impl Run {
             }
         }
         let m = total.output.first().map_or(0, Vec::len);
-        let driven = operators.through(&total.velocity);
-        let linear: Vec<Vec<f64>> = (total.edges.iter().enumerate())
-            .map(|(a, edges)| operators.at_edges(a, &driven, m).iter().zip(edges).map(|(x, y)| x + y).collect())
-            .collect();
+        let linear = operators.at_edges(&total);
         if let Some(index) = linear.iter().find_map(|row| row.iter().position(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
         let laws = body.frictions.iter().map(|f| f.1).collect();
         let rubbing = Rubbing::new(laws, operators.gains.clone())?;
-        let march = March::new(&linear, &operators.responses, rubbing, &total.start);
+        let start: Vec<f64> = operators.sticks.iter().map(|&b| total.start[b]).collect();
+        let march = March::new(&linear, &operators.responses, rubbing, &start);
         if let Some(index) = march.bodies.iter().find_map(|x| x.edges.iter().position(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
-        // What friction holds back though nothing else would is a difference of two large numbers.
+        // What friction holds back though nothing else would is a difference of two large numbers, which its own size
+        // does not show: nothing is left of it but their rounding.
         let largest = |values: &[f64]| values.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-        for (a, (row, moved)) in linear.iter().zip(&march.bodies).enumerate() {
-            let held = march.rubbing().breakaway(a) * march.rubbing().own(a);
-            if largest(row) > LOST * (largest(&moved.edges) + held) {
+        let drives = total.edges.iter().chain([&total.start]).map(|row| largest(row)).fold(0.0, f64::max);
+        for (a, row) in linear.iter().enumerate() {
+            if largest(row) > LOST * (drives + march.rubbing().breakaway(a) * march.rubbing().own(a)) {
                 return Err(Error::Diverged { what: "free run without its friction".into(), index: row.len() });
             }
         }
@@ -364,7 +359,7 @@ impl Run {
         for ((&b, friction), force) in operators.sticks.iter().zip(&operators.frictions).zip(&forces) {
             let held = friction.of(force, 0);
             total.output[b].iter_mut().zip(&held.output).for_each(|(b, v)| *b -= v);
-            total.velocity[b].iter_mut().zip(&held.velocity).for_each(|(b, v)| *b -= v);
+            total.edges[b].iter_mut().zip(&held.edges).for_each(|(b, v)| *b -= v);
         }
         let alone = body.equations.len() == 1;
         let mut outputs = if alone && march.bodies.iter().all(Trace::is_still) {
@@ -385,8 +380,8 @@ impl Run {
         if let Some(index) = outputs.iter().find_map(|y| y.iter().position(|v| !v.is_finite())) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
-        let velocities = operators.through(&total.velocity);
-        Ok(Self { outputs, solved, velocities, march, forces })
+        let moved = operators.through(&total.edges);
+        Ok(Self { outputs, solved, moved, march, forces })
     }
 }
 
@@ -406,5 +401,5 @@ pub(super) fn at_rest(output: &mut [f64], body: &Trace) {
     }
 }
 
-/// Ratio of the velocities without and with friction beyond which their difference has lost half of its digits.
+/// How much larger than what drives a body its velocity without friction may become: of sixteen digits eight are left.
 const LOST: f64 = 1e8;

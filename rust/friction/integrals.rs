@@ -1,4 +1,4 @@
-//! Signals integrated by any order: pulse means on the levels of an output and of its velocity, and values at edges.
+//! Signals integrated by any order: pulse means on the level of an output, and its velocity at edges.
 
 use crate::excess::kernel_and_slope;
 use crate::kernels::digamma;
@@ -27,40 +27,36 @@ pub(super) fn edge_kernel(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f64>)
 /// Below this integration a signal shows at an edge as the pulses on either side have it.
 const SEEN_AT_ONCE: f64 = 1e-6;
 
-/// A signal integrated as its term asks on all three levels, or the slope of that with respect to the order.
+/// A signal integrated as its term asks, or the slope of that with respect to the order.
 #[derive(Debug, Clone)]
 pub(super) struct Integrated {
+    /// Pulse means on the level of the output.
     pub(super) output: Vec<f64>,
-    pub(super) velocity: Vec<f64>,
+    /// The velocity at the ends of pulses.
     pub(super) edges: Vec<f64>,
 }
 
 /// Kernels of a signal that drives the body, integrated by η on the level of the output: values and slopes.
 pub(super) struct Driver {
     pub(super) output: [Vec<f64>; 2],
-    pub(super) velocity: [Vec<f64>; 2],
-    pub(super) edges: Option<[Vec<f64>; 2]>,
+    /// What a pulse does at the ends of pulses; of a signal that shows at once, to means.
+    pub(super) edges: [Vec<f64>; 2],
+    at_once: bool,
 }
 
 impl Driver {
-    pub(super) fn new(eta: f64, m: usize, step: f64, seen: bool) -> Self {
-        let (output, velocity) = (kernel_and_slope(eta, m, step), kernel_and_slope(eta - 1.0, m, step));
-        let edges = (seen && eta - 1.0 > SEEN_AT_ONCE).then(|| edge_kernel(eta - 1.0, m, step));
-        Self {
-            output: [output.0, output.1],
-            velocity: [velocity.0, velocity.1],
-            edges: edges.map(|(value, slope)| [value, slope]),
-        }
+    pub(super) fn new(eta: f64, m: usize, step: f64) -> Self {
+        let output = kernel_and_slope(eta, m, step);
+        let at_once = eta - 1.0 <= SEEN_AT_ONCE;
+        let edges = if at_once { kernel_and_slope(eta - 1.0, m, step) } else { edge_kernel(eta - 1.0, m, step) };
+        Self { output: [output.0, output.1], edges: [edges.0, edges.1], at_once }
     }
 
     /// The signal through the kernels (0) or their slopes (1).
     pub(super) fn of(&self, signal: &Kernel, which: usize) -> Integrated {
-        let velocity = product(signal, &self.velocity[which]);
-        let edges = match &self.edges {
-            Some(kernels) => product(signal, &kernels[which]),
-            None => at_edges(&velocity),
-        };
-        Integrated { output: product(signal, &self.output[which]), velocity, edges }
+        let edges = product(signal, &self.edges[which]);
+        let edges = if self.at_once { between(&edges) } else { edges };
+        Integrated { output: product(signal, &self.output[which]), edges }
     }
 }
 
@@ -72,7 +68,7 @@ pub(super) fn product(cached: &Kernel, series: &[f64]) -> Vec<f64> {
 }
 
 /// Values at the ends of the pulses from means: those on either side, the last extended.
-fn at_edges(means: &[f64]) -> Vec<f64> {
+fn between(means: &[f64]) -> Vec<f64> {
     let m = means.len();
     let mut out: Vec<f64> = means.windows(2).map(|pair| 0.5 * (pair[0] + pair[1])).collect();
     let last = means.last().copied().unwrap_or(0.0);

@@ -233,7 +233,7 @@ impl FrictionModel {
     fn forcing(&self, orders: &[f64], coefficients: &[f64], values: &[f64], record: &Record) -> Result<Forcing> {
         let body = self.body(orders, coefficients);
         let (powers, _) = parted(&self.powers(orders, coefficients, values));
-        Forcing::of(&powers, &body.links(), &body.sticks(), record.m(), record.step())
+        Forcing::of(&powers, &body.links(), record.m(), record.step())
     }
 
     /// The record as its inputs act, none where that is as they are, and how these move with their free numbers.
@@ -373,15 +373,11 @@ impl FrictionModel {
                 add(b, -alphas[b], &friction.of(force, 1));
             }
         }
-        let through = operators.through(&total.velocity);
-        let at_ends: Vec<Vec<f64>> = (total.edges.iter().enumerate())
-            .map(|(a, edges)| {
-                operators.at_edges(a, &through, record.m()).iter().zip(edges).map(|(x, y)| x + y).collect()
-            })
-            .collect();
+        let at_ends = operators.at_edges(&total);
+        let start: Vec<f64> = sticks.iter().map(|&b| total.start[b]).collect();
         let first: Vec<f64> =
             sticks.iter().enumerate().map(|(a, &b)| operators.first_slope(body, a, alphas[b], &moves)).collect();
-        let forces = motion.march.slope(&at_ends, &operators.responses, &first, &frictions, &total.start);
+        let forces = motion.march.slope(&at_ends, &operators.responses, &first, &frictions, &start);
         for ((&b, friction), force) in sticks.iter().zip(&operators.frictions).zip(forces.iter().flatten()) {
             let held = friction.of(&Kernel::new(force), 0);
             total.output[b].iter_mut().zip(&held.output).for_each(|(s, v)| *s -= v);
@@ -425,8 +421,7 @@ impl FrictionModel {
     /// How what a run starts with moves: it is linear in states and coefficients, and smooth in orders.
     fn forcing_slope(&self, point: &Point, values: &[f64], record: &Record, moved: &Moved) -> Result<Forcing> {
         let idle = values.is_empty() || values.iter().all(|x| *x == 0.0);
-        let sticks: Vec<usize> = self.frictions.iter().map(|f| f.0).collect();
-        let none = || Ok(Forcing::none(record.m(), self.equations.len(), &sticks));
+        let none = || Ok(Forcing::none(record.m(), self.equations.len()));
         match *moved {
             Moved::State(_, state) => {
                 let unit: Vec<f64> = (0..values.len()).map(|k| if k == state { 1.0 } else { 0.0 }).collect();
@@ -447,11 +442,9 @@ impl FrictionModel {
                     self.forcing(&point.orders, &shifted, values, record)
                 };
                 let size = point.coefficients[j].abs().max(1.0);
-                if self.equations.len() == 1 {
-                    return Ok(difference(&at(size)?, &at(0.0)?, size));
-                }
-                // Levels of outputs that feed through at once are no linear function of coefficients.
-                Ok(difference(&at(SHIFT * size)?, &at(-SHIFT * size)?, 2.0 * SHIFT * size))
+                // Of one equation no more than a square; levels and velocities that feed through others at once are none.
+                let by = if self.equations.len() == 1 { size } else { SHIFT * size };
+                Ok(difference(&at(by)?, &at(-by)?, 2.0 * by))
             }
             Moved::Order(j) => {
                 let shifted = |by: f64| {
@@ -498,7 +491,7 @@ fn difference(up: &Forcing, down: &Forcing, step: f64) -> Forcing {
     out
 }
 
-/// Spectra of outputs and velocities, which terms of them take in.
+/// Spectra of outputs, and of velocities at edges, which terms of them take in.
 struct Spectra(Vec<(Kernel, Kernel)>);
 
 impl Spectra {
@@ -508,18 +501,12 @@ impl Spectra {
             let solved = sticks.iter().position(|&b| b == j).map_or(y, |a| &run.solved[a]);
             (Kernel::new(solved), Kernel::new(v))
         };
-        Self(run.outputs.iter().zip(&run.velocities).enumerate().map(of).collect())
+        Self(run.outputs.iter().zip(&run.moved).enumerate().map(of).collect())
     }
 
     /// Share of a term of an output through its kernels (0) or their slopes (1).
-    fn own(&self, output: usize, kernels: &[Vec<f64>; 4], which: usize) -> Integrated {
-        let [mean, mean_slope, end, end_slope] = kernels;
-        let (means, ends) = if which == 0 { (mean, end) } else { (mean_slope, end_slope) };
+    fn own(&self, output: usize, kernels: &[Vec<f64>; 2], which: usize) -> Integrated {
         let (position, velocity) = &self.0[output];
-        Integrated {
-            output: product(position, means),
-            velocity: product(velocity, means),
-            edges: if ends.is_empty() { Vec::new() } else { product(velocity, ends) },
-        }
+        Integrated { output: product(position, &kernels[which]), edges: product(velocity, &kernels[which]) }
     }
 }

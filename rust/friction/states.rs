@@ -24,42 +24,30 @@ pub(super) struct Link {
 pub(super) struct Forcing {
     /// Pulse means on the level of the output.
     pub(super) output: Vec<Vec<f64>>,
-    /// Pulse means on the level of the velocity.
-    pub(super) velocity: Vec<Vec<f64>>,
-    /// The same at the ends of the pulses, of each body that may stick.
+    /// At the ends of the pulses what drives a velocity on from where it starts.
     pub(super) edges: Vec<Vec<f64>>,
-    /// The velocities of these bodies at the start.
+    /// The velocities at the start.
     pub(super) start: Vec<f64>,
     /// The outputs at the start.
     pub(super) levels: Vec<f64>,
     m: usize,
-    /// Which bodies may stick.
-    sticks: Vec<usize>,
 }
 
 impl Forcing {
-    pub(super) fn none(m: usize, n: usize, sticks: &[usize]) -> Self {
+    pub(super) fn none(m: usize, n: usize) -> Self {
         let rows = vec![vec![0.0; m]; n];
-        Self {
-            output: rows.clone(),
-            velocity: rows,
-            edges: vec![vec![0.0; m]; sticks.len()],
-            start: vec![0.0; sticks.len()],
-            levels: vec![0.0; n],
-            m,
-            sticks: sticks.to_vec(),
-        }
+        Self { output: rows.clone(), edges: rows, start: vec![0.0; n], levels: vec![0.0; n], m }
     }
 
     /// The same size, nothing in it.
     pub(super) fn nothing(&self) -> Self {
-        Self::none(self.m, self.levels.len(), &self.sticks)
+        Self::none(self.m, self.levels.len())
     }
 
     /// Adds another one, weighted.
     pub(super) fn add(&mut self, weight: f64, other: &Self) {
-        let rows = self.output.iter_mut().chain(&mut self.velocity).zip(other.output.iter().chain(&other.velocity));
-        for (sum, part) in rows.chain(self.edges.iter_mut().zip(&other.edges)) {
+        let rows = self.output.iter_mut().chain(&mut self.edges).zip(other.output.iter().chain(&other.edges));
+        for (sum, part) in rows {
             sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
         }
         self.start.iter_mut().zip(&other.start).for_each(|(s, v)| *s += weight * v);
@@ -70,80 +58,82 @@ impl Forcing {
     pub(super) fn add_to(&mut self, equation: usize, weight: f64, part: &Integrated) {
         let add = |sum: &mut Vec<f64>, part: &[f64]| sum.iter_mut().zip(part).for_each(|(s, v)| *s += weight * v);
         add(&mut self.output[equation], &part.output);
-        add(&mut self.velocity[equation], &part.velocity);
-        if let Some(body) = self.sticks.iter().position(|&b| b == equation) {
-            add(&mut self.edges[body], &part.edges);
-        }
+        add(&mut self.edges[equation], &part.edges);
     }
 
     /// Powers of t on the level of the outputs, as (exponent, coefficient) by equation, beside terms of followed outputs.
     ///
     /// A level x₀ at the start is integrated by these terms, and so is the jump to it: to the velocity it is
-    /// c x₀ t^{η−1}/Γ(η).
+    /// c x₀ t^{η−1}/Γ(η). A velocity v₀ at the start is c v₀ t^η/Γ(η + 1) to the velocities that follow it.
     ///
     /// # Errors
     /// [`Error::OutOfRange`] for a power whose rate has no mean over the first pulse; [`Error::LeadingZero`] where the
-    /// levels at the start follow from no equation.
+    /// levels or velocities at the start follow from no equation.
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn of(
-        powers: &[Vec<(f64, f64)>],
-        links: &[Vec<Link>],
-        sticks: &[usize],
-        m: usize,
-        step: f64,
-    ) -> Result<Self> {
+    pub(super) fn of(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>], m: usize, step: f64) -> Result<Self> {
         let n = powers.len();
-        let mut out = Self::none(m, n, sticks);
-        out.levels = levels(powers, links)?;
+        let mut out = Self::none(m, n);
+        let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
+        out.levels = at_once(&powers.iter().map(constant).collect::<Vec<f64>>(), links)?;
+        let mut all = vec![Sum::default(); n];
         for (i, own) in powers.iter().enumerate() {
-            let body = sticks.iter().position(|&b| b == i);
-            let mut rates: Vec<(f64, f64, f64)> = Vec::new();
-            let mut rate =
-                |exponent: f64, value: f64| match rates.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN) {
-                    Some(known) => (known.1, known.2) = (known.1 + value, known.2.max(value.abs())),
-                    None => rates.push((exponent, value, value.abs())),
-                };
             for &(exponent, value) in own {
                 if value != 0.0 {
-                    let means =
-                        if body.is_some() { power_means(exponent, m, step) } else { means_of(exponent, m, step) };
+                    let means = means_of(exponent, m, step);
                     out.output[i].iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
                 }
                 if exponent.abs() >= ORDER_GRAIN {
-                    rate(exponent - 1.0, value * exponent);
+                    all[i].add(exponent - 1.0, value * exponent);
                 }
             }
             for link in links[i].iter().filter(|link| link.integration.abs() >= ORDER_GRAIN) {
                 let eta = link.integration;
-                rate(eta - 1.0, link.coefficient * out.levels[link.output] / libm::tgamma(eta));
+                all[i].add(eta - 1.0, link.coefficient * out.levels[link.output] / libm::tgamma(eta));
             }
-            for (exponent, value, largest) in rates {
-                // What a jump adds and an initial term takes away again is nothing, but for rounding.
-                if value.abs() <= 1e-13 * largest {
-                    continue;
-                }
-                if exponent <= -1.0 {
-                    return Err(Error::OutOfRange {
-                        name: "exponent of an initial term".into(),
-                        value: exponent + 1.0,
-                        range: "(0, ∞) or 0".into(),
-                        remedy:
-                            "a level that a term above its equation's order differentiates needs that term's power of \
-                                 t beside it; start at rest, or let the start be found"
-                                .into(),
-                    });
-                }
-                let means = if body.is_some() { power_means(exponent, m, step) } else { means_of(exponent, m, step) };
-                out.velocity[i].iter_mut().zip(means).for_each(|(s, v)| *s += value * v);
-                let Some(body) = body else { continue };
+            if let Some((exponent, _)) = all[i].powers().find(|power| power.0 <= -1.0) {
+                return Err(Error::OutOfRange {
+                    name: "exponent of an initial term".into(),
+                    value: exponent + 1.0,
+                    range: "(0, ∞) or 0".into(),
+                    remedy: "a level that a term above its equation's order differentiates needs that term's power of \
+                             t beside it; start at rest, or let the start be found"
+                        .into(),
+                });
+            }
+        }
+        let given: Vec<f64> =
+            all.iter().map(|own| own.powers().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum()).collect();
+        out.start = at_once(&given, links)?;
+        for (i, own) in all.iter_mut().enumerate() {
+            own.add(0.0, -out.start[i]);
+            for link in &links[i] {
+                let eta = link.integration;
+                own.add(eta, link.coefficient * out.start[link.output] / libm::tgamma(eta + 1.0));
+            }
+            for (exponent, value) in own.powers() {
                 let ends = (1..=m).map(|k| libm::pow(k as f64 * step, exponent));
-                out.edges[body].iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
-                if exponent.abs() < ORDER_GRAIN {
-                    out.start[body] += value;
-                }
+                out.edges[i].iter_mut().zip(ends).for_each(|(s, v)| *s += value * v);
             }
         }
         Ok(out)
+    }
+}
+
+/// Powers of t, equal exponents together.
+#[derive(Debug, Clone, Default)]
+struct Sum(Vec<(f64, f64, f64)>);
+
+impl Sum {
+    fn add(&mut self, exponent: f64, value: f64) {
+        match self.0.iter_mut().find(|r| (r.0 - exponent).abs() < ORDER_GRAIN) {
+            Some(known) => (known.1, known.2) = (known.1 + value, known.2.max(value.abs())),
+            None => self.0.push((exponent, value, value.abs())),
+        }
+    }
+
+    /// (exponent, coefficient): what one adds and another takes away again is nothing, but for rounding.
+    fn powers(&self) -> impl Iterator<Item = (f64, f64)> + '_ {
+        self.0.iter().filter(|r| r.1.abs() > 1e-13 * r.2).map(|r| (r.0, r.1))
     }
 }
 
@@ -160,13 +150,11 @@ fn means_of(exponent: f64, m: usize, step: f64) -> Vec<f64> {
     kernel(exponent, m, step).into_iter().map(summed).collect()
 }
 
-/// Outputs at the start: the powers t^0, and what of other levels feeds through at once.
-fn levels(powers: &[Vec<(f64, f64)>], links: &[Vec<Link>]) -> Result<Vec<f64>> {
-    let n = powers.len();
-    let constant = |own: &Vec<(f64, f64)>| own.iter().filter(|p| p.0.abs() < ORDER_GRAIN).map(|p| p.1).sum::<f64>();
-    let given: Vec<f64> = powers.iter().map(constant).collect();
+/// What outputs or velocities start at: what is given of each, and what of the others feeds through at once.
+fn at_once(given: &[f64], links: &[Vec<Link>]) -> Result<Vec<f64>> {
+    let n = given.len();
     if !links.iter().flatten().any(|link| link.integration.abs() < ORDER_GRAIN) {
-        return Ok(given);
+        return Ok(given.to_vec());
     }
     let mut matrix = vec![0.0; n * n];
     for (i, row) in links.iter().enumerate() {

@@ -9,6 +9,7 @@ moves the body.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import product
 
 import numpy as np
 from scipy.integrate import solve_ivp
@@ -218,21 +219,24 @@ def hub_and_link(
     return angles, rate
 
 
-def two_bodies(
+def bodies(
     force: Callable[[float], Sequence[float]], times: np.ndarray, springs: Sequence[Sequence[float]],
-    dampers: Sequence[Sequence[float]], friction: Sequence[tuple[float, float, float]],
-    start: Sequence[float] = (0.0, 0.0, 0.0, 0.0), width: float | None = None,
+    dampers: Sequence[Sequence[float]], friction: Sequence[tuple[float, float, float] | None],
+    start: Sequence[float] | None = None, width: float | None = None,
+    carried: Sequence[Sequence[float]] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Two bodies on dry friction that pull at each other, between their events: positions and velocities, (2, times).
+    """Bodies that pull at each other, some on dry friction, between their events: positions, velocities, (n, times).
 
-    D^2 y_i = sum_j (springs_ij y_j + dampers_ij Dy_j) + F_i - (f_i + fs_i exp(-(Dy_i/vs_i)^2)) sgn(Dy_i); the start is
-    (y_1, Dy_1, y_2, Dy_2). Each of the nine ways to slide to a side or rest is an equation of its own. With a width the
-    sign is tanh(Dy / width), and no body ever rests.
+    D^2 y_i = sum_j (springs_ij y_j + dampers_ij Dy_j + carried_ij D^2 y_j) + F_i - (f_i + fs_i exp(-(Dy_i/vs_i)^2))
+    sgn(Dy_i), no friction where it is None; the start is (y_1, Dy_1, y_2, …). Each way to slide to a side or rest is an
+    equation of its own; of those that bodies at rest may go on in, the one is taken whose accelerations and forces
+    agree with it. With a width the sign is tanh(Dy / width), and no body ever rests.
     """
-    k, d, end = np.asarray(springs), np.asarray(dampers), float(times[-1])
-    most = [f + more for f, more, _ in friction]
-    state, now = np.array(start, dtype=float), 0.0
-    places, rates = np.zeros((2, times.size)), np.zeros((2, times.size))
+    k, d, end, n = np.asarray(springs), np.asarray(dampers), float(times[-1]), len(friction)
+    mass = np.eye(n) - (np.zeros((n, n)) if carried is None else np.asarray(carried))
+    rough = [i for i in range(n) if friction[i] is not None]
+    state, now = np.zeros(2 * n) if start is None else np.array(start, dtype=float), 0.0
+    places, rates = np.zeros((n, times.size)), np.zeros((n, times.size))
     places[:, 0], rates[:, 0] = state[::2], state[1::2]
 
     def pull(t: float, x: np.ndarray) -> np.ndarray:
@@ -242,52 +246,78 @@ def two_bodies(
         f, more, speed = friction[i]
         return f + more * float(np.exp(-((v / speed) ** 2)))
 
-    def at_rest(i: int, t: float, x: np.ndarray) -> float:
-        there = float(pull(t, x)[i])
-        return float(np.sign(there)) if abs(there) > most[i] else 0.0
+    def most(i: int) -> float:
+        return friction[i][0] + friction[i][1]
+
+    def moving(t: float, x: np.ndarray, sides: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """Accelerations, and the forces that hold what rests."""
+        pulled = pull(t, x)
+        for i in rough:
+            pulled[i] -= sides[i] * rubs(i, x[2 * i + 1])
+        free = [i for i in range(n) if i not in rough or sides[i]]
+        a = np.zeros(n)
+        a[free] = np.linalg.solve(mass[np.ix_(free, free)], pulled[free])
+        return a, pulled - mass @ a
 
     if width is not None:
 
-        def smooth(t: float, x: np.ndarray) -> list[float]:
-            a = pull(t, x) - [rubs(i, x[2 * i + 1]) * np.tanh(x[2 * i + 1] / width) for i in range(2)]
-            return [x[1], a[0], x[3], a[1]]
+        def smooth(t: float, x: np.ndarray) -> np.ndarray:
+            pulled = pull(t, x)
+            for i in rough:
+                pulled[i] -= rubs(i, x[2 * i + 1]) * np.tanh(x[2 * i + 1] / width)
+            return np.stack([x[1::2], np.linalg.solve(mass, pulled)]).T.ravel()
 
         found = solve_ivp(smooth, (0.0, end), state, method="LSODA", t_eval=times, rtol=1e-9, atol=1e-11,
                           max_step=end / 2000)  # fmt: skip
         return found.y[::2], found.y[1::2]
-    sides = [float(np.sign(state[2 * i + 1])) or at_rest(i, 0.0, state) for i in range(2)]
+
+    def on_from(t: float, x: np.ndarray, known: dict[int, float]) -> list[float]:
+        """The one way to go on: what moves goes on to its side, what rests stays or starts as forces say."""
+        known = {i: float(np.sign(x[2 * i + 1])) for i in range(n) if i not in rough or x[2 * i + 1]} | known
+        asked = [i for i in range(n) if i not in known]
+        agree = []
+        for ways in product((-1.0, 0.0, 1.0), repeat=len(asked)):
+            sides = known | dict(zip(asked, ways, strict=True))
+            a, held = moving(t, x, [sides[i] for i in range(n)])
+            if all(a[i] * sides[i] > 0.0 if sides[i] else abs(held[i]) <= most(i) for i in asked):
+                agree.append([sides[i] for i in range(n)])
+        assert len(agree) == 1, agree
+        return agree[0]
+
+    sides = on_from(0.0, state, {})
     while now < end:
 
-        def motion(t: float, x: np.ndarray, s: Sequence[float] = tuple(sides)) -> list[float]:
-            v = np.where(np.asarray(s) != 0.0, x[1::2], 0.0)
-            still = np.array([x[0], v[0], x[2], v[1]])
-            a = pull(t, still) - [s[i] * rubs(i, v[i]) for i in range(2)]
-            return [v[0], a[0] if s[0] else 0.0, v[1], a[1] if s[1] else 0.0]
+        def rested(x: np.ndarray, sides: Sequence[float] = tuple(sides)) -> np.ndarray:
+            still = x.copy()
+            still[[2 * i + 1 for i in rough if not sides[i]]] = 0.0
+            return still
+
+        def motion(t: float, x: np.ndarray, sides: Sequence[float] = tuple(sides)) -> np.ndarray:
+            still = rested(x)
+            return np.stack([still[1::2], moving(t, still, sides)[0]]).T.ravel()
 
         def event_of(i: int, begun: float = now, sides: Sequence[float] = tuple(sides)):
-            def event(t: float, x: np.ndarray, s: float = sides[i]) -> float:
-                if s:
-                    return s * x[2 * i + 1] if t > begun + 1e-9 else 1.0
-                return abs(float(pull(t, x)[i])) - most[i] if t > begun + 1e-9 else -1.0
+            def event(t: float, x: np.ndarray) -> float:
+                if sides[i]:
+                    return sides[i] * x[2 * i + 1] if t > begun + 1e-9 else 1.0
+                return abs(float(moving(t, rested(x), sides)[1][i])) - most(i) if t > begun + 1e-9 else -1.0
 
             event.terminal, event.direction = True, -1.0 if sides[i] else 1.0
             return event
 
-        found = solve_ivp(motion, (now, end), state, events=[event_of(0), event_of(1)], rtol=1e-11, atol=1e-13,
+        found = solve_ivp(motion, (now, end), state, events=[event_of(i) for i in rough], rtol=1e-11, atol=1e-13,
                           method="DOP853", dense_output=True, max_step=end / 500)  # fmt: skip
         inside = np.flatnonzero((times > now) & (times <= found.t[-1]))
         if inside.size:
-            there = found.sol(times[inside])
-            places[:, inside] = there[::2]
-            rates[:, inside] = there[1::2] * (np.asarray(sides) != 0.0)[:, None]
-        now, state = float(found.t[-1]), found.y[:, -1].copy()
+            there = np.array([rested(column) for column in found.sol(times[inside]).T]).T
+            places[:, inside], rates[:, inside] = there[::2], there[1::2]
+        now, state = float(found.t[-1]), rested(found.y[:, -1])
         if found.status == 1:
-            for i in (i for i in range(2) if found.t_events[i].size):
-                if sides[i]:
-                    state[2 * i + 1] = 0.0
-                    sides[i] = at_rest(i, now, state)
-                else:
-                    sides[i] = float(np.sign(pull(now, state)[i]))
+            met = [i for i, when in zip(rough, found.t_events, strict=True) if when.size]
+            held = moving(now, state, sides)[1]
+            state[[2 * i + 1 for i in met if sides[i]]] = 0.0
+            # At its limit a body lets go to the side to which it is pushed.
+            sides = on_from(now, state, {i: float(np.sign(held[i])) for i in met if not sides[i]})
     return places, rates
 
 

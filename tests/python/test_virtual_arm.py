@@ -103,6 +103,24 @@ def test_the_arm_without_friction_is_its_model_under_inertial_coupling(name):
     assert errors(states_of(parameters, driven), truth).max() < 1e-3
 
 
+@pytest.mark.parametrize("name", ["effective", "measured", "measured-lqr"])
+def test_the_whole_arm_is_its_model_with_friction(name):
+    parameters, driven = exact(name), currents(1001)
+    model = parameters.model(friction=True)
+    law = ftlm.flexible_link(stage="both", coupling="simulated", cross_stage="inertial", friction=True)
+    assert model.structure.sticks == law.sticks == (0, 2)
+    assert [e.signals for e in model.equations] == [e.signals for e in law.equations]
+    blank = ftlm.Run.from_arrays(
+        step=STEP, inputs={"I1": driven[:, 0], "I2": driven[:, 1]}, outputs={n: np.zeros(1001) for n in ANGLES}
+    )
+    solved = model.simulate(blank)
+    found = states_of(parameters, driven)
+    assert errors(found, np.column_stack([solved[n] for n in ANGLES])).max() < 1e-4
+    # Both hubs rest now and then, and each is shaken while the other moves.
+    for hub in (0, 2):
+        assert 0.02 < np.mean(np.diff(found[:, hub]) == 0.0) < 0.98
+
+
 def test_a_hub_by_itself_is_the_body_with_friction_of_the_free_run():
     # The link weighs as much as no link: what is left is D^2 theta11 = b D^gamma theta11 + g (I1 - sign).
     stage = replace(rig.ArmParameters.of("effective").stage1, a=0.0, d=0.0)
@@ -247,3 +265,34 @@ def test_an_offset_that_cannot_be_is_refused(options, words):
     with pytest.raises(ftlm.ModelError) as refused:
         rig.record(duration=0.5, **options)
     assert words in str(refused.value)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["effective", "measured-lqr"])
+def test_the_whole_arm_is_recovered_from_its_currents(name):
+    """Both stages, both hubs' friction and the coupling, from the automatic start, within the printed intervals."""
+    parameters, rng = exact(name), np.random.default_rng(0)
+    # Held over two steps of the arm, of which one is read.
+    t, phases = np.arange(1501) * 2 * STEP, rng.uniform(0.0, 2.0 * np.pi, 4)
+    first = 0.45 * np.sign(np.sin(2.2 * t + phases[0])) + 0.15 * np.sin(13.2 * t + phases[1])
+    second = 0.4 * np.sign(np.sin(3.33 * t + phases[2])) + 0.12 * np.sin(19.5 * t + phases[3])
+    driven = np.column_stack([first, second])
+    driven[0] = 0.0
+    angles = states_of(parameters, np.repeat(driven, 2, axis=0))[::2]
+    angles += 0.003 * angles.std(axis=0) * rng.standard_normal(angles.shape)
+    run = ftlm.Run.from_arrays(
+        step=2 * STEP, inputs={"I1": driven[:, 0], "I2": driven[:, 1]},
+        outputs={n: angles[:, k] for k, n in enumerate(ANGLES)},
+    )  # fmt: skip
+    structure = ftlm.flexible_link(stage="both", coupling="simulated", cross_stage="inertial", friction=True)
+    found = ftlm.identify(run, structure)
+    assert min(found.fit_percent.values()) > 99.5
+    truth = parameters.model(friction=True)
+    held = [
+        abs(value - known[n]) < 4.0 * found.standard_errors[n]
+        for estimated, known in ((found.orders, truth.orders), (found.coefficients, truth.coefficients))
+        for n, value in estimated.items()
+        if n in found.standard_errors and known[n] != round(known[n])
+    ]
+    assert len(held) > 15
+    assert all(held)

@@ -165,8 +165,8 @@ def flexible_link(
     friction
         Adds Coulomb friction to the hub's equation. With ``coupling="simulated"``, in the Lagrange form, it is
         - fc_j * sign(D theta_j1) of the velocity that the model itself gives, set-valued at rest (:class:`Friction`),
-        by output error: hubs stick and slip while their links ring (with ``stage="both"`` both do; not beside inertial
-        coupling, whose accelerations stand in the equation of hub 2). With measured coupling it is a
+        by output error: hubs stick and slip while their links ring, with ``stage="both"`` and inertial coupling each of
+        them while the other's motion shakes it. With measured coupling it is a
         linear term c * coulomb_theta_j1 of the sign of the measured velocity, in the published form of both equations.
     cross_sensitivity
         Adds hub angles as they are (order 0) to the deflection's equation: strain gauges and cables make a measured
@@ -234,12 +234,6 @@ def flexible_link(
             "friction=True with coupling='simulated' follows hubs of form='lagrange', where it does not enter the "
             "links' equations; use that form, or coupling='measured', whose friction has the sign of the measured "
             "velocity"
-        )
-    if friction and coupling == "simulated" and stage == "both" and cross_stage == "inertial":
-        raise ModelError(
-            "cross_stage='inertial' puts accelerations of stage 1 into the equation of hub 2, where friction=True with "
-            "coupling='simulated' has every order below alpha; use cross_stage=False, leave the friction out, or use "
-            "coupling='measured'"
         )
     if not hub and (form != "lagrange" or coupling == "simulated" or friction):
         raise ModelError(
@@ -334,7 +328,7 @@ def _stage(
 def _added(item: Equation, terms: Sequence[Term]) -> Equation:
     """An equation with more terms, before those of friction."""
     rubs = tuple(t for t in item.terms if t.signal.startswith("coulomb_"))
-    return Equation(item.output, item.order, (*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
+    return replace(item, terms=(*item.terms[: len(item.terms) - len(rubs)], *terms, *rubs))
 
 
 def _twisted(made: tuple[Equation, Equation], stage: int) -> tuple[Equation, Equation]:

@@ -284,12 +284,6 @@ class Equation:
                 f"{words} acts on its velocity, but alpha = {alpha:g} is outside (1, 2]; leave it out, or choose "
                 "another order"
             )
-        for item in self.terms:
-            if not item.order.names and item.order.constant >= alpha - 1e-9:
-                raise ModelError(
-                    f"order {item.order.constant:g} of {item.signal} is not below alpha = {alpha:g}, and {words} then "
-                    "has no velocity to follow; lower it"
-                )
 
     @property
     def friction(self) -> Friction | None:

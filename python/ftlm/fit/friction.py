@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -14,11 +15,12 @@ from ftlm.data.equations import Equation, Friction, Term
 from ftlm.data.orders import Order
 from ftlm.data.readings import read
 from ftlm.data.run import Run
-from ftlm.data.structures import Structure
+from ftlm.data.structures import Hints, Structure
 from ftlm.fit.grid import FINEST, Attempt, Grid
 from ftlm.fit.problem import FRICTION_BOUNDS, FreeProblem
 from ftlm.fit.race import COARSE_SAMPLES, FINALISTS, FIRST_LAP, SECOND_LAP, Laps, race
 from ftlm.fit.sliding import slid
+from ftlm.fit.starts import whole_orders
 from ftlm.solve.records import COULOMB
 
 #: Friction at a start as shares of the force that drives the body, from next to none upwards.
@@ -30,6 +32,10 @@ NEAR = (0.02, 0.2, 1.0)
 FALLS = (0.05, 0.2, 0.6)
 #: What hangs on a body at a start, as shares of the body's own inertia.
 CARRIED = (0.1, 0.3, 1.0, 3.0)
+#: Starts at most of several bodies each of which carries a share of its own.
+MOST_CARRIED = 64
+#: Orders of two terms of an equation and its counter-equation that lie nearer are action and reaction.
+ALIKE = 0.5
 #: A body that moves by less than this many deviations of its noise, peak to peak, has not moved.
 STILL = 10.0
 
@@ -57,6 +63,12 @@ def race_with_friction(
             values = dict(zip(less.names, attempt.values.tolist(), strict=True))
             starts += falling(coarse, values, attempt.origin)
         return raced(coarse, starts, threads)
+    if 1 < len(rubbing(structure)) < len(structure.equations):
+        # What hangs on them is told from its own equation; that of a body, driven by all that hangs on it, may be
+        # explained by what they tell of its motion.
+        for orders in skeletons(problem):
+            starts += carrying(problem, runs, hanging(alike, orders, floor, threads), together=False)
+        return raced(coarse, starts, threads)
     # Driven by measured signals, each of several bodies is told from its own equation, whatever the others do.
     signed = FreeProblem.of(replace(with_measured_sign(structure), coupling="measured"))
     reached = race(replace(alike, problem=signed), floor, threads, progress)
@@ -74,29 +86,63 @@ def rubbing(structure: Structure) -> list[tuple[Equation, Friction]]:
     return [(e, e.friction) for e in structure.equations if e.friction is not None]
 
 
-def carrying(problem: FreeProblem, runs: Sequence[Run], values: dict[str, float]) -> list[Attempt]:
+def skeletons(problem: FreeProblem) -> list[dict[str, float]]:
+    """Orders at which a machine is put together: whole ones, and those beside them that are natural for it.
+
+    Orders that equations share tell too little of each by itself, and an overdamped body, whose drive and brake nearly
+    cancel, is another one at every order.
+    """
+    ends = dict(zip(problem.orders, problem.bounds, strict=True))
+    natural = (problem.structure.hints or Hints()).natural
+    known = {n: natural[n] for n in problem.orders if natural.get(n)}
+    whole = dict(zip(problem.orders, whole_orders(problem), strict=True))
+    whole |= {n: v for n, values in known.items() for v in values if v == round(v)}
+    other = {n: v for n, values in known.items() for v in values if v != whole[n]}
+    sets = [whole, whole | other] if other else [whole]
+    return [{n: min(max(v, ends[n][0]), ends[n][1]) for n, v in orders.items()} for orders in sets]
+
+
+def hanging(alike: Grid, orders: dict[str, float], floor: float, threads: int) -> dict[str, float]:
+    """The orders, and coefficients of equations without friction, each driven by what was measured; others are 0."""
+    structure = alike.problem.structure
+    values = orders | dict.fromkeys(structure.coefficient_names, 0.0)
+    for item, weight in zip(structure.equations, alike.weights, strict=True):
+        if item.friction is None:
+            named = {n: orders[n] for n in item.order_names}
+            alone = FreeProblem.of(structure.driven(item.output).with_orders(named))
+            reached = race(replace(alike, problem=alone, weights=[weight]), floor, threads, None)
+            values |= alone.named(reached[0].coefficients) if reached else {}
+    return values
+
+
+def carrying(
+    problem: FreeProblem, runs: Sequence[Run], values: dict[str, float], *, together: bool = True
+) -> list[Attempt]:
     """Starts of bodies by themselves, with what hangs on them put back as action and reaction ask for.
 
     The others are as they are when measured bodies drive them; a body itself, driven by measured others, may be
-    explained by what they tell of its motion, without what drives it and without friction.
+    explained by what they tell of its motion, without what drives it and without friction. Several bodies carry
+    the same share of their inertia, or each its own.
     """
     structure = problem.structure
     bounds = dict(zip(problem.orders, problem.bounds, strict=True))
     alone = [(item, *by_itself(runs, structure, item, values, bounds)) for item, _ in rubbing(structure)]
     told = [(item, orders, numbers) for item, orders, numbers in alone if numbers]
     out = []
-    for share in CARRIED if told else ():
+    together = together or len(CARRIED) ** len(told) > MOST_CARRIED
+    for shares in [[s] * len(told) for s in CARRIED] if together else itertools.product(CARRIED, repeat=len(told)):
         # What drives a body and brakes it moves the others, too.
         found, rest = dict(values), dict(values)
-        for item, orders, numbers in told:
+        for (item, orders, numbers), share in zip(told, shares, strict=True):
             found |= reacting(structure, item, values, share)
             found |= {n: (1.0 + share) * v for n, v in numbers.items()}
             rest |= orders
         free = dict(zip(problem.coefficients, problem.free_from(found), strict=True))
         rest = {n: v for n, v in rest.items() if n in problem.names}
         words = " and ".join(item.output for item, _, _ in told) + (", each" if len(told) > 1 else "")
-        out.append(at(problem, {**rest, **free}, f"{words} by itself, carrying {share:g} of its inertia"))
-    return out
+        carried = " and ".join(f"{share:g}" for share in (shares[:1] if together else shares))
+        out.append(at(problem, {**rest, **free}, f"{words} by itself, carrying {carried} of its inertia"))
+    return out if told else []
 
 
 def by_itself(
@@ -133,7 +179,7 @@ def reacting(structure: Structure, item: Equation, values: dict[str, float], sha
         own = sorted((t for t in other.terms if t.signal == other.output), key=highest)
         back = sorted((t for t in item.terms if t.signal == other.output), key=highest)
         for there, here in zip(own, back, strict=False):
-            if not isinstance(here.coefficient, str):
+            if not isinstance(here.coefficient, str) or abs(highest(there) - highest(here)) > ALIKE:
                 continue
             value = there.fixed if there.fixed is not None else there.factor * values[str(there.coefficient)]
             out[here.coefficient] = -share * value / here.factor

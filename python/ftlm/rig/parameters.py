@@ -197,13 +197,18 @@ class ArmParameters:
             )
         return {"p2": -hub - arm, "q2": -arm, "p3": base, "q3": base, "p4": carried, "q4": carried}
 
-    def model(self) -> Model:
-        """The arm's linear part, both stages from their currents: what :meth:`arm` integrates, friction aside.
+    def model(self, *, friction: bool = False) -> Model:
+        """The arm as a model, both stages from their currents; with friction it is what :meth:`arm` integrates.
+
+        Parameters
+        ----------
+        friction
+            Whether hubs stick; of the Lagrange form.
 
         Raises
         ------
         ModelError
-            Orders or coefficients that make no model, the published form with a coupling.
+            Orders or coefficients that make no model, the published form with a coupling or with friction.
         """
         if self.form == "published" and self.coupling != 0.0:
             raise ModelError(
@@ -211,13 +216,16 @@ class ArmParameters:
             )
         coupled = self.coupling != 0.0
         structure = flexible_link(
-            stage="both", form=self.form, coupling="simulated", cross_stage="inertial" if coupled else False
-        )
+            stage="both", form=self.form, coupling="simulated", cross_stage="inertial" if coupled else False,
+            friction=friction,
+        )  # fmt: skip
         orders: dict[str, float] = {}
         coefficients: dict[str, float] = self.pushes() if coupled else {}
         for j, stage in ((1, self.stage1), (2, self.stage2)):
             orders |= stage.orders(j)
             coefficients |= stage.coefficients(j, self.form)
+            if friction:
+                coefficients[f"fc{j}"] = stage.g * stage.coulomb
         known = {n: v for n, v in orders.items() if n in structure.order_names}
         return Model(structure.with_orders(known).with_coefficients(coefficients), orders=known)
 
