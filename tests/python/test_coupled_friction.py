@@ -248,6 +248,12 @@ def test_what_is_not_followed_is_refused(make, said: str) -> None:
         make()
 
 
+@pytest.mark.parametrize("cross", [False, "torques", "inertial"])
+def test_hubs_keep_their_friction_beside_the_other_stage(cross) -> None:
+    structure = ftlm.flexible_link(stage="both", coupling="simulated", friction=True, cross_stage=cross)
+    assert structure.sticks == (0, 2)
+
+
 def test_highest_orders_that_cancel_are_refused() -> None:
     three = "D^2 x = q + u - 1*sign(D x); D^2 q = D^2 p - q; D^2 p = D^2 q - 2 p + x"
     t = np.arange(101) * 0.01
