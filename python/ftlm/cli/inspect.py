@@ -1,19 +1,30 @@
-"""Commands that look before anything is done: at a run (`inspect`), at the installation (`doctor`)."""
+"""Commands that look first: at a file (`open`), at a run (`inspect`), at the installation (`doctor`)."""
 
 from __future__ import annotations
 
 import json
 import platform
 from importlib import metadata
-from typing import Any
+from typing import Annotated, Any
+
+from typer import Argument
 
 from ftlm import _core
 from ftlm.base.checks import available_threads
-from ftlm.cli.command import command
+from ftlm.cli.command import command, show
 from ftlm.cli.options import Files, Json, ReadingOptions
 from ftlm.cli.words import in_options
 from ftlm.data.inspection import inspect_run
 from ftlm.rig.quanser import driver_state
+
+
+@command
+def open_(
+    *, file: Annotated[str, Argument(metavar="FILE", help="Any measured file.")], reading: ReadingOptions,
+    as_json: Json = False,
+) -> None:  # fmt: skip
+    """Say what a file is: columns, units, roles, step, what was assumed and what says otherwise, what to type next."""
+    show(reading.opened(file), as_json=as_json)
 
 
 @command

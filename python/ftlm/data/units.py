@@ -29,6 +29,7 @@ _WRITTEN = {
     **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"), "hr": "h", "hour": "h", "hours": "h",
     **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"), "minute": "min", "minutes": "min",
     **dict.fromkeys(("usec", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("sekunde", "sekunden", "sek"), "s"), "millisekunden": "ms", "minuten": "min", "stunden": "h",
 }  # fmt: skip
 _BRACKETED = re.compile(r"(.*?)\s*\[\s*([^\[\]]*?)\s*\]")
 _OTHERWISE = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*/\s*(\S+)|_(\S+))")
