@@ -221,7 +221,7 @@ def _sheet(path: Path, header: dict[str, object], cells: bytes, layout: Layout) 
     others = header.get("others")
     if layout.sheet is None and isinstance(others, list) and others:
         words = f"sheet {sheet!r}, the only one that is not empty"
-        assumed = Assumption("sheet", sheet, words, "layout=dict(sheet=…)")
+        assumed = Assumption("sheet", sheet, words, "layout=dict(sheet=NAME)")
         table = replace(table, assumed=(assumed, *table.assumed))
     return table
 

@@ -151,7 +151,7 @@ class Pool:
                     "name one with time="
                 )
             if named and why:
-                assumed = Assumption("time", named[0].name, why, "time=…")
+                assumed = Assumption("time", named[0].name, why, "time=COLUMN")
             clocks += named
         if not clocks:
             matrices = dict.fromkeys(column.matrix for column in used if column.matrix is not None)

@@ -19,6 +19,7 @@ from ftlm.data.readings import Missing, checked_missing
 from ftlm.data.run import Run, built
 from ftlm.data.units import header_time, time_unit_of
 from ftlm.files.apart import kind_of, read_apart
+from ftlm.files.cells import stated_unit
 from ftlm.files.columns import Column, FileTable, Pool
 from ftlm.files.layout import OF_SHEETS, OF_TEXT, Layout
 from ftlm.files.text import LONGEST_HEADER, read_text
@@ -68,8 +69,8 @@ def load(
         file's column called t, time or seconds (any case), alone or with a unit as in ``time [ms]``, ``time (ms)``,
         ``time/ms`` or ``t_ms``, is taken, a .mat file's vector of such a name; else (said in the run's `warnings`) one
         that other programs call so, such as Timestamp or Zeit, the only one that holds dates, or a first one with a
-        unit of time; or else the first column of every matrix in use, which must all agree. Dates and times of day count
-        from the first row on.
+        unit of time; or else the first column of every matrix in use, which must all agree. Dates and times of day
+        count from the first row on.
     inputs, outputs : mapping of str to column, or list of str, optional
         Columns by signal name; a list names columns that keep their names. Needed unless `columns` or the file's
         own ftlm header gives them; at least one output. A column that ends in its unit, ``I (A)``, is found without.
@@ -246,8 +247,8 @@ def header_of(clock: Column) -> str:
     """Return what stands above a column of times; the first column of a matrix has no words of its own."""
     if clock.matrix is not None:
         return "time"
-    stated = clock.stated and header_time(clock.variable)[1] is None
-    return f"{clock.variable} [{clock.stated}]" if stated else clock.variable
+    below = clock.stated and header_time(clock.variable)[1] is None and not stated_unit(clock.variable)[1]
+    return f"{clock.variable} [{clock.stated}]" if below else clock.variable
 
 
 def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:

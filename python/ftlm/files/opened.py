@@ -155,13 +155,13 @@ class OpenedFile:
         if "slice" in told:
             words += ["--slice", ":".join("" if end is None else repr(end) for end in told["slice"])]
         for key, option in (("inputs", "-u"), ("outputs", "-y"), ("units", "--unit"), ("intersample", "--intersample")):
-            words += [w for name, value in told.get(key, {}).items() for w in (option, f"{name}={value}")]
+            bare = key in ("inputs", "outputs")
+            pairs = (name if bare and name == value else f"{name}={value}" for name, value in told.get(key, {}).items())
+            words += [w for pair in pairs for w in (option, pair)]
         # What every reader finds by itself and no number depends on may stay unsaid.
-        plain = {a.option for a in self.assumed if not a.counts} | {"separator"}
-        for key, value in self.layout.to_dict().items() if "layout" in told else ():
-            usual = (key, value) in (("decimal", "point"), ("skip", 0), ("header", 1), ("encoding", "utf-8"))
-            if key not in plain and not usual:
-                words += [f"--{key}", str(value)]
+        plain = {a.option for a in self.assumed if not a.counts}
+        told_layout: Layout = told.get("layout", Layout())
+        words += [w for k, v in told_layout.to_dict().items() if k not in plain for w in (f"--{k}", str(v))]
         return words
 
 
@@ -259,7 +259,7 @@ class _Opening:
             return clock, (assumed,), ""
         if wanted.time is None and clock.matrix is not None:
             words = f"the time is the first column of the matrix, {clock.name!r}"
-            return clock, (Assumption("time", clock.name, words, "time=…", False),), ""
+            return clock, (Assumption("time", clock.name, words, "time=COLUMN", False),), ""
         return clock, (), ""
 
     def _roles(
@@ -303,19 +303,19 @@ class _Opening:
         if clock is not None and self.table.header is None:
             options["time"] = clock.name
         asked = self.asked
-        told = {
+        more = {
             "slice": asked.window,
             "resample": asked.resample,
             "time_unit": asked.time_unit,
             "missing": asked.missing,
         }
-        options |= {key: value for key, value in told.items() if value is not None}
+        options |= {key: value for key, value in more.items() if value is not None}
         for key in ("inputs", "outputs", "units", "intersample"):
             if getattr(wanted, key) and (self.table.header is None or key in ("inputs", "outputs")):
                 options[key] = dict(getattr(wanted, key))
-        if self.table.header is None and self.table.layout != Layout():
-            options["layout"] = self.table.layout
-        return options
+        said = {*wanted.layout.to_dict(), *(a.option for a in self.table.assumed)}
+        layout = Layout.of({key: value for key, value in self.table.layout.to_dict().items() if key in said})
+        return options | ({"layout": layout} if layout != Layout() else {})
 
 
 def _shown(column: Column, roles: Mapping[str, tuple[str, str]]) -> FileColumn:

@@ -6,10 +6,10 @@ every file it writes to standard output one line of JSON and then the numbers:
 
 ``{"arrays": [{"name": …, "rows": …, "columns": …, "type": …}], "skipped": {name: why}}`` followed by the arrays, each
 little-endian float64, column after column; or ``{"error": why, "way_out": what to do}`` and the end. An array may
-state its ``"unit"``; one of moments says ``"since"``, whole nanoseconds since 1970 from which its own nanoseconds count.
-Of columns, not matrices, it says ``"text": true``, and for a run that ftlm wrote ``"ftlm-run"``: its own header. Of a
-sheet it says ``"sheet"``, its name, ``"others"``, which are empty, and ``"bytes"``: so many of UTF-8 text follow, a line
-a row, cells between tabs.
+state its ``"unit"``; one of moments says ``"since"``, whole nanoseconds since 1970 from which its own nanoseconds
+count. Of columns, not matrices, it says ``"text": true``, and for a run that ftlm wrote ``"ftlm-run"``: its own header.
+Of a sheet it says ``"sheet"``, its name, ``"others"``, which are empty, and ``"bytes"``: so many of UTF-8 text follow,
+a line a row, cells between tabs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SECONDS_LIMIT = 60
 SIZE_LIMIT = 1 << 30
 MOST_ARRAYS = 10_000
 MOST_DEPTH = 8
-WHICH = "say which with layout=dict(sheet=…)"
+WHICH = "say which with layout=dict(sheet=NAME)"
 SAVE_AGAIN = "save it again with save('FILE.mat', '-v7')"
 NUMERIC = frozenset(
     ("double", "single", "logical", "int8", "uint8", "int16", "uint16", "int32", "uint32", "int64", "uint64")

@@ -11,20 +11,20 @@ from ftlm.files.cells import stated_unit
 
 _DRIVES = frozenset(
     ("u", "in", "inp", "input", "eingang", "cmd", "command", "current", "strom", "torque", "drehmoment", "pwm", "duty",
-     "drive", "force", "kraft", "power", "leistung", "heater", "heating", "excitation", "anregung", "actuator", "i", "im",
-     "valve", "ventil", "throttle")
+     "drive", "force", "kraft", "power", "leistung", "heater", "heating", "excitation", "anregung", "actuator", "i",
+     "im", "valve", "ventil", "throttle")
 )  # fmt: skip
 _FOLLOWS = frozenset(
     ("y", "out", "output", "ausgang", "angle", "winkel", "position", "pos", "weg", "displacement", "deflection",
-     "auslenkung", "theta", "th", "temp", "temperature", "temperatur", "speed", "velocity", "drehzahl", "geschwindigkeit",
-     "acceleration", "accel", "beschleunigung", "level", "pressure", "druck", "response", "antwort", "strain", "dehnung",
-     "tip")
+     "auslenkung", "theta", "th", "temp", "temperature", "temperatur", "speed", "velocity", "drehzahl",
+     "geschwindigkeit", "acceleration", "accel", "beschleunigung", "level", "pressure", "druck", "response",
+     "antwort", "strain", "dehnung", "tip")
 )  # fmt: skip
 #: A motor is driven by its voltage, a cell answers with it.
 _EITHER = frozenset(["voltage", "volt", "volts", "spannung", "v"])
 _UNITS = {
-    "volt": "V", "volts": "V", "amp": "A", "amps": "A", "ampere": "A", "amperes": "A",
-    "degree": "deg", "degrees": "deg", "radian": "rad", "radians": "rad", "metre": "m", "meter": "m", "newton": "N", "kelvin": "K",
+    "volt": "V", "volts": "V", "amp": "A", "amps": "A", "ampere": "A", "amperes": "A", "degree": "deg",
+    "degrees": "deg", "radian": "rad", "radians": "rad", "metre": "m", "meter": "m", "newton": "N", "kelvin": "K",
     "celsius": "degC", "watt": "W", "hertz": "Hz", "pascal": "Pa", "u/min": "rpm", "1/min": "rpm",
 }  # fmt: skip
 

@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from ftlm.base.checks import listed
 from ftlm.base.errors import DataError
 from ftlm.files.cells import DECIMAL_COMMA, is_number, is_unit, split, unit_of
 from ftlm.files.layout import SEPARATORS, Assumption, Layout
@@ -165,10 +164,9 @@ def _chosen(kept: Sequence[tuple[int, str]], given: Layout, source: str) -> tupl
     for separator, comma in _ways(text, given):
         cut = _cut(kept, separator, source, comma=comma)
         width = _width(cut)
-        rows = [line for line in cut if line.width == width and line.good]
-        names = any(line.named and line.width == width for line in cut)
+        rows = [line for line in cut[_first_row(cut, width) :] if line.width == width and line.good]
         half = 2 * sum(line.width > 1 for line in cut[:20]) >= len(cut[:20])
-        rank = (len(rows), -sum(line.words for line in rows), names, half and not rows)
+        rank = (len(rows), -sum(line.words for line in rows), half and not rows)
         if best is None or rank > best[0]:
             best = rank, separator, comma, cut
     if best is None:
@@ -349,17 +347,22 @@ def _said(
     ).under(given)  # fmt: skip
     assumed = []
     if given.separator is None:
-        others = listed((w for w in SEPARATORS if w != _WORDS[separator] and w != layout.decimal), 4)
         assumed.append(
-            Assumption("separator", str(layout.separator), f"{SEPARATOR_WORDS[separator]} between cells", others, False)
+            Assumption(
+                "separator",
+                str(layout.separator),
+                f"{SEPARATOR_WORDS[separator]} between cells",
+                "layout=dict(separator=NAME)",
+                False,
+            )
         )
     if given.decimal is None and comma:
         shown = next(c.strip() for line in cut for c in line.cells if DECIMAL_COMMA.fullmatch(c.strip()))
         words, otherwise = f"decimal commas, as in {shown!r}", "layout=dict(decimal='point')"
         assumed.append(Assumption("decimal", "comma", words, otherwise))
     if given.skip is None and skip:
-        words = f"the first {skip} lines stand above the table"
-        assumed.append(Assumption("skip", skip, words, "layout=dict(skip=…)"))
+        words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
+        assumed.append(Assumption("skip", skip, words, "layout=dict(skip=LINES)"))
     if given.header is None and units is not None:
         words = f"line {cut[top - 1].at} holds units"
         assumed.append(Assumption("header", 2, words, "layout=dict(header=1)"))

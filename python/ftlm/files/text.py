@@ -253,7 +253,7 @@ def _encoding(stream: BinaryIO | _Limited, layout: Layout, path: Path) -> tuple[
         zeros, others = head[offset:4000:2].count(0), head[1 - offset : 4000 : 2].count(0)
         if zeros > 4 and others == 0 and zeros > 0.8 * len(head[offset:4000:2]):
             words = f"every other byte is 0, so the text is {name}"
-            return name, (Assumption("encoding", name, words, "layout=dict(encoding=…)", False),)
+            return name, (Assumption("encoding", name, words, "layout=dict(encoding=NAME)", False),)
     try:
         codecs.getincrementaldecoder("utf-8")().decode(head)
     except UnicodeDecodeError as error:
@@ -261,10 +261,10 @@ def _encoding(stream: BinaryIO | _Limited, layout: Layout, path: Path) -> tuple[
             at = head[: error.start].count(b"\n") + 1
             raise DataError(
                 f"{path.name}: line {at} is not UTF-8 text (byte {head[error.start]:#04x}), and other bytes are of no "
-                "text at all; say layout=dict(encoding=…), or pass a csv, text or .mat file"
+                "text at all; say layout=dict(encoding=NAME), or pass a csv, text or .mat file"
             ) from None
         words = f"no UTF-8 (byte {head[error.start]:#04x}), taken for cp1252 of Windows, which numbers do not depend on"
-        otherwise = "layout=dict(encoding=…)"
+        otherwise = "layout=dict(encoding=NAME)"
         try:
             head.decode("cp1252")
         except UnicodeDecodeError:
@@ -307,7 +307,7 @@ def _line_blocks(path: Path, stream: BinaryIO | _Limited, encoding: str) -> Iter
 
 def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> DataError:
     if not isinstance(error, UnicodeDecodeError):
-        return DataError(f"{path.name}: the text is no {encoding} ({error}); say layout=dict(encoding=…)")
+        return DataError(f"{path.name}: the text is no {encoding} ({error}); say layout=dict(encoding=NAME)")
     at, byte = line + error.object[: error.start].count(b"\n"), error.object[error.start]
     return DataError(
         f"{path.name}: line {at} is not {encoding.upper()} text (byte {byte:#04x}); say layout=dict(encoding='cp1252') "

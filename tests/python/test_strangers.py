@@ -1,0 +1,94 @@
+"""Files of strangers: from each to a validated model by one command, the truth within its intervals; `ftlm open`."""
+
+import json
+import shlex
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import ftlm
+import strangers
+from ftlm.cli.app import app
+
+
+def command(*words):
+    return CliRunner().invoke(app, list(map(str, words)), env={"COLUMNS": "200", "NO_COLOR": "1"})
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Each stranger's file in a folder."""
+    folder = tmp_path_factory.mktemp("strangers")
+    made = {name: strangers.made(name, folder) for name in strangers.MAKERS}
+    for stranger in made.values():
+        (folder / stranger.name).write_bytes(stranger.content)
+    return folder, made
+
+
+@pytest.mark.parametrize("name", strangers.MAKERS)
+def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
+    folder, made = files
+    path = folder / made[name].name
+    done = command("identify", path, *made[name].words, "--structure", strangers.EQUATION, "--slice", ":3.6",
+                   "--intervals", "quadratic", "--validation", path, "--json")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    for number, true in strangers.TRUTH.items():
+        low, high = found["intervals"][number]
+        assert low < true < high, number
+        assert high - low < 0.2 * abs(true), number
+    assert found["validation"]["output_error"]["y"]["fit"] > 95
+
+
+def loaded(path, stranger):
+    pairs = dict(word.split("=") if "=" in word else (word, word) for word in stranger.words[1:4:2])
+    unit = {"y": "mm"} if "y=mm" in stranger.words else None
+    u, y = pairs["u"], pairs["y"]
+    return ftlm.load(path, inputs={"u": u}, outputs={"y": y}, units=unit)
+
+
+@pytest.mark.parametrize("name", strangers.MAKERS)
+def test_the_record_is_the_one_that_was_written(files, name):
+    folder, made = files
+    run = loaded(folder / made[name].name, made[name])
+    _, u, y = strangers.record()
+    assert (run.length, run.step) == (strangers.ROWS, pytest.approx(strangers.STEP, rel=1e-12))
+    assert run.start == pytest.approx(made[name].start, abs=1e-12)
+    np.testing.assert_allclose(run["u"], u, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run["y"], y, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", strangers.MAKERS)
+def test_what_is_opened_says_all_that_it_assumed_and_loads_the_same_run(files, name):
+    folder, made = files
+    path, stranger = folder / made[name].name, made[name]
+    asked = {"inputs": {"u": stranger.words[1].partition("=")[2] or "u"}}
+    asked["outputs"] = {"y": stranger.words[3].partition("=")[2] or "y"}
+    opened = ftlm.open_file(path, **asked)
+    assert opened.problem == ""
+    run = opened.load()
+    plain = ftlm.load(path, **asked, units=opened.options.get("units"))
+    assert run.step == plain.step == opened.step
+    assert all(np.array_equal(run[n], plain[n]) for n in run.signals)
+    # Said explicitly, nothing is assumed any more.
+    assert not {str(a) for a in opened.assumed if a.counts} & set(run.warnings)
+    assert {str(a) for a in opened.assumed if a.counts} <= set(plain.warnings)
+    assert opened.rows == strangers.ROWS
+
+
+@pytest.mark.parametrize("name", strangers.MAKERS)
+def test_the_command_that_open_names_works(files, name):
+    folder, made = files
+    path, stranger = folder / made[name].name, made[name]
+    shown = command("open", path, *stranger.words)
+    assert shown.exit_code == 0, shown.output
+    lines = [line.removeprefix("next: ") for line in shown.stdout.splitlines() if line.startswith("next: ")]
+    assert [line.split()[1] for line in lines] == ["inspect", "identify"]
+    assert "layout=" not in shown.stdout
+    looked = command(*shlex.split(lines[0])[1:], "--json")
+    assert looked.exit_code == 0, looked.output
+    (figures,) = json.loads(looked.stdout)
+    assert (figures["rows"], figures["step"]) == (strangers.ROWS, pytest.approx(strangers.STEP))
+    words = shlex.split(lines[1])[1:]
+    assert words[words.index("--structure") + 1] == strangers.EQUATION
