@@ -372,8 +372,8 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
             found = book.get_sheet_by_name(name)
         except calamine.WorksheetNotFound:
             continue
-        if found.total_height and found.total_width:
-            check_size(found.total_height, found.total_width)
+        if found.end is not None:
+            check_size(found.end[0] + 1, found.end[1] + 1)
             filled[name] = found
     if not filled:
         raise UnreadableError(

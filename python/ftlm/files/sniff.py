@@ -163,6 +163,8 @@ def _chosen(kept: Sequence[tuple[int, str]], given: Layout, source: str) -> tupl
     best: tuple[tuple[int, ...], str | None, bool, list[_Line]] | None = None
     for separator, comma in _ways(text, given):
         cut = _cut(kept, separator, source, comma=comma)
+        if comma and given.decimal is None and _decimal_comma(cut) is None:
+            continue
         width = _width(cut)
         rows = [line for line in cut[_first_row(cut, width) :] if line.width == width and line.good]
         half = 2 * sum(line.width > 1 for line in cut[:20]) >= len(cut[:20])
@@ -177,6 +179,11 @@ def _chosen(kept: Sequence[tuple[int, str]], given: Layout, source: str) -> tupl
     if given.decimal is None and comma:
         _check_thousands(cut, source)
     return separator, comma, cut
+
+
+def _decimal_comma(cut: list[_Line]) -> str | None:
+    """The first number with a decimal comma."""
+    return next((c.strip() for line in cut for c in line.cells if DECIMAL_COMMA.fullmatch(c.strip())), None)
 
 
 def _width(cut: list[_Line]) -> int:
@@ -241,6 +248,9 @@ def _header(
                 count = 2
             elif len(fitted(cut[top - 1])) != width and top > 1:
                 count = 0
+    if count > top and given.skip is None and count < len(cut):
+        # Names that are numbers look like a row.
+        top = count
     if count > top:
         raise DataError(f"{source}: layout= says {count} lines of header, and {top} stand above the rows; say fewer")
     if count == 0:
@@ -347,17 +357,10 @@ def _said(
     ).under(given)  # fmt: skip
     assumed = []
     if given.separator is None:
-        assumed.append(
-            Assumption(
-                "separator",
-                str(layout.separator),
-                f"{SEPARATOR_WORDS[separator]} between cells",
-                "layout=dict(separator=NAME)",
-                False,
-            )
-        )
+        words = f"{SEPARATOR_WORDS[separator]} between cells"
+        assumed.append(Assumption("separator", str(layout.separator), words, "layout=dict(separator=NAME)", False))
     if given.decimal is None and comma:
-        shown = next(c.strip() for line in cut for c in line.cells if DECIMAL_COMMA.fullmatch(c.strip()))
+        shown = _decimal_comma(cut)
         words, otherwise = f"decimal commas, as in {shown!r}", "layout=dict(decimal='point')"
         assumed.append(Assumption("decimal", "comma", words, otherwise))
     if given.skip is None and skip:

@@ -44,6 +44,7 @@ class _Trouble:
     blank: bool
     comma: bool
     moments: bool = False
+    sheet: bool = False
 
     def error(self, column: str, source: str) -> DataError:
         thing = f"{source}: column {column!r}, line {self.line}"
@@ -51,7 +52,7 @@ class _Trouble:
         shown = repr(text if len(text) <= 40 else text[:40] + "…")
         way_out = "correct or remove these rows"
         if not text:
-            what = "empty cell"
+            what = "empty cell" + (", or one with an error or a formula that nobody computed" if self.sheet else "")
             way_out = "fill or remove these rows yourself, or let them be missing with missing='weight' or 'hold'"
         elif self.comma and "." in text and is_number(text):
             what = f"{shown} has a point where decimals follow a comma"
@@ -71,6 +72,7 @@ class _Rows:
     """What the blocks of a text hold so far."""
 
     found: Found
+    sheet: bool = False
     count: int = 0
     ragged: int = 0
     ragged_line: int = 0
@@ -139,7 +141,7 @@ def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: s
     if not sample:
         raise DataError(f"{source}: the file is empty, 0 rows; choose a file that holds a record")
     found = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
-    rows = _Rows(found)
+    rows = _Rows(found, sheet is not None)
     for first, lines in itertools.chain(begun, blocks):
         _take(rows, first, lines, mark, source)
     columns = _columns(rows, path, source)
@@ -353,8 +355,9 @@ def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], v
     known = rows.troubles.get(index)
     if known is None:
         rows.troubles[index] = _Trouble(
-            lines[bad[0]], rows.count + bad[0], column[bad[0]], len(bad), blank and not dated, comma, bool(dated)
-        )
+            lines[bad[0]], rows.count + bad[0], column[bad[0]], len(bad), blank and not dated, comma, bool(dated),
+            rows.sheet,
+        )  # fmt: skip
     else:
         known.count += len(bad)
         known.blank &= blank and not dated
