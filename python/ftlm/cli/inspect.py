@@ -17,6 +17,12 @@ from ftlm.cli.words import in_options
 from ftlm.data.inspection import inspect_run
 from ftlm.rig.quanser import driver_state
 
+#: What reads which files, and the extra that installs it.
+_READERS = {
+    "scipy": (".mat files", "mat"), "h5py": (".mat files of version 7.3 and HDF5", "hdf5"),
+    "pyarrow": ("parquet and feather", "parquet"), "python-calamine": ("xlsx and ods", "excel"),
+}  # fmt: skip
+
 
 @command
 def open_(
@@ -49,16 +55,17 @@ def doctor(*, as_json: Json = False) -> None:
         "cores": available_threads(),
         "simd": _core.SIMD,
         "numpy": _installed("numpy"),
-        "scipy": _installed("scipy"),
+        **{package: _installed(package) for package in _READERS},
         "rig driver": driver_state(),
     }
     if as_json:
         print(json.dumps(about, indent=1))
         return
     for name, value in about.items():
-        print(f"{name:<12}{value if value is not None else 'not installed'}")
-    if about["scipy"] is None:
-        print("scipy is needed for .mat files: pip install 'ftlm[mat]'")
+        print(f"{name:<17}{value if value is not None else 'not installed'}")
+    for package, (files, extra) in _READERS.items():
+        if about[package] is None:
+            print(f"{package} is needed for {files}: pip install 'ftlm[{extra}]'")
 
 
 def _installed(package: str) -> str | None:
