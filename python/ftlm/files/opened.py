@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -21,6 +22,8 @@ from ftlm.files.load import Options, PathLike, Wanted, load, run_from, tables_of
 from ftlm.files.roles import guessed_roles, known_unit, signal_names
 
 _SHOWN = 40
+#: What the error of a column says of its first bad cell.
+_IN_LINE = re.compile(r"line \d+: .*?(?=, first at)")
 
 
 @dataclass(frozen=True)
@@ -126,7 +129,8 @@ class OpenedFile:
         shown = self.columns[:_SHOWN]
         cells = [heads, *((_printed(c.name), _role(c), _printed(c.unit), *_figures(c)) for c in shown)]
         widths = [max(len(row[k]) for row in cells) for k in range(6)]
-        lines = [f"{_printed(self.path)}: {self.kind}; {self.rows} rows, {len(self.columns)} columns"]
+        counts = f"{self.rows} row{'s' * (self.rows != 1)}, {len(self.columns)} column{'s' * (len(self.columns) != 1)}"
+        lines = [f"{_printed(self.path)}: {self.kind}; {counts}"]
         lines += ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells]
         if len(self.columns) > _SHOWN:
             lines.append(f"… and {len(self.columns) - _SHOWN} more")
@@ -270,7 +274,7 @@ class _Opening:
         if header is not None and not wanted.inputs and not wanted.outputs:
             wanted.inputs, wanted.outputs = {n: n for n in header.inputs}, {n: n for n in header.outputs}
         elif not wanted.inputs and not wanted.outputs:
-            free = [c.name for c in every if c is not clock and c.problem is None and c.name and c.name.isprintable()]
+            free = [c.name for c in every if c is not clock and _holds(c) and c.name and c.name.isprintable()]
             drives, follows = guessed_roles(free)
             names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
             wanted.inputs, wanted.outputs = {names[c]: c for c in drives}, {names[c]: c for c in follows}
@@ -289,7 +293,7 @@ class _Opening:
             said.append(Assumption("inputs", inputs, words, "inputs={name: column}, outputs={name: column}"))
         left = ""
         if not wanted.outputs:
-            choice = listed((c.name for c in every if c is not clock and c.problem is None), 20)
+            choice = listed((c.name for c in every if c is not clock and _holds(c)), 20)
             left = (
                 "which columns are inputs and which are outputs, their names do not say; name them with "
                 f"inputs={{name: column}} and outputs={{name: column}}; there are {choice}"
@@ -318,13 +322,20 @@ class _Opening:
         return options | ({"layout": layout} if layout != Layout() else {})
 
 
+def _holds(column: Column) -> bool:
+    """Whether a column holds numbers, gaps or not."""
+    return column.problem is None or column.blank
+
+
 def _shown(column: Column, roles: Mapping[str, tuple[str, str]]) -> FileColumn:
     role, signal = roles.get(column.name, ("", ""))
     unit, values = column.stated, column.values
     if column.moments is not None:
         return FileColumn(column.name, role, signal, unit, None, None, None, f"from {column.moments.first}")
-    if values is None or not values.size or (column.problem is not None and not column.blank):
-        return FileColumn(column.name, role, signal, unit, None, None, None, "no numbers")
+    if values is None or not values.size or not _holds(column):
+        why = _IN_LINE.search(str(column.problem))
+        words = "no numbers" if why is None else f"no numbers ({why[0]})"
+        return FileColumn(column.name, role, signal, unit, None, None, None, words)
     there = values[~np.isnan(values)]
     if not there.size:
         return FileColumn(column.name, role, signal, unit, None, None, None, "empty")
@@ -337,7 +348,7 @@ def _role(column: FileColumn) -> str:
 
 def _figures(column: FileColumn) -> tuple[str, str, str]:
     if column.first is None or column.low is None or column.high is None:
-        return column.words, "", ""
+        return _printed(column.words), "", ""
     return f"{column.first:.5g}", f"{column.low:.5g}", f"{column.high:.5g}"
 
 

@@ -342,6 +342,8 @@ def _gather(hdf5: Any, group: Any, prefix: str, found: Arrays, depth: int) -> No
                 _gather(hdf5, item, f"{name}/", found, depth + 1)
         elif not isinstance(item, hdf5.Dataset) or (kind and kind not in NUMERIC):
             found.header["skipped"][name] = kind or "no array"
+        elif not has_numbers(item):
+            found.header["skipped"][name] = "no numbers"
         elif item.is_virtual or item.external:
             found.header["skipped"][name] = "its numbers lie in other files"
         elif "MATLAB_empty" in item.attrs:
@@ -352,6 +354,14 @@ def _gather(hdf5: Any, group: Any, prefix: str, found: Arrays, depth: int) -> No
             unit = unit.decode(errors="replace") if isinstance(unit, bytes) else unit if isinstance(unit, str) else ""
             # MATLAB counts along columns, so that what it writes is turned.
             found.add(name, values.T if kind and values.ndim == 2 else values, unit)
+
+
+def has_numbers(item: Any) -> bool:
+    """Whether NumPy knows the type of an array of HDF5, and it is none of objects."""
+    try:
+        return not item.dtype.hasobject
+    except (TypeError, ValueError):
+        return False
 
 
 def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:

@@ -137,7 +137,7 @@ def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: s
     blocks = _line_blocks(path, stream, encoding)
     # Of sheets, no cell begins a remark.
     mark = "#" if sheet is None else "\0"
-    begun, sample = _sample(blocks, layout, mark)
+    begun, sample, remark = _sample(blocks, layout, mark)
     if not sample:
         raise DataError(f"{source}: the file is empty, 0 rows; choose a file that holds a record")
     found = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
@@ -150,27 +150,39 @@ def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: s
         found = replace(found, layout=replace(found.layout, separator=None, decimal=None))
     kind = f"sheet {sheet!r}" if sheet else f"text ({encoding}, {SEPARATOR_WORDS[found.separator]} between cells)"
     assumed = () if header is not None else guessed + found.assumed
+    if found.names is None:
+        assumed = tuple(_with_remark(a, remark, found.width) for a in assumed)
     return FileTable(path, columns, True, header, layout=what.under(found.layout), assumed=assumed, kind=kind)
+
+
+def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
+    """What was assumed of names, with a remark above the rows that may hold them, as NumPy writes it."""
+    words = remark.lstrip("# \t").replace(",", " ").split()
+    if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
+        return assumption
+    return replace(assumption, words=f"{assumption.words} (a remark above them has as many words: {' '.join(words)})")
 
 
 def _sample(
     blocks: Iterator[tuple[int, list[str]]], layout: Layout, mark: str
-) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]]]:
-    """The blocks that have begun, and the first lines of the text that hold something."""
+) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]], str]:
+    """The blocks that have begun, the first lines of the text that hold something, and the remark above them."""
     begun: list[tuple[int, list[str]]] = []
     sample: list[tuple[int, str]] = []
-    size = 0
+    size, remark = 0, ""
     for first, lines in blocks:
         begun.append((first, lines))
         for at, line in enumerate(lines, first):
             if size > _SAMPLE and len(sample) >= _SAMPLE_LINES:
                 break
+            if not sample and line.lstrip()[:1] == mark:
+                remark = line[:400]
             if _holds(line, mark):
                 sample.append((at, line))
                 size += len(line) if at > (layout.skip or 0) else 0
         if size > _SAMPLE and len(sample) >= _SAMPLE_LINES:
             break
-    return begun, sample
+    return begun, sample, remark
 
 
 def _holds(line: str, mark: str) -> bool:
@@ -261,9 +273,10 @@ def _encoding(stream: BinaryIO | _Limited, layout: Layout, path: Path) -> tuple[
     except UnicodeDecodeError as error:
         if any(code in head for code in (*range(9), *range(14, 32))):
             at = head[: error.start].count(b"\n") + 1
+            zipped = ": it begins as workbooks do, whose names end in .xlsx or .ods" if head[:2] == b"PK" else ""
             raise DataError(
                 f"{path.name}: line {at} is not UTF-8 text (byte {head[error.start]:#04x}), and other bytes are of no "
-                "text at all; say layout=dict(encoding=NAME), or pass a csv, text or .mat file"
+                f"text at all{zipped}; say layout=dict(encoding=NAME), or pass a csv, text or .mat file"
             ) from None
         words = f"no UTF-8 (byte {head[error.start]:#04x}), taken for cp1252 of Windows, which numbers do not depend on"
         otherwise = "layout=dict(encoding=NAME)"
