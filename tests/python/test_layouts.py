@@ -129,6 +129,10 @@ OPEN = {
         "t;u;y\n23:59:58;1;2\n23:59:59;1;3\n00:00:00;1;4\n00:00:01;1;4\n",
         ["'t' (time)", "decreasing"],
     ),
+    "rows above a table of another width": (
+        "0;1;2\n1;2\n2;3\n3;4\n4;5\n",
+        ["line 1 has 3 numbers, 1 such lines in all", "table of 2 cells", "skip=LINES"],
+    ),
     "words among the first numbers": ("0.0;abc;3\n1;2;3\n2;2;3\n", ["line 1", "'abc'", "neither a header nor a row"]),
     "numbers among names": ("t;5;u;y\n0;1;2;3\n1;1;2;3\n2;1;2;3\n", ["'5'"]),
     "gzip within gzip": (gzip.compress(gzip.compress(rows().encode())), ["x.csv"]),

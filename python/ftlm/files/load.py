@@ -180,7 +180,11 @@ def run_from(tables: list[FileTable], wanted: Wanted, options: Options) -> Run:
     if name is None:
         stem = stem_of(tables[0].path)
         name = header.name if header is not None else stem if is_run_name(stem) else "run"
-    facts = tuple(f"{a}" for table in tables for a in table.assumed if a.counts) + clock.facts
+    several = len(tables) > 1
+    facts = tuple(
+        f"{table.path.name}: {a}" if several else str(a) for table in tables for a in table.assumed if a.counts
+    )
+    facts += clock.facts
     asked = Asked(
         given_inputs, given_outputs, step=wanted.step, time=clock.times, units=wanted.units,
         intersample=wanted.intersample, name=name, resample=options.resample, window=options.window,

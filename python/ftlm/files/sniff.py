@@ -118,6 +118,8 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
     top = first if given.skip is None or given.header is None else min(given.header, len(cut))
     names, units, top = _header(cut, top, width, given, source, own=own)
     layout, assumed = _said(cut, given, separator, comma, names, units, top, first)
+    if given.skip is None:
+        _check_above(cut[: top - (0 if names is None else 1 if units is None else 2)], width, source)
     if not own and names is None and top < len(cut):
         _check_headless(cut[top], source, given)
     if names is not None and not own and given.separator is None:
@@ -282,6 +284,17 @@ def _check_headless(line: _Line, source: str, given: Layout) -> None:
     """Refuse words among the numbers of a first row: it could be a header as well."""
     if line.words and given.header is None:
         raise _mixed_line(line, source)
+
+
+def _check_above(above: list[_Line], width: int, source: str) -> None:
+    """Refuse to leave out what may be rows: lines of several numbers and nothing else."""
+    rows = [line for line in above if line.full and sum(map(is_number, line.cells)) > 1]
+    if rows:
+        raise DataError(
+            f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
+            f"a table of {width} cells a row; give every line the same number of cells, or say how many lines to leave "
+            "out with layout=dict(skip=LINES)"
+        )
 
 
 def _mixed_line(line: _Line, source: str) -> DataError:
