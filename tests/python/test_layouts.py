@@ -57,6 +57,18 @@ def test_what_is_found_is_said_and_saying_it_gives_the_same_run(tmp_path, case):
     assert any(w == "decimal commas, as in '0,0'; otherwise layout=dict(decimal='point')" for w in run.warnings)
 
 
+def test_units_and_settings_of_an_oscilloscope_are_no_row(tmp_path):
+    lines = "".join(f"{k},{k % 3}.5,{k},,\n" for k in range(9))
+    text = "X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,-1.2e-03,1.0e-03\n" + lines
+    opened = ftlm.open_file(write(tmp_path, text), step=1e-3, inputs={"u": "CH1"}, outputs={"y": "CH2"})
+    assert [c.unit for c in opened.columns] == ["Sequence", "Volt", "Volt", "-1.2e-03", "1.0e-03"]
+    np.testing.assert_array_equal(opened.load()["y"], np.arange(9))
+    # Words that are no units stay a damaged row.
+    messages(
+        ["line 2", "'open'"], lambda: ftlm.load(write(tmp_path, text.replace("Volt", "open")), outputs=["CH1"], step=1)
+    )
+
+
 def test_a_layout_that_is_said_is_not_looked_for(tmp_path):
     # Names that are numbers, and a first row that could be names.
     odd = write(tmp_path, "1;2;3\n0;0,5;x\n1;0,6;1\n2;0,7;2\n3;0,8;4\n")

@@ -19,6 +19,8 @@ _THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
 _PAIRS = re.compile(r"\s*[+-]?\d+,\d+(?:,\s+[+-]?\d+,\d+)+\s*")
 #: What LabVIEW puts above the cells of remarks that few rows have.
 _REMARKS = "comment"
+#: What oscilloscopes call the unit of a column that counts rows.
+_COUNTED = "sequence"
 
 
 @dataclass(frozen=True)
@@ -212,7 +214,9 @@ def _first_row(cut: list[_Line], width: int) -> int:
     first = next((k for k, line in enumerate(cut) if alike(line) and line.count), None)
     if first is None:
         first = next(k for k, line in enumerate(cut) if line is rows[0])
-    while first > 0 and cut[first - 1].width == width and cut[first - 1].count and not _above_units(cut, first):
+    while first > 0 and cut[first - 1].width == width and cut[first - 1].count:
+        if _above_units(cut, first) or _settings(cut, first - 1):
+            break
         first -= 1
     return first
 
@@ -220,6 +224,15 @@ def _first_row(cut: list[_Line], width: int) -> int:
 def _above_units(cut: list[_Line], first: int) -> bool:
     """Whether the line above is a header although it holds numbers, as of channels 1 and 2: units stand below it."""
     return first < len(cut) and _units(cut[first])
+
+
+def _settings(cut: list[_Line], at: int) -> bool:
+    """Whether a line below one of names holds units and settings, as oscilloscopes write start and increment there."""
+    line = cut[at]
+    words = [c.strip() for c, n in zip(line.cells, line.numbers, strict=True) if c.strip() and not n]
+    units = [word for word in words if is_unit(word)]
+    others = {word.casefold() for word in words if not is_unit(word)}
+    return at > 0 and cut[at - 1].named and line.count > 0 and bool(units) and others <= {_COUNTED}
 
 
 def _units(line: _Line) -> bool:
@@ -244,9 +257,10 @@ def _header(
     count = given.header
     if count is None:
         count = 0
-        if top > 0 and (cut[top - 1].named or own):
+        units_above = top > 1 and (_units(cut[top - 1]) or _settings(cut, top - 1))
+        if top > 0 and (cut[top - 1].named or own or units_above):
             count = 1
-            if top > 1 and _units(cut[top - 1]) and len(fitted(cut[top - 2])) == width and cut[top - 2].words:
+            if units_above and len(fitted(cut[top - 2])) == width and cut[top - 2].words:
                 count = 2
             elif len(fitted(cut[top - 1])) != width and top > 1:
                 count = 0
