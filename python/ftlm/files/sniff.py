@@ -281,17 +281,22 @@ def _header(
             f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is no line of names; say "
             "layout=dict(decimal='comma')"
         )
-    times = Counter(names)
-    for name in names:
-        if name and times[name] > 1:
-            raise DataError(
-                f"{source}: line {line.at}: the column name {name!r} is there {times[name]} times; rename all but one"
-            )
+    check_distinct(names, line.at, source)
     if count == 1:
         return names, None, top
     units = [unit_of(cell) for cell in cut[top - 1].cells]
     units += [""] * (len(names) - len(units))
     return names, units[: len(names)], top
+
+
+def check_distinct(names: list[str], at: int, source: str) -> None:
+    """Refuse a name of a header that is there twice."""
+    times = Counter(names)
+    for name in names:
+        if name and times[name] > 1:
+            raise DataError(
+                f"{source}: line {at}: the column name {name!r} is there {times[name]} times; rename all but one"
+            )
 
 
 def _check_headless(line: _Line, source: str, given: Layout) -> None:
