@@ -1,6 +1,7 @@
 """Files of strangers: from each to a validated model by one command, the truth within its intervals; `ftlm open`."""
 
 import json
+import re
 import shlex
 
 import numpy as np
@@ -63,6 +64,16 @@ def test_the_record_is_the_one_that_was_written_and_open_says_all_that_was_assum
     assert said <= set(plain.warnings)
     assert plain.step == run.step == opened.step
     assert all(run[n].tobytes() == plain[n].tobytes() for n in run.signals)
+
+
+def test_the_manual_shows_what_is_printed(files, monkeypatch, root):
+    folder, made = files
+    monkeypatch.chdir(folder)
+    (block,) = re.findall(r"^```text\n(.*?)^```", (root / "docs" / "files.md").read_text(encoding="utf-8"), re.S | re.M)
+    shown, printed = block.splitlines(), command("open", made["German csv"].name).stdout.splitlines()
+    assert shown[0] == "$ ftlm open messung.csv"
+    for line, real in zip(shown[1:], printed, strict=True):
+        assert real.startswith(line.removesuffix("…"))
 
 
 @pytest.mark.parametrize("name", ["German csv", "LabVIEW text", "oscilloscope", "dates", "xlsx", "utf-16"])
