@@ -145,6 +145,11 @@ OPEN = {
         "0;1;2\n1;2\n2;3\n3;4\n4;5\n",
         ["line 1 has 3 numbers, 1 such lines in all", "table of 2 cells", "skip=LINES"],
     ),
+    "rows of decimal commas above a table": (
+        "0,5;1,5;2\n1,5;2\n2,5;3\n3,5;4\n4,5;5\n",
+        ["line 1 has 3 numbers, 1 such lines in all"],
+    ),
+    "a short first row": ("t;u;y\n0\n1;2;3\n2;3;3\n3;4;4\n", ["line 2 has 1 cells where the line of names has 3"]),
     "words among the first numbers": ("0.0;abc;3\n1;2;3\n2;2;3\n", ["line 1", "'abc'", "neither a header nor a row"]),
     "numbers among names": ("t;5;u;y\n0;1;2;3\n1;1;2;3\n2;1;2;3\n", ["'5'"]),
     "gzip within gzip": (gzip.compress(gzip.compress(rows().encode())), ["x.csv"]),

@@ -121,7 +121,7 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
     names, units, top = _header(cut, top, width, given, source, own=own)
     layout, assumed = _said(cut, given, separator, comma, names, units, top, first)
     if given.skip is None:
-        _check_above(cut[: top - (0 if names is None else 1 if units is None else 2)], width, source)
+        _check_above(cut[: top - (0 if names is None else 1 if units is None else 2)], width, source, comma=comma)
     if not own and names is None and top < len(cut):
         _check_headless(cut[top], source, given)
     if names is not None and not own and given.separator is None:
@@ -218,7 +218,11 @@ def _first_row(cut: list[_Line], width: int) -> int:
         if _above_units(cut, first) or _settings(cut, first - 1):
             break
         first -= 1
-    return first
+    # Short rows right below a line of names are rows; what is wrong with them is said when all are read.
+    above = first
+    while above > 0 and cut[above - 1].full:
+        above -= 1
+    return above if above > 0 and cut[above - 1].named and cut[above - 1].width == width else first
 
 
 def _above_units(cut: list[_Line], first: int) -> bool:
@@ -305,9 +309,9 @@ def _check_headless(line: _Line, source: str, given: Layout) -> None:
         raise _mixed_line(line, source)
 
 
-def _check_above(above: list[_Line], width: int, source: str) -> None:
+def _check_above(above: list[_Line], width: int, source: str, *, comma: bool) -> None:
     """Refuse to leave out what may be rows: lines of several numbers and nothing else."""
-    rows = [line for line in above if line.full and sum(map(is_number, line.cells)) > 1]
+    rows = [line for line in above if line.full and sum(is_number(cell, comma=comma) for cell in line.cells) > 1]
     if rows:
         raise DataError(
             f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
