@@ -11,7 +11,7 @@ import pytest
 
 import ftlm
 import strangers
-from ftlm.files import apart, text
+from ftlm.files import apart, reader, text
 from test_files import messages, rows, write
 
 SIGNALS = {"inputs": {"u": "u"}, "outputs": {"y": "y"}}
@@ -298,6 +298,15 @@ def test_a_workbook_that_is_none_or_too_large_is_refused(tmp_path):
     whole = sheet(tmp_path, [HEAD, *BODY]).read_bytes()
     for bad in (b"", b"PK\x03\x04", whole[:-30], whole[: len(whole) // 2], b"t,u,y\n" + rows().encode()):
         messages(["x.xlsx", "damaged"], lambda bad=bad: read(tmp_path, bad, "x.xlsx"))
+    good, refused = reader.read_sheet(str(tmp_path / "x.xlsx"), None), 0
+    for at in range(50, len(whole), 17):
+        # A flipped bit is refused, or is none of the sheet's.
+        path = write(tmp_path, whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :], "flipped.xlsx")
+        out = io.BytesIO()
+        reader.answer("sheet", str(path), out, 1 << 20, None)
+        refused += b'"error"' in out.getvalue()
+        assert b'"error"' in out.getvalue() or out.getvalue().endswith(good[1])
+    assert refused > 200
     out = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(whole)) as book, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as bomb:
         for entry in book.infolist():

@@ -371,6 +371,11 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
             size = sum(entry.file_size for entry in archive.infolist())
         if size > SIZE_LIMIT:
             raise UnreadableError(f"unpacked, it has {size} bytes, more than {SIZE_LIMIT}", "save a part of it")
+        # What reads the sheet does not come to the checksum of each part, which stands behind it.
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise UnreadableError(f"the checksum of {damaged!r} in it is another")
     calamine: Any = importlib.import_module("python_calamine")
     book = calamine.CalamineWorkbook.from_path(path)
     names = list(book.sheet_names)
