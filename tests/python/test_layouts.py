@@ -298,7 +298,7 @@ def test_a_workbook_that_is_none_or_too_large_is_refused(tmp_path):
     whole = sheet(tmp_path, [HEAD, *BODY]).read_bytes()
     for bad in (b"", b"PK\x03\x04", whole[:-30], whole[: len(whole) // 2], b"t,u,y\n" + rows().encode()):
         messages(["x.xlsx", "damaged"], lambda bad=bad: read(tmp_path, bad, "x.xlsx"))
-    good, refused = reader.read_sheet(str(tmp_path / "x.xlsx"), None), 0
+    good, refused = reader.read_sheet(str(write(tmp_path, whole, "whole.xlsx")), None), 0
     for at in range(50, len(whole), 17):
         # A flipped bit is refused, or is none of the sheet's.
         path = write(tmp_path, whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :], "flipped.xlsx")
