@@ -246,8 +246,8 @@ def test_names_with_scripts_are_names(tmp_path, name):
 # --- sheets -----------------------------------------------------------------------------------------------------------
 
 
-def sheet(folder, table, name="x.xlsx", **more):
-    """A workbook of one sheet, or of several."""
+def sheet(folder, table, name="x.xlsx", merged=(), **more):
+    """A workbook of one sheet, or of several; of the first, ranges of cells may be merged."""
     openpyxl = pytest.importorskip("openpyxl")
     book = openpyxl.Workbook()
     book.active.title = "first"
@@ -255,6 +255,8 @@ def sheet(folder, table, name="x.xlsx", **more):
         page = book[title] if title in book.sheetnames else book.create_sheet(title)
         for line in lines:
             page.append(line)
+    for cells in merged:
+        book["first"].merge_cells(cells)
     book.save(folder / name)
     return folder / name
 
@@ -281,6 +283,14 @@ def test_bad_sheets_are_refused_in_words(tmp_path, case):
     lines, words = BAD_SHEETS[case]
     path = sheet(tmp_path, lines)
     messages(["x.xlsx", *words], lambda: ftlm.load(path, **SIGNALS))
+
+
+def test_what_merged_cells_cover_is_empty(tmp_path):
+    path = sheet(tmp_path, [["a title", None, None], HEAD, *BODY], merged=["A1:C1", "B4:B6"])
+    messages(["'u', line 5", "empty cell", "row 2, 2 in all"], lambda: ftlm.load(path, **SIGNALS))
+    held = ftlm.load(path, **SIGNALS, missing="hold")
+    np.testing.assert_array_equal(held["u"][:5], [0, 1, 1, 1, 1])
+    assert "input u: 2 of 9 rows" in " ".join(held.warnings)
 
 
 def test_sheets_of_a_workbook_and_what_is_not_used_with_them(tmp_path):
