@@ -21,7 +21,9 @@ if _typing.TYPE_CHECKING:
     from ftlm.data.run import Run
     from ftlm.data.solved import Estimate
     from ftlm.data.structures import SensorFilter, Structure
+    from ftlm.files.layout import Assumption, Layout
     from ftlm.files.load import load
+    from ftlm.files.opened import FileColumn, OpenedFile, open_file
     from ftlm.fit.genetic import Genetic
     from ftlm.fit.interval import ProfileInterval
     from ftlm.fit.recursion import Trace, multi_innovation_trace
@@ -53,16 +55,17 @@ if _typing.TYPE_CHECKING:
     )
 
 __all__ = [
-    "PARAMETERS", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation", "Estimate",
-    "FeedbackTest", "Friction", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria",
-    "InternalError", "Lattice", "LinkParameters", "Metrics", "Model", "ModelError", "Order", "OutputResiduals",
-    "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow",
-    "Selection", "SensorFilter", "StoreStatus", "Stribeck", "Structure", "Term", "Trace", "Trial", "__version__",
-    "block_pulse_matrix", "compare", "equation", "explicit_euler", "flexible_link", "fractional_derivative",
-    "fractional_integral", "haar_inverse", "haar_matrix", "haar_transform", "identify", "identify_many",
-    "information_criteria", "lattice", "link_model", "load", "load_model", "metrics", "multi_innovation_trace",
-    "operational_matrix", "order_law", "physical_parameters", "reproduce", "resid", "resume_search", "rig",
-    "search_orders", "search_status", "select", "simulate",
+    "PARAMETERS", "Assumption", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation",
+    "Estimate", "FeedbackTest", "FileColumn", "Friction", "FtlmError", "Genetic", "Identification", "Identified",
+    "InformationCriteria", "InternalError", "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError",
+    "OpenedFile", "Order", "OutputResiduals", "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals",
+    "RigFault", "Run", "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck",
+    "Structure", "Term", "Trace", "Trial", "__version__", "block_pulse_matrix", "compare", "equation",
+    "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse",
+    "haar_matrix", "haar_transform", "identify", "identify_many", "information_criteria", "lattice", "link_model",
+    "load", "load_model", "metrics", "multi_innovation_trace", "open_file", "operational_matrix", "order_law",
+    "physical_parameters", "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status", "select",
+    "simulate",
 ]  # fmt: skip
 
 #: Where each name lives.
@@ -80,7 +83,9 @@ _HOMES = {
         "data.run": "Run",
         "data.solved": "Estimate",
         "data.structures": "SensorFilter Structure",
+        "files.layout": "Assumption Layout",
         "files.load": "load",
+        "files.opened": "FileColumn OpenedFile open_file",
         "fit.genetic": "Genetic",
         "fit.interval": "ProfileInterval",
         "fit.recursion": "Trace multi_innovation_trace",

@@ -1,6 +1,7 @@
 """Everything of ftlm that reads what others wrote, as functions of bytes that may only end well or in an FtlmError."""
 
 import functools
+import gzip
 import os
 import struct
 import tempfile
@@ -12,7 +13,8 @@ import numpy as np
 
 import ftlm
 from ftlm.data.orders import Order, parse_values
-from ftlm.files import apart
+from ftlm.files import apart, reader
+from ftlm.files.layout import Layout
 from ftlm.search import frames
 
 #: Files of the fuzzers live in memory where there is such a place.
@@ -36,6 +38,32 @@ def csv(data):
     _used(ftlm.load(_file(".csv", data), time=0, inputs={"u": 1}, outputs={"y": 2}))
 
 
+def opened(data):
+    """A file whose layout nobody says."""
+    found = ftlm.open_file(_file(".txt", data))
+    str(found)
+    if not found.problem:
+        run = found.load()
+        _used(run)
+        assert (run.length, run.step) == (found.rows if "missing" not in found.options else run.length, found.step)
+
+
+def packed(data):
+    """A csv packed by gzip: damaged inside, or outside."""
+    ftlm.open_file(_file(".csv.gz", data))
+
+
+def _read(kind, suffix):
+    """What the child does, in this process: many more inputs a second; crashes would be seen."""
+
+    def read(data):
+        path = str(_file(suffix, data))
+        with open(os.devnull, "wb") as out:
+            reader.answer(kind, path, out, reader.SIZE_LIMIT, None)
+
+    return read
+
+
 def csv_header(data):
     """The header that ftlm writes, over good numbers."""
     _used(ftlm.load(_file(".csv", data + b"\nt,u,y\n0,1,2\n0.1,1,3\n0.2,0,4\n0.3,0,4\n")))
@@ -57,7 +85,7 @@ def parquet(data):
 def answer(data):
     """What the child that reads .mat and parquet files says; it may have been taken over by the file."""
     answers = apart._Answers(data)
-    while answers.table(Path("x.mat")) is not None:
+    while answers.table(Path("x.mat"), Layout()) is not None:
         pass
 
 
@@ -107,8 +135,18 @@ def stored(data):
 
 TARGETS = {
     f.__name__: f
-    for f in (csv, csv_header, columns, mat, parquet, answer, model, equation, order, values, sealed, stored)
-}
+    for f in (
+        csv, csv_header, opened, packed, columns, mat, parquet, answer, model, equation, order, values, sealed, stored
+    )
+} | {
+    "read_sheet": _read("sheet", ".xlsx"), "read_hdf5": _read("hdf5", ".h5"), "read_numpy": _read("numpy", ".npz"),
+    "read_feather": _read("feather", ".feather"),
+}  # fmt: skip
+#: What must be installed for some.
+NEEDS = {
+    "mat": "scipy", "parquet": "pyarrow", "read_feather": "pyarrow", "read_hdf5": "h5py",
+    "read_sheet": "python_calamine",
+}  # fmt: skip
 #: Those that start a child for every input.
 SLOW = ("mat", "parquet")
 
@@ -131,6 +169,33 @@ def seeds(target):
         return _seeds(target, Path(folder))
 
 
+def _binary_seeds(target, folder, u, y):
+    path = folder / "a"
+    if target == "read_sheet":
+        from openpyxl import Workbook
+
+        book = Workbook()
+        for row in (["t", "u", "y"], *([0.1 * k, a, b] for k, (a, b) in enumerate(zip(u, y, strict=True)))):
+            book.active.append(list(map(lambda v: v if isinstance(v, str) else float(v), row)))
+        book.save(path)
+    elif target == "read_hdf5":
+        import h5py
+
+        with h5py.File(path, "w") as file:
+            file["u"], file["group/y"] = u, y
+            file.create_dataset("z", data=np.outer(u, y), chunks=(8, 8), compression="gzip")
+            file["y"] = h5py.SoftLink("/group/y")
+    elif target == "read_numpy":
+        with open(path, "wb") as stream:
+            np.savez(stream, t=0.1 * np.arange(y.size), u=u, y=y, both=np.column_stack([u, y]), word=np.array("a"))
+    else:
+        import pandas
+
+        stamps = pandas.date_range("2024-05-01", periods=y.size, freq="s")
+        pandas.DataFrame({"stamp": stamps, "u": u, "y": y}).to_feather(path)
+    return (path.read_bytes(),)
+
+
 def _seeds(target, folder):
     n = 24
     u = np.where(np.arange(n) % 8 < 4, 1.0, -1.0)
@@ -146,6 +211,15 @@ def _seeds(target, folder):
         plain = b"t;u;y\r\n" + b"".join(b"%d,5;1,25;-2e-3\r\n" % i for i in range(9))
         bare = b"\xef\xbb\xbf# note\n" + b"".join(b"%.2f 1 %d\n" % (i / 100, i) for i in range(9))
         return (own, plain, bare) if target == "csv" else (own.split(b"\n")[0],)
+    if target in ("opened", "packed"):
+        plain = b"t;u;y\r\n" + b"".join(b"%d,5;1,25;-2e-3\r\n" % i for i in range(9))
+        log = b"Log 3\n\nDate/Time,in,out\n-,V,mm\n" + b"".join(
+            b"2024-05-01 12:00:0%d,1,%d\n" % (i, i) for i in range(9)
+        )
+        good = (plain, log, plain.decode().encode("utf-16"), "Zeit [ms]\tStrom (A)\tWeg\n1\t2\t3\n".encode("cp1252"))
+        return good if target == "opened" else tuple(gzip.compress(g, mtime=0) for g in good)
+    if target.startswith("read_"):
+        return _binary_seeds(target, folder, u, y)
     if target == "columns":
         return (b'time = "t"\nstep = 0.1\n[inputs]\nu = "u"\n[outputs]\ny = 2\n[units]\ny = "deg"\n',)
     if target == "mat":

@@ -39,7 +39,8 @@ def check(case, kind, folder, page):
         for name, column in options.get(part, {"inputs": {"u": "u"}, "outputs": {"y": "y"}}[part]).items():
             assert np.array_equal(run[name], np.asarray(data[column], float))
     assert verdict in ("said", "taken")
-    told = np.asarray(data["t"], float)
+    dated = data["t"].dtype.kind == "U"
+    told = np.asarray(data["t"].astype("datetime64[s]").astype(float) if dated else data["t"], float)
     assert np.allclose(run.time, told - told[0], rtol=1e-9, atol=0.02 * run.step)
 
 

@@ -3,17 +3,15 @@
 import pytest
 
 from fuzz import REGRESSIONS, fault, fuzz
-from targets import SLOW, TARGETS
+from targets import NEEDS, SLOW, TARGETS
 
 KEPT = sorted(path for path in REGRESSIONS.rglob("*") if path.is_file())
 
 
 @pytest.mark.parametrize("target", TARGETS)
 def test_mutations_end_well_or_in_an_error_of_ftlm(target):
-    if target == "mat":
-        pytest.importorskip("scipy")
-    if target == "parquet":
-        pytest.importorskip("pyarrow")
+    if target in NEEDS:
+        pytest.importorskip(NEEDS[target])
     count = 4 if target in SLOW else 400
     tried, faults = fuzz(target, seed=1, inputs=count)
     assert (tried, faults) == (count, {})

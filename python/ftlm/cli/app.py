@@ -12,7 +12,7 @@ import typer
 from ftlm import _core
 from ftlm.cli.command import Command
 from ftlm.cli.identify import identify, resume, search, status
-from ftlm.cli.inspect import doctor, inspect
+from ftlm.cli.inspect import doctor, inspect, open_
 from ftlm.cli.judge import compare, export, plot, report, resid, simulate
 from ftlm.cli.paper import demo, orders, reproduce
 from ftlm.cli.record import record
@@ -41,10 +41,10 @@ def version(
 
 
 for _command in (
-    demo, record, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce,
+    demo, record, open_, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce,
     orders, plot, export, doctor,
 ):  # fmt: skip
-    app.command(cls=Command)(_command)
+    app.command(_command.__name__.rstrip("_"), cls=Command)(_command)
 
 
 def main() -> None:

@@ -18,7 +18,9 @@ from ftlm.data.lattice import Lattice, lattice
 from ftlm.data.run import Run
 from ftlm.data.settings import Criterion
 from ftlm.data.structures import START_WORDS, SensorFilter, Structure, check_initial
+from ftlm.files.layout import Layout
 from ftlm.files.load import load
+from ftlm.files.opened import OpenedFile, open_file
 from ftlm.fit.genetic import Genetic
 
 #: Options that may be left out.
@@ -26,7 +28,7 @@ Text = str | None
 Number = float | None
 Texts = list[str] | None
 
-Files = Annotated[list[str], Argument(metavar="FILE...", help="csv or .mat files; several files are several runs.")]
+Files = Annotated[list[str], Argument(metavar="FILE...", help="Measured files; several files are several runs.")]
 SavedModel = Annotated[str, Argument(metavar="MODEL", help="A saved model.")]
 StructureText = Annotated[
     str,
@@ -79,6 +81,23 @@ class ReadingOptions:
         Literal["refuse", "weight", "hold"] | None,
         Option(help="weight: outputs that are not there weigh nothing; hold: inputs hold their last value besides."),
     ] = None
+    encoding: Annotated[Text, Option(help="Encoding of text, such as cp1252; default what its bytes show.")] = None
+    separator: Annotated[
+        Literal["comma", "semicolon", "tab", "space"] | None,
+        Option(help="Between cells of text; default what is there."),
+    ] = None
+    decimal: Annotated[Literal["point", "comma"] | None, Option(help="Of numbers in text; default what is there.")] = (
+        None
+    )
+    skip: Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default what is no table.")] = None
+    header: Annotated[
+        int | None,
+        Option(metavar="0|1|2", help="Lines of header: none, names, names and units; default what is there."),
+    ] = None
+    dates: Annotated[
+        Literal["ymd", "dmy", "mdy"] | None, Option(help="Order of day and month where dates leave it open.")
+    ] = None
+    sheet: Annotated[Text, Option(help="Sheet of a workbook that has several.")] = None
     detrend: Annotated[
         Literal["constant", "linear"] | None,
         Option(help="Subtract the mean or the straight line of every signal; --offset estimates it instead."),
@@ -95,7 +114,7 @@ class ReadingOptions:
             "time": self.time, "step": self.sampling, "inputs": pairs("-u", self.inputs),
             "outputs": pairs("-y", self.outputs), "units": pairs("--unit", self.units), "columns": self.columns,
             "time_unit": self.time_unit, "intersample": pairs("--intersample", self.between), "resample": self.resample,
-            "missing": self.missing,
+            "missing": self.missing, "layout": self.layout(),
         }  # fmt: skip
         if not files:
             return []
@@ -111,6 +130,22 @@ class ReadingOptions:
                 print(f"ftlm: {len(files)} .mat files read as one run", file=sys.stderr)
                 return [run]
         return [load(f, **options) for f in files]
+
+    def layout(self) -> dict[str, Any]:
+        """What is said of how files are laid out."""
+        return {f.name: getattr(self, f.name) for f in fields(Layout) if getattr(self, f.name) is not None}
+
+    def opened(self, file: str) -> OpenedFile:
+        """What a file is, before it is a run."""
+        if self.detrend is not None:
+            raise ModelError("--detrend is not used with open; give it to the commands that open names")
+        return open_file(
+            file, time=self.time, step=self.sampling, inputs=pairs("-u", self.inputs) or None,
+            outputs=pairs("-y", self.outputs) or None, units=pairs("--unit", self.units), columns=self.columns,
+            time_unit=self.time_unit, intersample=pairs("--intersample", self.between), layout=self.layout(),
+            slice=None if self.sliced is None else interval(self.sliced, "--slice", "1.1:19.5"),
+            resample=self.resample, missing=self.missing,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)

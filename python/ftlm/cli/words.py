@@ -21,11 +21,15 @@ OPTIONS = {
     "delay": "--delay", "force": "--force", "offset": "--offset", "reference": "--reference", "start": "--start",
     "validation": "--validation",
     "loss": "--loss", "intervals": "--intervals", "missing": "--missing",
+    "encoding": "--encoding", "separator": "--separator", "decimal": "--decimal", "skip": "--skip",
+    "header": "--header", "dates": "--dates", "sheet": "--sheet",
 }  # fmt: skip
 #: ``force=True (--force)``, where the option stands beside the argument already.
 _BESIDE = re.compile(r"\b\w+=\S* \((--[a-z-]+)\)")
 #: What a run is cut by, whose ends a command takes joined by a colon.
 _CUT = re.compile(r"\bslice\((\S+), (?:None|(\S+?))\)")
+#: What Python says of a layout, whose keys are options of their own.
+_LAYOUT = re.compile(r"layout=dict\(([^()]*)\)")
 _COMMANDS = re.compile(r" \(commands: [^)]*\)")
 #: ``-u m=3`` is a name that a user gave, not an argument.
 _ARGUMENT = re.compile(r"(--?[\w-]+ )?(?<![^\s(])(" + "|".join(OPTIONS) + r")=(?:'([^']*)'|([\w.+-]+))?(?![\w{])")
@@ -35,6 +39,7 @@ _BARE = re.compile(r"\b(innovation_length|prior_covariance|time_unit)\b(?!=)")
 def in_options(text: str) -> str:
     """Return a message in which the options of the command line stand for the arguments of Python."""
     text = text.replace("inputs={name: column}", "-u NAME=COLUMN").replace("outputs={name: column}", "-y NAME=COLUMN")
+    text = _LAYOUT.sub(lambda found: found[1].replace(", ", " "), text).replace("layout=: ", "")
     text = text.replace("in a columns file", "in a file for --columns")
     text = _CUT.sub(lambda found: f"--slice {found[1]}:{found[2] or ''}", text)
     text = _BESIDE.sub(r"\1", _COMMANDS.sub("", text))

@@ -27,6 +27,7 @@ from ftlm.data.samples import (
     FEWEST_ROWS,
     HELD,
     Intersample,
+    as_seconds,
     as_vector,
     check_increasing,
     check_lengths,
@@ -109,7 +110,7 @@ class Asked:
             # Copies: a view would keep the rest in memory, and could be written to.
             vectors = {s: vector[first:last].copy() for s, vector in vectors.items()}
         data = self._values(vectors, units, first, missing)
-        times, facts = clock.times[first:last], self.facts
+        times, facts = clock.times[first:last], self.facts + clock.facts
         if clock.step is not None:
             step, start = clock.step, float(f"{first * clock.step:.12g}")
         else:
@@ -216,12 +217,18 @@ class Asked:
         else:
             if not isinstance(self.time_unit, str) or self.time_unit not in TIME_UNITS:
                 raise DataError(f"time_unit={self.time_unit!r} is unknown; the known ones are {listed(TIME_UNITS)}")
-            times, dtype = as_vector(self.time, self.time_label)
+            dated = as_seconds(self.time, self.time_label)
+            if dated is not None and self.time_unit != "s":
+                raise DataError(
+                    f"time_unit={self.time_unit!r} is the unit of numbers, and {self.time_label} holds dates"
+                )
+            times, dtype = as_vector(self.time if dated is None else dated[0], self.time_label)
             lengths = {self.time_label: times.size, **lengths}
             times = times * TIME_UNITS[self.time_unit]
             single = dtype.kind == "f" and dtype.itemsize < 8
             precision = float(np.finfo(dtype if single else np.float64).eps)
-            clock = _Clock(times, None, precision * float(np.abs(times).max()))
+            said = (dated[1],) if dated is not None and dated[1] else ()
+            clock = _Clock(times, None, precision * float(np.abs(times).max()), said)
         check_lengths(lengths)
         return clock
 
@@ -258,11 +265,12 @@ class Asked:
 
 @dataclass(frozen=True)
 class _Clock:
-    """Times of the rows [s], their step where it was given, and what their numbers resolve."""
+    """Times of the rows [s], their step where it was given, what their numbers resolve, what is to be said of them."""
 
     times: Floats
     step: float | None
     resolution: float
+    facts: tuple[str, ...] = ()
 
 
 def resampled(since: Floats, step: float, first: int, how: str) -> str:

@@ -6,7 +6,7 @@ import html
 import os
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import fields
-from typing import Any, NoReturn, cast
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from ftlm.base.checks import as_mapping, bad_rows, listed, names_to_columns, nea
 from ftlm.base.errors import DataError
 from ftlm.data.advice import Advice, advise
 from ftlm.data.asked import Asked, how_read
+from ftlm.data.frames import asked_of_frame, dataset_of, frame_of
 from ftlm.data.limits import Limit
 from ftlm.data.measured import Measured
 from ftlm.data.names import check_signal_name
@@ -35,7 +36,6 @@ from ftlm.data.samples import (
     window_rows,
 )
 from ftlm.data.structures import Structure
-from ftlm.data.units import time_unit_of
 from ftlm.data.written import write_csv, write_parquet
 
 
@@ -77,7 +77,8 @@ class Run(Measured):
         step : float, optional
             Time between rows [s], > 0. Exactly one of `step` and `time` is given.
         time : array_like, shape (N,), optional
-            Time of every row in `time_unit`, increasing. It is regular when every row lies within 2 % of a step of its
+            Time of every row in `time_unit`, or dates (datetime64, datetime), which count from the first row on;
+            increasing. It is regular when every row lies within 2 % of a step of its
             place on a regular grid; a mean step that differs from a short decimal number by rounding alone is taken
             as that number.
         inputs, outputs : mapping of str to array_like, shape (N,), N ≥ 3
@@ -131,14 +132,15 @@ class Run(Measured):
         intersample: Mapping[str, str] | None = None, name: str = "run", resample: float | None = None,
         slice: Sequence[float | None] | None = None, time_unit: str | None = None, missing: str = "refuse",
     ) -> Run:  # fmt: skip
-        """Make a run from a pandas or polars frame, a dict of arrays or a structured NumPy array.
+        """Make a run from a pandas or polars frame, an xarray dataset, a dict of arrays or a structured array.
 
         Parameters
         ----------
         frame : frame
             Columns are taken as ``frame[column]``.
         time : hashable, optional
-            Column that holds the time. Exactly one of `time` and `step` is given.
+            Column that holds the time, or the name of the frame's index. Without `time` and `step` that index is the
+            time where it holds dates or is called t, time or seconds; of a dataset its only dimension.
         step : float, optional
             Time between rows [s], > 0.
         inputs, outputs : mapping of str to column, or list of str
@@ -158,32 +160,9 @@ class Run(Measured):
         DataError
             If a column is unknown or there more than once, and for everything `Run.from_arrays` refuses.
         """
-        columns = _frame_columns(frame)
-
-        def pick(column: Hashable, thing: str) -> object:
-            count = columns.count(column)
-            if count == 0:
-                raise DataError(
-                    f"column {column!r} ({thing}) is not in the frame{nearest(column, columns)}; "
-                    f"the columns are {listed(columns)}; for the index of a pandas frame use frame.reset_index()"
-                )
-            if count > 1:
-                raise DataError(f"column {column!r} ({thing}) is there {count} times; rename all but one")
-            return cast("Mapping[Any, object]", frame)[column]
-
-        clock = None if time is None else pick(time, "time")
-        wanted = [names_to_columns(argument, given) for argument, given in (("inputs", inputs), ("outputs", outputs))]
-        labels = {s: f"signal {s!r} (column {column!r})" for part in wanted for s, column in part.items()}
-        given_inputs, given_outputs = ({s: pick(c, f"signal {s!r}") for s, c in part.items()} for part in wanted)
-        label = "time" if time is None else f"time (column {time!r})"
-        if isinstance(time, str):
-            unit, said = time_unit_of(time, label, time_unit)
-        else:
-            unit, said = time_unit or "s", ()
-        asked = Asked(
-            given_inputs, given_outputs, step=step, time=clock, units=units, intersample=intersample, name=name,
-            resample=resample, window=slice, time_unit=unit, labels=labels, facts=said, time_label=label,
-            missing=missing,
+        asked = asked_of_frame(
+            frame, time=time, step=step, inputs=inputs, outputs=outputs, units=units, intersample=intersample,
+            name=name, resample=resample, window=slice, time_unit=time_unit, missing=missing,
         )  # fmt: skip
         return built(asked)
 
@@ -531,6 +510,37 @@ class Run(Measured):
         """
         write_parquet(self, path, force=force)
 
+    def to_frame(self) -> Any:
+        """Return the run as a pandas frame: a column a signal in SI units, the source time ``t_s`` [s] as its index.
+
+        `Run.from_frame` takes it back. What is told of the signals stands in its ``attrs``: units, inputs, outputs,
+        intersample, name.
+
+        Returns
+        -------
+        pandas.DataFrame
+
+        Raises
+        ------
+        ModelError
+            If pandas is not installed.
+        """
+        return frame_of(self)
+
+    def to_xarray(self) -> Any:
+        """Return the run as an xarray dataset over ``t_s`` [s], attributes as of `to_frame`.
+
+        Returns
+        -------
+        xarray.Dataset
+
+        Raises
+        ------
+        ModelError
+            If xarray is not installed.
+        """
+        return dataset_of(self)
+
     def _fields(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(Measured)}
 
@@ -558,18 +568,3 @@ def run_of(record: Measured) -> Run:
     run = object.__new__(Run)
     Measured.__init__(run, **{f.name: getattr(record, f.name) for f in fields(Measured)})
     return run
-
-
-def _frame_columns(frame: object) -> list[Hashable]:
-    if isinstance(frame, Mapping):
-        return list(frame)
-    # A lazy polars frame is told by its collect(); asking it for its columns would already start work.
-    columns = None if hasattr(frame, "collect") else getattr(frame, "columns", None)
-    if columns is None:
-        columns = getattr(getattr(frame, "dtype", None), "names", None)
-    if columns is None or not hasattr(frame, "__getitem__"):
-        raise DataError(
-            f"frame is a {type(frame).__name__}; pass a pandas or polars DataFrame (collect() a lazy one first), "
-            "a dict of arrays or a structured array"
-        )
-    return list(columns)

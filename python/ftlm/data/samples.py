@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -119,6 +120,36 @@ def as_vector(given: object, thing: str, *, gaps: bool = False) -> tuple[Floats,
         raise _not_numbers(given, array, thing)
     with np.errstate(over="ignore"):
         return np.array(array, dtype=np.float64, order="C"), array.dtype
+
+
+def as_seconds(given: object, thing: str) -> tuple[Floats, str] | None:
+    """Return dates as seconds since the first and its words, lapses of time as seconds; None for anything else."""
+    try:
+        array = np.asarray(given)
+        first = array.flat[0] if array.dtype.kind == "O" and array.size else None
+        if isinstance(first, datetime.date):
+            # Dates with a time zone are in universal time then, as pandas knows and NumPy does not.
+            plain = getattr(given, "dtype", None) is not None and array.dtype != getattr(given, "dtype", None)
+            array = np.asarray(given if plain else [_universal(moment) for moment in array.tolist()], "datetime64[ns]")
+    except (ValueError, TypeError, OverflowError) as error:
+        raise DataError(f"{thing}: not one date per row ({error}); pass datetime64, or seconds") from None
+    if array.dtype.kind not in "mM" or array.ndim != 1 or array.size == 0:
+        return None
+    gone = np.flatnonzero(np.isnat(array))
+    if gone.size:
+        raise bad_rows(thing, "no date", int(gone[0]), gone.size, "remove or fill these rows yourself")
+    lapses = array - array[0] if array.dtype.kind == "M" else array
+    nanoseconds = lapses.astype("timedelta64[ns]")
+    if (nanoseconds.astype(lapses.dtype) != lapses).any():
+        raise DataError(f"{thing}: from {array.min()} to {array.max()} there are more nanoseconds than can be counted")
+    words = f"time counted from {array[0]} on" if array.dtype.kind == "M" else ""
+    return nanoseconds.astype(np.int64) / 1e9, words
+
+
+def _universal(moment: Any) -> Any:
+    """A date in universal time, where it has a zone."""
+    zone = getattr(moment, "tzinfo", None)
+    return moment if zone is None else moment.astimezone(datetime.UTC).replace(tzinfo=None)
 
 
 def _not_numbers(given: object, array: npt.NDArray[Any], thing: str) -> DataError:

@@ -29,9 +29,10 @@ _WRITTEN = {
     **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"), "hr": "h", "hour": "h", "hours": "h",
     **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"), "minute": "min", "minutes": "min",
     **dict.fromkeys(("usec", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("sekunde", "sekunden", "sek"), "s"), "millisekunden": "ms", "minuten": "min", "stunden": "h",
 }  # fmt: skip
 _BRACKETED = re.compile(r"(.*?)\s*\[\s*([^\[\]]*?)\s*\]")
-_OTHERWISE = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*/\s*(\S+)|_(\S+))")
+_OTHERWISE = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*[/,]\s*(\S+)|_(\S+))")
 _TIME_NAMES = frozenset(("t", "time", "seconds"))
 
 
@@ -39,7 +40,7 @@ def header_time(name: str) -> tuple[str, str | None]:
     """Split the name of a column of times into what it is called, without capitals, and the unit that it states.
 
     The unit is one of :data:`TIME_UNITS`, None where none is stated, and as it stands where square brackets hold
-    something else. Written as in ``time [ms]``, ``time (ms)``, ``time/ms`` or ``time_ms``.
+    something else. Written as in ``time [ms]``, ``time (ms)``, ``time/ms``, ``time, ms`` or ``time_ms``.
     """
     folded = name.strip().casefold()
     bracketed = _BRACKETED.fullmatch(folded)

@@ -13,15 +13,27 @@ import numpy.typing as npt
 from ftlm.base.checks import bad_rows, listed, nearest
 from ftlm.base.errors import DataError
 from ftlm.data.header import Header
-from ftlm.data.units import is_time_name
+from ftlm.data.units import header_time, is_time_name
+from ftlm.files.cells import is_time_unit, stated_unit
+from ftlm.files.layout import Assumption, Layout
+from ftlm.files.moments import Moments
 
 _AGREE = 1e-9
+#: What the time is called beside t, time and seconds, without capitals and what joins words.
+_OTHER_TIMES = frozenset(
+    ("timestamp", "datetime", "zeit", "zeitstempel", "datumzeit", "datumuhrzeit", "uhrzeit", "elapsedtime", "elapsed",
+     "timeelapsed", "xvalue", "temps", "tiempo", "tempo", "sec", "secs", "second", "sekunden")
+)  # fmt: skip
+_JOINED = str.maketrans("", "", " _-/.")
 _MATLAB_COLUMN = re.compile(r"(.+)\(:,\s*(\d+)\)")
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column of numbers, or the reason why it is not one; `blank` where that is empty cells alone (NaN)."""
+    """One column of numbers, or the reason why it is not one.
+
+    `blank` where that is empty cells alone (NaN); `moments` where it holds dates; `stated` is its unit in the file.
+    """
 
     variable: str
     name: str
@@ -30,6 +42,8 @@ class Column:
     problem: DataError | None = None
     matrix: str | None = None
     blank: bool = False
+    moments: Moments | None = None
+    stated: str = ""
 
     def numbers(self, *, blank: bool = False) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
         """Return its numbers, or raise why there are none; empty cells may be let pass."""
@@ -42,13 +56,16 @@ class Column:
 
 @dataclass(frozen=True)
 class FileTable:
-    """The columns of one file."""
+    """The columns of one file, what kind of file it is, how it is laid out, and what of that was assumed."""
 
     path: Path
     columns: list[Column]
     text: bool
     header: Header | None = None
     skipped: dict[str, str] = field(default_factory=dict)
+    layout: Layout = field(default_factory=Layout)
+    assumed: tuple[Assumption, ...] = ()
+    kind: str = ""
 
 
 class Pool:
@@ -69,6 +86,11 @@ class Pool:
                     )
                 matrix = None if column.matrix is None else prefix + column.matrix
                 self._columns[name] = replace(column, name=name, matrix=matrix)
+
+    @property
+    def columns(self) -> list[Column]:
+        """All of them, in the order of the files."""
+        return list(self._columns.values())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -95,6 +117,10 @@ class Pool:
             name = f"{written[1]}.{int(written[2])}" if len(written[2]) < 10 else spec
         column = self._columns.get(name)
         if column is None:
+            # Without the unit in brackets that it ends in, where that leaves one.
+            bare = [c for c in self._columns.values() if stated_unit(c.name) == (spec, c.stated) and c.stated]
+            column = bare[0] if len(bare) == 1 else None
+        if column is None:
             raise DataError(
                 f"column {spec!r} ({thing}) is not in {listed(table.path.name for table in self._tables)}"
                 f"{nearest(spec, self._columns)}; {self.described()}"
@@ -112,22 +138,20 @@ class Pool:
             )
         return columns[position]
 
-    def time(self, spec: object, used: list[Column]) -> Column:
-        """Return the time: the column asked for, or the one that names or places itself."""
+    def time(self, spec: object, used: list[Column]) -> tuple[Column, Assumption | None]:
+        """Return the time: the column asked for, or the one that names or places itself, and what was assumed of it."""
         if spec is not None:
-            return self.find(spec, "time")
-        clocks = []
+            return self.find(spec, "time"), None
+        clocks, assumed = [], None
         for table in self._tables:
-            named = [
-                column
-                for column in self._columns.values()
-                if column.source == table.path and column.matrix is None and is_time_name(column.variable)
-            ]
+            named, why = self._clocks(table)
             if len(named) > 1:
                 raise DataError(
                     f"{table.path.name}: the columns {listed(column.name for column in named)} may all be the time; "
                     "name one with time="
                 )
+            if named and why:
+                assumed = Assumption("time", named[0].name, why, "time=COLUMN")
             clocks += named
         if not clocks:
             matrices = dict.fromkeys(column.matrix for column in used if column.matrix is not None)
@@ -139,7 +163,23 @@ class Pool:
             )
         for other in clocks[1:]:
             _check_agreement(clocks[0], other)
-        return clocks[0]
+        return clocks[0], assumed
+
+    def _clocks(self, table: FileTable) -> tuple[list[Column], str]:
+        """Columns of a file that may be the time, the surest kind that there is, and why where that is to be said."""
+        own = [c for c in self._columns.values() if c.source == table.path and c.matrix is None]
+        sure = [c for c in own if is_time_name(c.variable)]
+        if sure:
+            return sure, ""
+        named = [c for c in own if header_time(c.variable)[0].translate(_JOINED) in _OTHER_TIMES]
+        if named:
+            return named, f"the time is column {named[0].name!r}, by its name"
+        dated = [c for c in own if c.moments is not None]
+        if dated:
+            return dated, f"the time is column {dated[0].name!r}, which holds dates or times of day"
+        if own and own[0].stated and is_time_unit(own[0].stated):
+            return own[:1], f"the time is the first column, {own[0].name!r}, by its unit {own[0].stated}"
+        return [], ""
 
 
 def _check_agreement(one: Column, other: Column) -> None:

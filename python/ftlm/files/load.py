@@ -1,4 +1,4 @@
-"""Loads one measured experiment from text, MATLAB or parquet files, refusing whatever it cannot be sure of."""
+"""Loads one measured experiment from the files that programs write, refusing whatever it cannot be sure of."""
 
 from __future__ import annotations
 
@@ -15,21 +15,23 @@ from ftlm.base.errors import DataError
 from ftlm.data.asked import Asked
 from ftlm.data.header import Header
 from ftlm.data.names import CSV_TIME, is_run_name
-from ftlm.data.readings import checked_missing
+from ftlm.data.readings import Missing, checked_missing
 from ftlm.data.run import Run, built
-from ftlm.data.units import time_unit_of
-from ftlm.files.apart import MATLAB, PARQUET, read_apart
+from ftlm.data.units import header_time, time_unit_of
+from ftlm.files.apart import kind_of, read_apart
+from ftlm.files.cells import stated_unit
 from ftlm.files.columns import Column, FileTable, Pool
+from ftlm.files.layout import OF_SHEETS, OF_TEXT, Layout
 from ftlm.files.text import LONGEST_HEADER, read_text
 
 PathLike: TypeAlias = str | os.PathLike[str]
 _SIZE_LIMIT = 1 << 30
-_COLUMN_KEYS = ("time", "step", "inputs", "outputs", "units", "intersample")
+_COLUMN_KEYS = ("time", "step", "inputs", "outputs", "units", "intersample", "layout")
 
 
 @dataclass
-class _Wanted:
-    """Which columns the caller wants, from the arguments, the columns file and ftlm's own header."""
+class Wanted:
+    """Which columns of which layout the caller wants, from the arguments, the columns file and ftlm's own header."""
 
     time: Hashable | None
     step: float | None
@@ -37,6 +39,7 @@ class _Wanted:
     outputs: dict[str, Hashable]
     units: dict[str, str]
     intersample: dict[str, str]
+    layout: Layout
 
 
 def load(
@@ -46,30 +49,37 @@ def load(
     columns: Mapping[str, object] | PathLike | None = None, intersample: Mapping[str, str] | None = None,
     step: float | None = None, slice: Sequence[float | None] | None = None, resample: float | None = None,
     name: str | None = None, time_unit: str | None = None, missing: str | None = None,
+    layout: Layout | Mapping[str, object] | None = None,
 ) -> Run:  # fmt: skip
-    """Load one run from a text, version-5 .mat or parquet file, or from several files that hold its columns.
+    """Load one run from a file of text, a sheet or arrays, or from several files that hold its columns.
 
     Parameters
     ----------
     path : path or sequence of paths
-        ``.mat``, ``.parquet``, or text: comma, semicolon, tab or white space between numbers, decimal points, UTF-8,
-        lines that begin with ``#`` skipped, an optional header of names. Without a header the columns are c1, c2, …
-        The columns of a matrix V of a .mat file are V.1, V.2, … (or ``V(:,1)``), a vector keeps its name; samples are
-        in rows.
+        Text, packed by gzip or not; ``.xlsx``, ``.xls``, ``.ods``; ``.mat``, ``.h5``, ``.npz``, ``.npy``; ``.parquet``,
+        ``.feather``. Of text and of sheets, `layout` says what is above the table and how its cells are written, or it
+        is found: comma, semicolon, tab or white space between cells, decimal points or commas, a header of names, a
+        line of units, dates. What could be read in two ways is refused; what was taken for granted and could change
+        numbers stands in the run's `warnings`, with what says otherwise. Lines that begin with ``#`` are skipped.
+        Without a header the columns are c1, c2, …
+        The columns of a matrix V are V.1, V.2, … (or ``V(:,1)``), a vector keeps its name; samples are in rows.
         Columns of several files are pooled; a name that is in two of them is prefixed by its file, ``STEM/V.3``.
     time : str or int, optional
         Column of the time, by name or, in a single text file, by position from 0. Without `time` and `step`, a text
         file's column called t, time or seconds (any case), alone or with a unit as in ``time [ms]``, ``time (ms)``,
-        ``time/ms`` or ``t_ms``, is taken, a .mat file's vector of such a name, or else the first column of every
-        matrix in use, which must all agree.
+        ``time/ms`` or ``t_ms``, is taken, a .mat file's vector of such a name; else (said in the run's `warnings`) one
+        that other programs call so, such as Timestamp or Zeit, the only one that holds dates, or a first one with a
+        unit of time; or else the first column of every matrix in use, which must all agree. Dates and times of day
+        count from the first row on.
     inputs, outputs : mapping of str to column, or list of str, optional
         Columns by signal name; a list names columns that keep their names. Needed unless `columns` or the file's
-        own ftlm header gives them; at least one output.
+        own ftlm header gives them; at least one output. A column that ends in its unit, ``I (A)``, is found without.
     units : mapping of str to str, optional
-        Unit of a signal's numbers, converted to SI.
+        Unit of a signal's numbers, converted to SI. A unit that the file states is not applied by itself:
+        :func:`ftlm.open_file` shows it.
     columns : mapping or path of a TOML file, optional
-        Keys ``time`` or ``step``, tables ``inputs``, ``outputs``, ``units``, ``intersample``; the arguments of the
-        same name override or extend it.
+        Keys ``time`` or ``step``, tables ``inputs``, ``outputs``, ``units``, ``intersample``, ``layout``; the arguments
+        of the same name override or extend it.
     intersample : mapping of str to {"zoh", "foh"}, optional
         Behaviour of an input between rows; ``"zoh"`` where not given.
     step : float, optional
@@ -88,6 +98,8 @@ def load(
     missing : {"refuse", "weight", "hold"}, optional
         What to do about NaN, empty cells and rows that a regular time lacks: see `Run.from_arrays`. Default
         ``"refuse"``, and ``"weight"`` for a file of ftlm's own that says which outputs were not read throughout.
+    layout : Layout or dict, optional
+        How text or a sheet is laid out, as far as it is to be said: see :class:`ftlm.Layout`.
 
     Returns
     -------
@@ -105,16 +117,43 @@ def load(
     >>> run = load("arm.csv", time="t_s", inputs={"I1": "Im1_meas_A"}, outputs={"theta11": "th11_deg"},
     ...            units={"theta11": "deg"})  # doctest: +SKIP
     """
-    paths = _paths(path)
+    wanted = wanted_of(
+        columns,
+        time=time,
+        step=step,
+        inputs=inputs,
+        outputs=outputs,
+        units=units,
+        intersample=intersample,
+        layout=layout,
+    )
     chosen = checked_missing(missing or "refuse")
-    wanted = _wanted(_columns_file(columns), time, step, inputs, outputs, units, intersample)
-    tables = _tables(paths)
+    tables = tables_of(path, wanted.layout)
+    options = Options(slice, resample, name, time_unit, missing, chosen)
+    return run_from(tables, wanted, options)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What else is asked of a run, as in :func:`load`; `chosen` is `missing` or what stands for none."""
+
+    window: Sequence[float | None] | None = None
+    resample: float | None = None
+    name: str | None = None
+    time_unit: str | None = None
+    missing: str | None = None
+    chosen: Missing = "refuse"
+
+
+def run_from(tables: list[FileTable], wanted: Wanted, options: Options) -> Run:
+    """Make the run that is wanted of files that have been read."""
+    chosen = options.chosen
     header = tables[0].header
     if header is not None and len(tables) > 1:
-        raise DataError(f"{str(paths[0])!r} is a whole run of its own; load it alone")
+        raise DataError(f"{str(tables[0].path)!r} is a whole run of its own; load it alone")
     if header is not None:
         _take_header(wanted, header)
-        chosen = chosen if missing is not None or not header.missing else "weight"
+        chosen = chosen if options.missing is not None or not header.missing else "weight"
     pool = Pool(tables)
     _check_apart(wanted, pool)
     if not wanted.outputs:
@@ -136,26 +175,63 @@ def load(
 
     given_inputs = gather(wanted.inputs, blank=chosen == "hold")
     given_outputs = gather(wanted.outputs, blank=chosen != "refuse")
-    clock = pool.time(wanted.time, used) if wanted.step is None else None
-    label = "time" if clock is None else f"{clock.source.name}: column {clock.name!r} (time)"
-    if clock is None and time_unit is not None:
-        raise DataError(f"time_unit={time_unit!r} is the unit of time=, which is not used; step= is in s")
-    unit, said = ("s", ()) if clock is None else time_unit_of(_header_of(clock), label, time_unit)
+    clock = _clock(wanted, pool, used, options)
+    name = options.name
     if name is None:
-        stem = paths[0].stem
+        stem = stem_of(tables[0].path)
         name = header.name if header is not None else stem if is_run_name(stem) else "run"
+    several = len(tables) > 1
+    facts = tuple(
+        f"{table.path.name}: {a}" if several else str(a) for table in tables for a in table.assumed if a.counts
+    )
+    facts += clock.facts
     asked = Asked(
-        given_inputs, given_outputs, step=wanted.step, time=None if clock is None else clock.numbers(),
-        units=wanted.units, intersample=wanted.intersample, name=name, resample=resample, window=slice,
-        time_unit=unit, labels=labels, facts=said, time_label=label, missing=chosen,
+        given_inputs, given_outputs, step=wanted.step, time=clock.times, units=wanted.units,
+        intersample=wanted.intersample, name=name, resample=options.resample, window=options.window,
+        time_unit=clock.unit, labels=labels, facts=facts, time_label=clock.label, missing=chosen,
     )  # fmt: skip
     if header is not None:
-        stated = header.step if clock is not None and clock.name == CSV_TIME else None
-        asked = replace(asked, known_step=stated, facts=(*header.warnings, *said), about=header.about)
+        stated = header.step if clock.name == CSV_TIME else None
+        asked = replace(asked, known_step=stated, facts=(*header.warnings, *facts), about=header.about)
     return built(asked)
 
 
-def _check_apart(wanted: _Wanted, pool: Pool) -> None:
+@dataclass(frozen=True)
+class _Clock:
+    """The time of the rows: numbers in a unit, the column that they are from, what errors call it, what is said."""
+
+    times: object = None
+    unit: str = "s"
+    label: str = "time"
+    name: str | None = None
+    facts: tuple[str, ...] = ()
+
+
+def _clock(wanted: Wanted, pool: Pool, used: list[Column], options: Options) -> _Clock:
+    given = options.time_unit
+    if wanted.step is not None:
+        if given is not None:
+            raise DataError(f"time_unit={given!r} is the unit of time=, which is not used; step= is in s")
+        return _Clock()
+    column, assumed = pool.time(wanted.time, used)
+    label = f"{column.source.name}: column {column.name!r} (time)"
+    facts: tuple[str, ...] = () if assumed is None else (str(assumed),)
+    if column.moments is None:
+        unit, said = time_unit_of(header_of(column), label, given)
+        return _Clock(column.numbers(), unit, label, column.name, facts + said)
+    if given is not None:
+        raise DataError(f"time_unit={given!r} is the unit of numbers, and {label} holds dates or times of day")
+    seconds = column.moments.seconds(label, wanted.layout.dates)
+    facts += (f"time counted from {column.moments.first!r} on",)
+    return _Clock(seconds, "s", label, column.name, facts)
+
+
+def stem_of(path: Path) -> str:
+    """What a file is called without the endings that say how it is packed and what it is."""
+    return Path(path.stem).stem if path.suffix.lower() == ".gz" else path.stem
+
+
+def _check_apart(wanted: Wanted, pool: Pool) -> None:
     """Refuse one column as an input and as an output: the model that explains it says nothing."""
     driven = {id(pool.find(spec, f"signal {name!r}")): (name, spec) for name, spec in wanted.inputs.items()}
     twice = [
@@ -171,9 +247,12 @@ def _check_apart(wanted: _Wanted, pool: Pool) -> None:
         )
 
 
-def _header_of(clock: Column) -> str:
+def header_of(clock: Column) -> str:
     """Return what stands above a column of times; the first column of a matrix has no words of its own."""
-    return clock.variable if clock.matrix is None else "time"
+    if clock.matrix is not None:
+        return "time"
+    below = clock.stated and header_time(clock.variable)[1] is None and not stated_unit(clock.variable)[1]
+    return f"{clock.variable} [{clock.stated}]" if below else clock.variable
 
 
 def _paths(given: PathLike | Sequence[PathLike]) -> list[Path]:
@@ -212,13 +291,21 @@ def _size(path: Path) -> int:
     return status.st_size
 
 
-def _tables(paths: list[Path]) -> list[FileTable]:
+def tables_of(path: PathLike | Sequence[PathLike], layout: Layout) -> list[FileTable]:
+    """Read files as they are, whatever is wanted of them."""
+    paths = _paths(path)
     read: dict[Path, FileTable] = {}
-    for kind in (MATLAB, PARQUET):
-        own = [path for path in paths if path.suffix.lower() in kind.suffixes]
-        if own:
-            read |= dict(zip(own, read_apart(own, kind), strict=True))
-    return [read[path] if path in read else read_text(path) for path in paths]
+    kinds = {path: kind_of(path) for path in paths}
+    for kind in dict.fromkeys(kinds.values()):
+        if kind is not None:
+            own = [path for path in paths if kinds[path] is kind]
+            for name in own:
+                layout.check_used(repr(name.name), kind.words, OF_SHEETS if kind.sheets else ())
+            read |= dict(zip(own, read_apart(own, kind, layout), strict=True))
+    for name in paths:
+        if kinds[name] is None:
+            layout.check_used(repr(name.name), "text", OF_TEXT)
+    return [read[path] if path in read else read_text(path, layout) for path in paths]
 
 
 def column_names(path: PathLike) -> tuple[str, ...] | None:
@@ -229,27 +316,30 @@ def column_names(path: PathLike) -> tuple[str, ...] | None:
     DataError
         As :func:`load`.
     """
-    (table,) = _tables(_paths(path))
+    (table,) = tables_of(path, Layout())
     return None if table.header is not None else Pool([table]).names
 
 
-def _wanted(
-    told: Mapping[str, object], time: Hashable | None, step: object, inputs: object, outputs: object, units: object,
-    intersample: object,
-) -> _Wanted:  # fmt: skip
+def wanted_of(
+    columns: object, *, time: Hashable | None = None, step: object = None, inputs: object = None,
+    outputs: object = None, units: object = None, intersample: object = None, layout: object = None,
+) -> Wanted:  # fmt: skip
+    """What a person wants, by arguments and by a columns file; the arguments go before."""
+    told = _columns_file(columns)
     if time is not None and step is not None:
         raise DataError("time= and step=: both are given; pass one of them")
     if time is None and step is None:
         time, step = told.get("time"), told.get("step")
         if time is not None and step is not None:
             raise DataError("columns=: both time and step are given; keep one of them")
-    return _Wanted(
+    return Wanted(
         time,
         cast("float | None", step),
         names_to_columns("inputs", told.get("inputs")) | names_to_columns("inputs", inputs),
         names_to_columns("outputs", told.get("outputs")) | names_to_columns("outputs", outputs),
         _words("units", told.get("units")) | _words("units", units),
         _words("intersample", told.get("intersample")) | _words("intersample", intersample),
+        Layout.of(told.get("layout")).under(Layout.of(layout)),
     )
 
 
@@ -287,7 +377,7 @@ def _columns_file(columns: object) -> Mapping[str, object]:
     return told
 
 
-def _take_header(wanted: _Wanted, header: Header) -> None:
+def _take_header(wanted: Wanted, header: Header) -> None:
     """Fill in what was not asked for from ftlm's own header."""
     if wanted.time is None and wanted.step is None:
         wanted.time = CSV_TIME

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import csv
+import codecs
+import functools
+import gzip
 import itertools
-import re
-from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
 
@@ -16,16 +17,20 @@ import numpy.typing as npt
 
 from ftlm.base.checks import bad_rows
 from ftlm.base.errors import DataError
-from ftlm.data.header import BOM, header_of_line
+from ftlm.data.header import header_of_line
+from ftlm.files.cells import DECIMAL_COMMA, is_number, number, split, stated_unit
 from ftlm.files.columns import Column, FileTable
+from ftlm.files.layout import Assumption, Layout
+from ftlm.files.moments import Moments, is_moment
+from ftlm.files.sniff import SEPARATOR_WORDS, Found, find_table
 
 _BLOCK = 8 << 20
 LONGEST_HEADER = 1 << 20
-_SAMPLE_LINES = 20
-_DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?|[+-]?\d+,(?:[eE][+-]?\d+)?")
-_DECIMAL_COMMAS = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?(?:\s+[+-]?\d+,\d+(?:[eE][+-]?\d+)?)+\s*")
-_DECIMAL_WAY_OUT = "write decimal points, for instance by replacing every comma by a point where ';' or tabs separate"
-_UTF16 = (b"\xff\xfe", b"\xfe\xff")
+#: What is looked at before the rest is read in one go: so many characters, and at least so many lines.
+_SAMPLE, _SAMPLE_LINES = 1 << 16, 8
+_UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_UTF32 = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
+_LARGEST_UNPACKED = 1 << 30
 
 
 @dataclass
@@ -37,193 +42,299 @@ class _Trouble:
     cell: str
     count: int
     blank: bool
+    comma: bool
+    moments: bool = False
+    sheet: bool = False
 
-    def error(self, column: str, source: Path) -> DataError:
-        thing = f"{source.name}: column {column!r}, line {self.line}"
+    def error(self, column: str, source: str) -> DataError:
+        thing = f"{source}: column {column!r}, line {self.line}"
         text = self.cell.strip()
         shown = repr(text if len(text) <= 40 else text[:40] + "…")
+        way_out = "correct or remove these rows"
         if not text:
-            what = "empty cell"
+            what = "empty cell" + (", or one with an error or a formula that nobody computed" if self.sheet else "")
             way_out = "fill or remove these rows yourself, or let them be missing with missing='weight' or 'hold'"
-        elif _DECIMAL_COMMA.fullmatch(text):
-            what, way_out = f"{shown} has a decimal comma", _DECIMAL_WAY_OUT
+        elif self.comma and "." in text and is_number(text):
+            what = f"{shown} has a point where decimals follow a comma"
+            way_out = "write all numbers alike, without marks between thousands"
+        elif DECIMAL_COMMA.fullmatch(text):
+            what = f"{shown} has a decimal comma"
+            way_out = "write all numbers alike, or say layout=dict(decimal='comma') where all of them have commas"
+        elif self.moments:
+            what = f"{shown} stands among numbers" if is_moment(text) else f"{shown} stands among dates or times of day"
         else:
-            what, way_out = f"{shown} is not a number", "correct or remove these rows"
+            what = f"{shown} is not a number"
         return bad_rows(thing, what, self.row, self.count, way_out)
 
 
-def read_text(path: Path) -> FileTable:
-    """Read the columns of one text file."""
+@dataclass
+class _Rows:
+    """What the blocks of a text hold so far."""
+
+    found: Found
+    sheet: bool = False
+    count: int = 0
+    ragged: int = 0
+    ragged_line: int = 0
+    ragged_cells: list[str] = field(default_factory=list)
+    blocks: list[npt.NDArray[np.float64]] = field(default_factory=list)
+    troubles: dict[int, _Trouble] = field(default_factory=dict)
+    moments: dict[int, list[Moments]] = field(default_factory=dict)
+
+
+def read_text(path: Path, layout: Layout) -> FileTable:
+    """Read the columns of one text file, packed by gzip or not."""
     try:
         with open(path, "rb") as stream:
-            return _parse_text(path, stream)
+            if path.suffix.lower() != ".gz" and stream.read(2) != b"\x1f\x8b":
+                stream.seek(0)
+                return parse_text(path, stream, layout)
+            stream.seek(0)
+            return _unpacked(path, stream, layout)
     except OSError as error:
         raise DataError(f"{str(path)!r} cannot be read ({error.strerror}); check its permissions") from None
 
 
-def _parse_text(path: Path, stream: BinaryIO) -> FileTable:
-    first = stream.readline(LONGEST_HEADER)
-    stream.seek(0)
-    header = header_of_line(path, first)
-    names: list[str] | None = None
-    separator: str | None = None
-    width = rows = ragged = 0
-    ragged_line, ragged_width = 0, 0
-    blocks: list[npt.NDArray[np.float64]] = []
-    troubles: dict[int, _Trouble] = {}
-    for number, lines in _line_blocks(path, stream):
-        kept = [(index, line) for index, line in enumerate(lines, number) if line.strip() and line.lstrip()[0] != "#"]
-        if not kept:
-            continue
-        started = width > 0
-        if not started:
-            separator = _separator([line for _, line in kept[:_SAMPLE_LINES]], path, kept[0][0])
-        cells = _split([line for _, line in kept], separator, path, kept[0][0])
-        if not started:
-            width = len(cells[0])
-            names = _names(cells[0], path, kept[0][0], own=header is not None)
-            if names is not None:
-                kept, cells = kept[1:], cells[1:]
-        wrong = [index for index, row in enumerate(cells) if len(row) != width]
-        if wrong:
-            if not ragged:
-                ragged_line, ragged_width = kept[wrong[0]][0], len(cells[wrong[0]])
-            ragged += len(wrong)
-        if not ragged and cells:
-            # Python's numbers may have underscores between their digits, those of files have not.
-            plain = not any("_" in line for _, line in kept)
-            blocks.append(_numbers(cells, [index for index, _ in kept], rows, troubles, plain=plain))
-        rows += len(cells)
-    if width == 0:
-        raise DataError(f"{path.name}: the file is empty, 0 rows; choose a file that holds a record")
-    if ragged:
+def _unpacked(path: Path, packed: BinaryIO, layout: Layout) -> FileTable:
+    try:
+        with gzip.GzipFile(fileobj=packed) as stream:
+            table = parse_text(path, _Limited(path, stream), layout)
+    except (OSError, EOFError, zlib.error) as error:
         raise DataError(
-            f"{path.name}: line {ragged_line} has {ragged_width} cells where the first line has {width}, {ragged} "
-            f"lines in all; give every line the same number of cells (separator: {_SEPARATOR_WORDS[separator]})"
-        )
-    if rows == 0:
-        raise DataError(f"{path.name}: a header and no rows; choose a file that holds a record")
-    values = np.concatenate(blocks).T.copy() if len(blocks) > 1 else blocks[0].T.copy()
-    if names is None:
-        names = [f"c{index + 1}" for index in range(width)]
-    problems = [troubles[k].error(name, path) if k in troubles else None for k, name in enumerate(names)]
-    blank = [k in troubles and troubles[k].blank for k in range(len(names))]
-    columns = [
-        Column(name, name, path, column, problem, blank=empty)
-        for name, column, problem, empty in zip(names, values, problems, blank, strict=True)
-    ]
-    return FileTable(path, columns, text=True, header=header)
+            f"{path.name}: damaged file: it cannot be unpacked ({str(error)[:100]}); get an intact copy"
+        ) from None
+    return replace(table, kind=f"{table.kind}, packed by gzip")
 
 
-_SEPARATOR_WORDS: dict[str | None, str] = {";": "semicolon", "\t": "tab", ",": "comma", None: "white space"}
+class _Limited:
+    """A stream that refuses to give more bytes than a file may have."""
+
+    def __init__(self, path: Path, stream: gzip.GzipFile) -> None:
+        self._path, self._stream = path, stream
+
+    def read(self, size: int) -> bytes:
+        if self._stream.tell() > _LARGEST_UNPACKED:
+            raise DataError(
+                f"{self._path.name}: unpacked, it has more than {_LARGEST_UNPACKED} bytes; split the record or lower "
+                "its rate"
+            )
+        return self._stream.read(size)
+
+    def readline(self, size: int) -> bytes:
+        return self._stream.readline(size)
+
+    def seek(self, place: int) -> int:
+        return self._stream.seek(place)
 
 
-def _line_blocks(path: Path, stream: BinaryIO) -> Iterator[tuple[int, list[str]]]:
+def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: str | None = None) -> FileTable:
+    """Read the columns of text: of a file, or of a sheet whose rows are lines and whose cells stand between tabs."""
+    source = path.name if sheet is None else f"{path.name}, sheet {sheet!r}"
+    header = header_of_line(path, stream.readline(LONGEST_HEADER)) if sheet is None else None
+    stream.seek(0)
+    encoding, guessed = _encoding(stream, layout, path)
+    stream.seek(0)
+    blocks = _line_blocks(path, stream, encoding)
+    # Of sheets, no cell begins a remark.
+    mark = "#" if sheet is None else "\0"
+    begun, sample, remark = _sample(blocks, layout, mark)
+    if not sample:
+        raise DataError(f"{source}: the file is empty, 0 rows; choose a file that holds a record")
+    found = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
+    rows = _Rows(found, sheet is not None)
+    for first, lines in itertools.chain(begun, blocks):
+        _take(rows, first, lines, mark, source)
+    columns = _columns(rows, path, source)
+    what = Layout(sheet=sheet) if sheet is not None else Layout(encoding=encoding)
+    if sheet is not None:
+        found = replace(found, layout=replace(found.layout, separator=None, decimal=None))
+    kind = f"sheet {sheet!r}" if sheet else f"text ({encoding}, {SEPARATOR_WORDS[found.separator]} between cells)"
+    assumed = () if header is not None else guessed + found.assumed
+    if found.names is None:
+        assumed = tuple(_with_remark(a, remark, found.width) for a in assumed)
+    return FileTable(path, columns, True, header, layout=what.under(found.layout), assumed=assumed, kind=kind)
+
+
+def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
+    """What was assumed of names, with a remark above the rows that may hold them, as NumPy writes it."""
+    words = remark.lstrip("# \t").replace(",", " ").split()
+    if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
+        return assumption
+    return replace(assumption, words=f"{assumption.words} (a remark above them has as many words: {' '.join(words)})")
+
+
+def _sample(
+    blocks: Iterator[tuple[int, list[str]]], layout: Layout, mark: str
+) -> tuple[list[tuple[int, list[str]]], list[tuple[int, str]], str]:
+    """The blocks that have begun, the first lines of the text that hold something, and the remark above them."""
+    begun: list[tuple[int, list[str]]] = []
+    sample: list[tuple[int, str]] = []
+    size, remark = 0, ""
+    for first, lines in blocks:
+        begun.append((first, lines))
+        for at, line in enumerate(lines, first):
+            if size > _SAMPLE and len(sample) >= _SAMPLE_LINES:
+                break
+            if not sample and line.lstrip()[:1] == mark:
+                remark = line[:400]
+            if _holds(line, mark):
+                sample.append((at, line))
+                size += len(line) if at > (layout.skip or 0) else 0
+        if size > _SAMPLE and len(sample) >= _SAMPLE_LINES:
+            break
+    return begun, sample, remark
+
+
+def _holds(line: str, mark: str) -> bool:
+    begun = line.lstrip()
+    return bool(begun) and begun[0] != mark
+
+
+def _take(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> None:
+    """Read the rows of one block."""
+    found = rows.found
+    kept = [(at, line) for at, line in enumerate(lines, first) if at >= found.begin and _holds(line, mark)]
+    if not kept:
+        return
+    cells = split([line for _, line in kept], found.separator, source, kept[0][0])
+    wrong = [index for index, row in enumerate(cells) if len(row) != found.width]
+    if wrong:
+        if not rows.ragged:
+            rows.ragged_line, rows.ragged_cells = kept[wrong[0]][0], cells[wrong[0]]
+        rows.ragged += len(wrong)
+    if not rows.ragged:
+        # Python's numbers may have underscores between their digits, those of files have not.
+        plain = not found.comma and not any("_" in line for _, line in kept)
+        rows.blocks.append(_numbers(rows, cells, [at for at, _ in kept], plain=plain))
+    rows.count += len(cells)
+
+
+def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
+    found = rows.found
+    if rows.ragged:
+        raise _ragged(rows, source)
+    if rows.count == 0:
+        raise DataError(f"{source}: a header and no rows; choose a file that holds a record")
+    values = np.concatenate(rows.blocks).T.copy() if len(rows.blocks) > 1 else rows.blocks[0].T.copy()
+    names = found.names if found.names is not None else [f"c{index + 1}" for index in range(found.width)]
+    columns = []
+    for k, (name, column) in enumerate(zip(names, values, strict=True)):
+        trouble, pieces = rows.troubles.get(k), rows.moments.get(k)
+        moments = None if pieces is None else Moments.joined(pieces)
+        problem = None if trouble is None else trouble.error(name, source)
+        if pieces is not None and (moments is None or moments.clock.size != rows.count):
+            problem = problem or DataError(
+                f"{source}: column {name!r}: dates or times written in several ways; write all alike"
+            )
+            moments = None
+        elif moments is not None:
+            problem = bad_rows(
+                f"{source}: column {name!r}", f"dates or times of day, not numbers ({moments.first!r})", 0, rows.count,
+                "name it with time=, or choose another column",
+            )  # fmt: skip
+        unit = (found.units[k] if found.units is not None else "") or stated_unit(name)[1]
+        blank = trouble is not None and trouble.blank
+        columns.append(Column(name, name, path, column, problem, blank=blank, moments=moments, stated=unit))
+    return columns
+
+
+def _ragged(rows: _Rows, source: str) -> DataError:
+    found = rows.found
+    first = "line of names" if found.names is not None else "first row"
+    others = [
+        words for mark, words in SEPARATOR_WORDS.items()
+        if mark is not None and mark != found.separator and not (found.comma and mark == ",")
+        and sum(cell.count(mark) for cell in rows.ragged_cells) >= max(1, found.width - 1)
+    ]  # fmt: skip
+    mixed = f"; that line has {others[0]}s" if others and len(rows.ragged_cells) < found.width else ""
+    return DataError(
+        f"{source}: line {rows.ragged_line} has {len(rows.ragged_cells)} cells where the {first} has {found.width}, "
+        f"{rows.ragged} lines in all; give every line the same number of cells "
+        f"(separator: {SEPARATOR_WORDS[found.separator]}{mixed})"
+    )
+
+
+def _encoding(stream: BinaryIO | _Limited, layout: Layout, path: Path) -> tuple[str, tuple[Assumption, ...]]:
+    """How the bytes of a text stand for characters: as told, by its mark, by its zeros, else UTF-8 where they are."""
+    if layout.encoding is not None:
+        return layout.encoding, ()
+    head = stream.read(LONGEST_HEADER)
+    if head.startswith(_UTF32):
+        return "utf-32", ()
+    if head.startswith(_UTF16):
+        return "utf-16", ()
+    for offset, name in ((1, "utf-16-le"), (0, "utf-16-be")):
+        zeros, others = head[offset:4000:2].count(0), head[1 - offset : 4000 : 2].count(0)
+        if zeros > 4 and others == 0 and zeros > 0.8 * len(head[offset:4000:2]):
+            words = f"every other byte is 0, so the text is {name}"
+            return name, (Assumption("encoding", name, words, "layout=dict(encoding=NAME)", False),)
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(head)
+    except UnicodeDecodeError as error:
+        if any(code in head for code in (*range(9), *range(14, 32))):
+            at = head[: error.start].count(b"\n") + 1
+            zipped = ": it begins as workbooks do, whose names end in .xlsx or .ods" if head[:2] == b"PK" else ""
+            raise DataError(
+                f"{path.name}: line {at} is not UTF-8 text (byte {head[error.start]:#04x}), and other bytes are of no "
+                f"text at all{zipped}; say layout=dict(encoding=NAME), or pass a csv, text or .mat file"
+            ) from None
+        words = f"no UTF-8 (byte {head[error.start]:#04x}), taken for cp1252 of Windows, which numbers do not depend on"
+        otherwise = "layout=dict(encoding=NAME)"
+        try:
+            head.decode("cp1252")
+        except UnicodeDecodeError:
+            return "latin-1", (
+                Assumption("encoding", "latin-1", words.replace("cp1252 of Windows", "latin-1"), otherwise),
+            )
+        return "cp1252", (Assumption("encoding", "cp1252", words, otherwise),)
+    return "utf-8", ()
+
+
+def _line_blocks(path: Path, stream: BinaryIO | _Limited, encoding: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the number of a first line and the lines from there, a few megabytes at a time."""
-    carry, number, newline = b"", 1, b""
+    decoder = codecs.getincrementaldecoder("utf-8-sig" if encoding == "utf-8" else encoding)()
+    carry, number_, newline = "", 1, ""
     while True:
         block = stream.read(_BLOCK)
+        try:
+            data = carry + decoder.decode(block, final=not block)
+        except UnicodeError as error:
+            raise _undecodable(path, error, number_ + carry.count("\n"), encoding) from None
         if not newline:
-            if block.startswith(_UTF16):
-                raise DataError(f"{path.name}: the text is UTF-16; save it as UTF-8")
-            block = block.removeprefix(BOM)
-            newline = b"\r" if b"\r" in block and b"\n" not in block else b"\n"
-        zero = block.find(b"\0")
+            newline = "\r" if "\r" in data and "\n" not in data else "\n" if data else ""
+        zero = data.find("\0")
         if zero >= 0:
             raise DataError(
-                f"{path.name}: a zero byte near line {number + (carry + block[:zero]).count(newline)}, so it is not a "
-                "text file or is damaged; pass a csv, text or .mat file"
+                f"{path.name}: a zero byte near line {number_ + data[:zero].count(newline)}, so it is not a text file "
+                "or is damaged; pass a csv, text or .mat file"
             )
-        data = carry + block
-        cut = data.rfind(newline) + 1 if block else len(data)
+        cut = data.rfind(newline) + 1 if block and newline else len(data) if not block else 0
         if cut == 0 and len(data) > _BLOCK:
-            raise DataError(f"{path.name}: line {number} is longer than {_BLOCK} bytes; pass a csv or text file")
+            raise DataError(f"{path.name}: line {number_} is longer than {_BLOCK} bytes; pass a csv or text file")
         if cut:
-            try:
-                text = data[:cut].decode("utf-8")
-            except UnicodeDecodeError as error:
-                raise DataError(
-                    f"{path.name}: line {number + data[: error.start].count(newline)} is not UTF-8 text (byte "
-                    f"{data[error.start]:#04x}); save it as UTF-8"
-                ) from None
-            lines = text.split(newline.decode())
-            yield number, lines
-            number += len(lines) - 1
+            lines = data[:cut].split(newline)
+            yield number_, lines
+            number_ += len(lines) - 1
         carry = data[cut:]
         if not block:
             return
 
 
-def _separator(sample: list[str], path: Path, number: int) -> str | None:
-    """Return what at least half of the first lines have: a semicolon, else a tab, else a comma, else None."""
-    if 2 * sum(_DECIMAL_COMMAS.fullmatch(line) is not None for line in sample) >= len(sample):
-        raise DataError(f"{path.name}: line {number} and others have decimal commas; {_DECIMAL_WAY_OUT}")
-    for candidate in (";", "\t", ","):
-        if 2 * sum(candidate in line.strip() for line in sample) >= len(sample):
-            return candidate
-    return None
+def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> DataError:
+    if not isinstance(error, UnicodeDecodeError):
+        return DataError(f"{path.name}: the text is no {encoding} ({error}); say layout=dict(encoding=NAME)")
+    at, byte = line + error.object[: error.start].count(b"\n"), error.object[error.start]
+    return DataError(
+        f"{path.name}: line {at} is not {encoding.upper()} text (byte {byte:#04x}); say layout=dict(encoding='cp1252') "
+        "if it is that of Windows, or save it as UTF-8"
+    )
 
 
-def _split(lines: list[str], separator: str | None, path: Path, number: int) -> list[list[str]]:
-    if separator is None:
-        return [line.split() for line in lines]
-    if not any('"' in line for line in lines):
-        return [line.split(separator) for line in lines]
+def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bool) -> npt.NDArray[np.float64]:
+    width, comma = len(cells[0]), rows.found.comma
+    value: Callable[[str], float] = float if plain else functools.partial(number, comma=comma)
     try:
-        rows = list(csv.reader(lines, delimiter=separator, strict=True))
-    except csv.Error as error:
-        raise DataError(f"{path.name}: quotes after line {number} cannot be read ({error}); correct them") from None
-    if len(rows) != len(lines):
-        raise DataError(f"{path.name}: a quoted cell after line {number} spans lines; correct the quotes")
-    return rows
-
-
-def _names(cells: list[str], path: Path, number: int, *, own: bool) -> list[str] | None:
-    """Return the names when this is a header, None when it is a row; a file of ftlm's `own` has one."""
-    stripped = [cell.strip() for cell in cells]
-    words = [cell for cell in stripped if cell and not _is_number(cell)]
-    if not words:
-        return None
-    commas = [cell for cell in words if _DECIMAL_COMMA.fullmatch(cell)]
-    if commas:
-        raise DataError(f"{path.name}: line {number}: {commas[0]!r} has a decimal comma; {_DECIMAL_WAY_OUT}")
-    if not own and any(_is_number(cell) for cell in stripped):
-        raise DataError(
-            f"{path.name}: line {number} mixes words and numbers ({words[0][:40]!r} is not a number, {len(words)} in "
-            "all), so it is neither a header nor a row; correct that cell, or give the columns names"
-        )
-    times = Counter(stripped)
-    for name in stripped:
-        if name and times[name] > 1:
-            raise DataError(
-                f"{path.name}: line {number}: the column name {name!r} is there {times[name]} times; rename all but one"
-            )
-    return stripped
-
-
-def _is_number(cell: str) -> bool:
-    try:
-        _number(cell)
-    except ValueError:
-        return False
-    return True
-
-
-def _number(cell: str) -> float:
-    if "_" in cell:
-        raise ValueError(cell)
-    return float(cell)
-
-
-def _numbers(
-    cells: list[list[str]], lines: list[int], rows_before: int, troubles: dict[int, _Trouble], *, plain: bool
-) -> npt.NDArray[np.float64]:
-    width = len(cells[0])
-    number = float if plain else _number
-    try:
-        flat = np.fromiter(
-            map(number, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width
-        )
+        flat = np.fromiter(map(value, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width)
     except ValueError:
         pass
     else:
@@ -232,16 +343,34 @@ def _numbers(
     for index in range(width):
         column = [row[index] for row in cells]
         try:
-            values[:, index] = list(map(number, column))
+            values[:, index] = list(map(value, column))
         except ValueError:
-            bad = [row for row, cell in enumerate(column) if not _is_number(cell)]
-            blank = all(not column[row].strip() for row in bad)
-            if blank:
-                values[:, index] = [number(cell) if cell.strip() else np.nan for cell in column]
-            known = troubles.get(index)
-            if known is None:
-                troubles[index] = _Trouble(lines[bad[0]], rows_before + bad[0], column[bad[0]], len(bad), blank)
-            else:
-                known.count += len(bad)
-                known.blank &= blank
+            _not_numbers(rows, index, column, lines, values)
     return values
+
+
+def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]) -> None:
+    """Keep moments of a column, or which of its cells are none and no numbers."""
+    comma = rows.found.comma
+    if is_moment(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):
+        moments = Moments.read(column)
+        if moments is not None:
+            rows.moments.setdefault(index, []).append(moments)
+            return
+    bad = [row for row, cell in enumerate(column) if not is_number(cell, comma=comma)]
+    dated = [row for row in bad if is_moment(column[row])]
+    if dated and 2 * len(dated) > len(column):
+        # Among dates it is the numbers that are wrong.
+        bad = [row for row in range(len(column)) if not is_moment(column[row])] or bad
+    blank = all(not column[row].strip() for row in bad)
+    if blank and not dated:
+        values[:, index] = [number(cell, comma=comma) if cell.strip() else np.nan for cell in column]
+    known = rows.troubles.get(index)
+    if known is None:
+        rows.troubles[index] = _Trouble(
+            lines[bad[0]], rows.count + bad[0], column[bad[0]], len(bad), blank and not dated, comma, bool(dated),
+            rows.sheet,
+        )  # fmt: skip
+    else:
+        known.count += len(bad)
+        known.blank &= blank and not dated

@@ -1,0 +1,83 @@
+"""Cells of text: their numbers, the lines that they are cut from, and what names and units look like."""
+
+from __future__ import annotations
+
+import csv
+import re
+
+from ftlm.base.errors import DataError
+from ftlm.data.units import TIME_UNITS, UNITS, header_time
+
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?|[+-]?\d+,(?:[eE][+-]?\d+)?")
+#: What stands in rows of units beside what ftlm converts.
+_UNIT_WORDS = frozenset(
+    (
+        "volt", "volts", "amp", "amps", "ampere", "amperes", "second", "seconds", "sec", "degree", "degrees", "radian",
+        "radians", "metre", "meter", "newton", "kelvin", "celsius", "watt", "hertz", "pascal", "bar", "mbar", "%", "-",
+        "db", "khz", "mhz", "kw", "mw", "mpa", "kn", "kg", "l/min", "m³/h", "nm", "ohm", "ω", "µv", "uv", "ua", "µa",
+        "hpa", "1/min", "u/min", "a.u.", "none", "count", "counts", "lsb", "km/h", "um", "µm", "°", "j", "kj", "ah",
+        "vdc", "vac",
+    )
+)  # fmt: skip
+_BRACKETED = re.compile(r"\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
+_STATED = re.compile(r"(.+?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
+
+
+def number(cell: str, *, comma: bool = False) -> float:
+    """Return the number in a cell; `ValueError` where there is none.
+
+    Python's numbers may have underscores between their digits, those of files have not; where commas are decimal,
+    points may group digits, so that a number with one is none.
+    """
+    if "_" in cell or (comma and "." in cell):
+        raise ValueError(cell)
+    return float(cell.replace(",", ".")) if comma else float(cell)
+
+
+def is_number(cell: str, *, comma: bool = False) -> bool:
+    """Whether a cell holds a number."""
+    try:
+        number(cell, comma=comma)
+    except ValueError:
+        return False
+    return True
+
+
+def split(lines: list[str], separator: str | None, source: str, first: int) -> list[list[str]]:
+    """Cut lines into cells, quoted ones whole."""
+    if separator is None:
+        return [line.split() for line in lines]
+    if not any('"' in line for line in lines):
+        return [line.split(separator) for line in lines]
+    try:
+        rows = list(csv.reader(lines, delimiter=separator, strict=True))
+    except csv.Error as error:
+        raise DataError(f"{source}: quotes after line {first} cannot be read ({error}); correct them") from None
+    if len(rows) != len(lines):
+        raise DataError(f"{source}: a quoted cell after line {first} spans lines; correct the quotes")
+    return rows
+
+
+def stated_unit(name: str) -> tuple[str, str]:
+    """What a column is called, and the unit that its name states in brackets, both as written; "" for none."""
+    found = _STATED.fullmatch(name)
+    unit = None if found is None else found[2] or found[3]
+    return (name, "") if found is None or not unit else (found[1], unit)
+
+
+def is_unit(cell: str) -> bool:
+    """Whether a cell can stand in a row of units."""
+    bracketed = _BRACKETED.fullmatch(cell)
+    word = bracketed[1] if bracketed else cell.strip()
+    return word in UNITS or word.casefold() in _UNIT_WORDS or is_time_unit(word) or bool(bracketed and len(word) <= 12)
+
+
+def is_time_unit(word: str) -> bool:
+    """Whether a word is a unit of time in any of its writings."""
+    return bool(word) and header_time(f"t [{word}]")[1] in TIME_UNITS
+
+
+def unit_of(cell: str) -> str:
+    """The unit that a cell of a row of units holds, without its brackets."""
+    bracketed = _BRACKETED.fullmatch(cell)
+    return bracketed[1] if bracketed else cell.strip()

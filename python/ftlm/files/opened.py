@@ -1,0 +1,358 @@
+"""What a stranger's file is before anything is made of it: columns, units, roles, assumptions, what to do next."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ftlm.base.checks import listed
+from ftlm.base.errors import DataError
+from ftlm.data.names import CSV_TIME
+from ftlm.data.readings import checked_missing
+from ftlm.data.run import Run
+from ftlm.files.columns import Column, FileTable, Pool
+from ftlm.files.layout import Assumption, Layout
+from ftlm.files.load import Options, PathLike, Wanted, load, run_from, tables_of, wanted_of
+from ftlm.files.roles import guessed_roles, known_unit, signal_names
+
+_SHOWN = 40
+#: What the error of a column says of its first bad cell.
+_IN_LINE = re.compile(r"line \d+: .*?(?=, first at)")
+
+
+@dataclass(frozen=True)
+class FileColumn:
+    """One column of a file.
+
+    Parameters
+    ----------
+    name : str
+        As the file has it.
+    role : str
+        ``"time"``, ``"input"``, ``"output"``, or "" for none.
+    signal : str
+        What a run calls it, where it is an input or an output.
+    unit : str
+        As the file states it; "" for none.
+    first, low, high : float or None
+        First, lowest and highest number; None where it holds no numbers.
+    words : str
+        What it holds where that is no numbers.
+    """
+
+    name: str
+    role: str
+    signal: str
+    unit: str
+    first: float | None
+    low: float | None
+    high: float | None
+    words: str = ""
+
+
+@dataclass(frozen=True)
+class OpenedFile:
+    """A file as :func:`ftlm.open_file` reads it.
+
+    Parameters
+    ----------
+    path : str
+        Of the file.
+    kind : str
+        What it is, in words.
+    rows : int
+        How many rows its table has.
+    columns : tuple of FileColumn
+        What they hold.
+    layout : Layout
+        How it is laid out, nothing left open.
+    assumed : tuple of Assumption
+        What nobody said and was taken for granted, each with the option that says it.
+    options : dict
+        Arguments of :func:`ftlm.load` that say all of it: the run is the same.
+    step : float or None
+        Time between rows [s]; None where `problem` stands in the way.
+    problem : str
+        Why it is no run yet, and what to do; "" for a run.
+    notes : tuple of str
+        What the run says of itself.
+    """
+
+    path: str
+    kind: str
+    rows: int
+    columns: tuple[FileColumn, ...]
+    layout: Layout
+    assumed: tuple[Assumption, ...]
+    options: dict[str, Any]
+    step: float | None
+    problem: str
+    notes: tuple[str, ...] = ()
+
+    def load(self) -> Run:
+        """Load it as a run, everything said that was assumed."""
+        return load(self.path, **self.options)
+
+    def command(self, verb: str = "identify") -> str:
+        """What to type next, quoted for a shell; "" where inputs or outputs are not known yet.
+
+        Parameters
+        ----------
+        verb
+            Command of `ftlm`: ``identify`` with the simplest equation of the first output, ``inspect``, ``select``.
+        """
+        if self.problem:
+            return ""
+        words = ["ftlm", verb, self.path if not self.path.startswith("-") else f"./{self.path}", *self._flags()]
+        outputs = [c.signal for c in self.columns if c.role == "output"]
+        inputs = [c.signal for c in self.columns if c.role == "input"]
+        if verb == "identify":
+            drives = "".join(f" + b{k} {name}" for k, name in enumerate(inputs))
+            words += ["--structure", f"D^alpha {outputs[0]} = a0 {outputs[0]}{drives}"]
+        elif verb == "select":
+            words += ["--structure", "auto"]
+        return " ".join(map(shlex.quote, words))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        said = {**asdict(self), "layout": self.layout.to_dict(), "commands": self._commands()}
+        return {**said, "options": {k: v.to_dict() if isinstance(v, Layout) else v for k, v in self.options.items()}}
+
+    def __str__(self) -> str:
+        heads = ("column", "role", "unit", "first", "low", "high")
+        shown = self.columns[:_SHOWN]
+        cells = [heads, *((_printed(c.name), _role(c), _printed(c.unit), *_figures(c)) for c in shown)]
+        widths = [max(len(row[k]) for row in cells) for k in range(6)]
+        counts = f"{self.rows} row{'s' * (self.rows != 1)}, {len(self.columns)} column{'s' * (len(self.columns) != 1)}"
+        lines = [f"{_printed(self.path)}: {self.kind}; {counts}"]
+        lines += ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip() for row in cells]
+        if len(self.columns) > _SHOWN:
+            lines.append(f"… and {len(self.columns) - _SHOWN} more")
+        if self.step is not None:
+            lines.append(f"step {self.step:.6g} s, {self.step * (self.rows - 1):.6g} s in all")
+        lines += [f"assumed: {assumption}" for assumption in self.assumed]
+        lines += [f"note: {note}" for note in self.notes]
+        if self.problem:
+            lines.append(f"to do: {self.problem}")
+        lines += [f"next: {line}" for line in self._commands()]
+        return "\n".join(lines)
+
+    def _commands(self) -> list[str]:
+        return [] if self.problem else [self.command("inspect"), self.command("identify")]
+
+    def _flags(self) -> list[str]:
+        """Options of the command line."""
+        told = self.options
+        words = []
+        for key, option in (
+            ("time", "--time"), ("step", "--sampling"), ("time_unit", "--time-unit"), ("resample", "--resample"),
+            ("missing", "--missing"),
+        ):  # fmt: skip
+            if key in told:
+                words += [option, str(told[key])]
+        if "slice" in told:
+            words += ["--slice", ":".join("" if end is None else repr(end) for end in told["slice"])]
+        for key, option in (("inputs", "-u"), ("outputs", "-y"), ("units", "--unit"), ("intersample", "--intersample")):
+            bare = key in ("inputs", "outputs")
+            pairs = (name if bare and name == value else f"{name}={value}" for name, value in told.get(key, {}).items())
+            words += [w for pair in pairs for w in (option, pair)]
+        # What every reader finds by itself and no number depends on may stay unsaid.
+        plain = {a.option for a in self.assumed if not a.counts}
+        told_layout: Layout = told.get("layout", Layout())
+        words += [w for k, v in told_layout.to_dict().items() if k not in plain for w in (f"--{k}", str(v))]
+        return words
+
+
+def open_file(
+    path: PathLike, *, time: str | int | None = None,
+    inputs: Mapping[str, str | int] | Sequence[str] | str | None = None,
+    outputs: Mapping[str, str | int] | Sequence[str] | str | None = None, units: Mapping[str, str] | None = None,
+    columns: Mapping[str, object] | PathLike | None = None, intersample: Mapping[str, str] | None = None,
+    step: float | None = None, slice: Sequence[float | None] | None = None, resample: float | None = None,
+    time_unit: str | None = None, missing: str | None = None, layout: Layout | Mapping[str, object] | None = None,
+) -> OpenedFile:  # fmt: skip
+    """Say what a file is and how it is read: columns, units, roles, what was assumed, what to type next.
+
+    What is not asked for is taken from the file: the time and roles from names, units from names or a line of them. All
+    of it stands in the result, with the arguments of :func:`ftlm.load` that say it. Nothing is guessed from numbers.
+
+    Parameters
+    ----------
+    path : path
+        One file of any kind that :func:`ftlm.load` reads.
+    time, inputs, outputs, units, columns, intersample, step, slice, resample, time_unit, missing, layout
+        As of :func:`ftlm.load`.
+
+    Returns
+    -------
+    OpenedFile
+        Prints as a table; ``.load()`` is the run.
+
+    Raises
+    ------
+    DataError
+        The file is missing, damaged, or can be read in more than one way; what only keeps it from being a run is its
+        `problem`.
+    """
+    if not isinstance(path, (str, os.PathLike)):
+        raise DataError(f"path is a {type(path).__name__}; pass the path of one file")
+    wanted = wanted_of(
+        columns,
+        time=time,
+        step=step,
+        inputs=inputs,
+        outputs=outputs,
+        units=units,
+        intersample=intersample,
+        layout=layout,
+    )
+    options = Options(slice, resample, None, time_unit, missing, checked_missing(missing or "refuse"))
+    (table,) = tables_of(path, wanted.layout)
+    return _Opening(table, Pool([table]), wanted, options).result(os.fspath(path))
+
+
+@dataclass
+class _Opening:
+    """A file on its way to being understood."""
+
+    table: FileTable
+    pool: Pool
+    wanted: Wanted
+    asked: Options
+
+    def result(self, path: str) -> OpenedFile:
+        table, wanted = self.table, self.wanted
+        every = self.pool.columns
+        clock, assumed, problem = self._time(every)
+        roles, said, open_roles = self._roles(every, clock)
+        assumed = (*table.assumed, *assumed, *said)
+        step, notes = None, tuple[str, ...]()
+        if not problem:
+            problem = open_roles
+        options = self._options(clock)
+        if not problem:
+            try:
+                run = run_from([table], wanted, self.asked)
+                step, notes = run.step, tuple(n for n in run.warnings if n not in {str(a) for a in assumed})
+            except DataError as error:
+                problem = str(error)
+        shown = tuple(_shown(column, roles) for column in every)
+        rows = max((0 if c.values is None else c.values.size for c in every), default=0)
+        return OpenedFile(path, table.kind, rows, shown, table.layout, assumed, options, step, problem, notes)
+
+    def _time(self, every: list[Column]) -> tuple[Column | None, tuple[Assumption, ...], str]:
+        """The time, what was assumed of it, and why there is none."""
+        wanted, header = self.wanted, self.table.header
+        if header is not None and wanted.time is None and wanted.step is None:
+            wanted.time = CSV_TIME
+        if wanted.step is not None:
+            return None, (), ""
+        matrices = list(dict.fromkeys(c.matrix for c in every if c.matrix is not None))
+        used = [c for c in every if c.matrix is not None] if len(matrices) == 1 else []
+        try:
+            clock, assumed = self.pool.time(wanted.time, used)
+        except DataError as error:
+            return None, (), str(error)
+        if assumed is not None:
+            return clock, (assumed,), ""
+        if wanted.time is None and clock.matrix is not None:
+            words = f"the time is the first column of the matrix, {clock.name!r}"
+            return clock, (Assumption("time", clock.name, words, "time=COLUMN", False),), ""
+        return clock, (), ""
+
+    def _roles(
+        self, every: list[Column], clock: Column | None
+    ) -> tuple[dict[str, tuple[str, str]], tuple[Assumption, ...], str]:
+        """Role and signal by column, what was guessed, and what is still open."""
+        wanted, header, guessed = self.wanted, self.table.header, False
+        if header is not None and not wanted.inputs and not wanted.outputs:
+            wanted.inputs, wanted.outputs = {n: n for n in header.inputs}, {n: n for n in header.outputs}
+        elif not wanted.inputs and not wanted.outputs:
+            free = [c.name for c in every if c is not clock and _holds(c) and c.name and c.name.isprintable()]
+            drives, follows = guessed_roles(free)
+            names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
+            wanted.inputs, wanted.outputs = {names[c]: c for c in drives}, {names[c]: c for c in follows}
+            guessed = bool(drives)
+        roles: dict[str, tuple[str, str]] = {} if clock is None else {clock.name: ("time", "")}
+        for role, asked in (("input", wanted.inputs), ("output", wanted.outputs)):
+            for name, spec in asked.items():
+                column = self.pool.find(spec, f"signal {name!r}")
+                roles[column.name] = (role, name)
+                if column.stated and name not in wanted.units and known_unit(column.stated) and header is None:
+                    wanted.units[name] = known_unit(column.stated)
+        said = []
+        if guessed:
+            inputs, outputs = listed(wanted.inputs.values(), 10), listed(wanted.outputs.values(), 10)
+            words = f"{inputs} drives {outputs}, by their names"
+            said.append(Assumption("inputs", inputs, words, "inputs={name: column}, outputs={name: column}"))
+        left = ""
+        if not wanted.outputs:
+            choice = listed((c.name for c in every if c is not clock and _holds(c)), 20)
+            left = (
+                "which columns are inputs and which are outputs, their names do not say; name them with "
+                f"inputs={{name: column}} and outputs={{name: column}}; there are {choice}"
+            )
+        return roles, tuple(said), left
+
+    def _options(self, clock: Column | None) -> dict[str, Any]:
+        """What says all of it to `load`."""
+        wanted = self.wanted
+        options: dict[str, Any] = {"step": wanted.step} if wanted.step is not None else {}
+        if clock is not None and self.table.header is None:
+            options["time"] = clock.name
+        asked = self.asked
+        more = {
+            "slice": asked.window,
+            "resample": asked.resample,
+            "time_unit": asked.time_unit,
+            "missing": asked.missing,
+        }
+        options |= {key: value for key, value in more.items() if value is not None}
+        for key in ("inputs", "outputs", "units", "intersample"):
+            if getattr(wanted, key) and (self.table.header is None or key in ("inputs", "outputs")):
+                options[key] = dict(getattr(wanted, key))
+        said = {*wanted.layout.to_dict(), *(a.option for a in self.table.assumed)}
+        layout = Layout.of({key: value for key, value in self.table.layout.to_dict().items() if key in said})
+        return options | ({"layout": layout} if layout != Layout() else {})
+
+
+def _holds(column: Column) -> bool:
+    """Whether a column holds numbers, gaps or not."""
+    return column.problem is None or column.blank
+
+
+def _shown(column: Column, roles: Mapping[str, tuple[str, str]]) -> FileColumn:
+    role, signal = roles.get(column.name, ("", ""))
+    unit, values = column.stated, column.values
+    if column.moments is not None:
+        return FileColumn(column.name, role, signal, unit, None, None, None, f"from {column.moments.first}")
+    if values is None or not values.size or not _holds(column):
+        why = _IN_LINE.search(str(column.problem))
+        words = "no numbers" if why is None else f"no numbers ({why[0]})"
+        return FileColumn(column.name, role, signal, unit, None, None, None, words)
+    there = values[~np.isnan(values)]
+    if not there.size:
+        return FileColumn(column.name, role, signal, unit, None, None, None, "empty")
+    return FileColumn(column.name, role, signal, unit, float(values[0]), float(there.min()), float(there.max()))
+
+
+def _role(column: FileColumn) -> str:
+    return f"{column.role} {column.signal}" if column.signal else column.role
+
+
+def _figures(column: FileColumn) -> tuple[str, str, str]:
+    if column.first is None or column.low is None or column.high is None:
+        return _printed(column.words), "", ""
+    return f"{column.first:.5g}", f"{column.low:.5g}", f"{column.high:.5g}"
+
+
+def _printed(text: str) -> str:
+    """Text without what a terminal would obey, and not too long."""
+    shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[:60])
+    return shown + ("…" if len(text) > 60 else "")

@@ -1,0 +1,412 @@
+"""Finds the table in the first lines of a text, and says what of its layout it took for granted."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from ftlm.base.errors import DataError
+from ftlm.files.cells import DECIMAL_COMMA, is_number, is_unit, split, unit_of
+from ftlm.files.layout import SEPARATORS, Assumption, Layout
+from ftlm.files.moments import is_moment
+
+_WORDS = {character: word for word, character in SEPARATORS.items()}
+SEPARATOR_WORDS: dict[str | None, str] = {";": "semicolon", "\t": "tab", ",": "comma", None: "white space"}
+_ORDER = (";", "\t", ",", None)
+_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2}(?:,\d{3})+")
+_PAIRS = re.compile(r"\s*[+-]?\d+,\d+(?:,\s+[+-]?\d+,\d+)+\s*")
+#: What LabVIEW puts above the cells of remarks that few rows have.
+_REMARKS = "comment"
+#: What oscilloscopes call the unit of a column that counts rows.
+_COUNTED = "sequence"
+
+
+@dataclass(frozen=True)
+class Found:
+    """The table of a text.
+
+    Parameters
+    ----------
+    separator, comma
+        Between cells, and whether decimals follow a comma.
+    names, units
+        Of its columns; None where it has no header.
+    begin
+        Number of the line of its first row.
+    width
+        Cells a row.
+    layout
+        All of that as a person would say it.
+    assumed
+        What was not said and taken for granted.
+    """
+
+    separator: str | None
+    comma: bool
+    names: list[str] | None
+    names_line: int
+    units: list[str] | None
+    begin: int
+    width: int
+    layout: Layout
+    assumed: tuple[Assumption, ...]
+
+
+@dataclass(frozen=True)
+class _Line:
+    """One line of the sample, cut in one way."""
+
+    at: int
+    cells: list[str]
+    numbers: list[bool]
+    words: int
+
+    @property
+    def width(self) -> int:
+        return len(self.cells)
+
+    @property
+    def count(self) -> int:
+        """Cells that hold a number or a moment."""
+        return sum(self.numbers)
+
+    @property
+    def full(self) -> bool:
+        return self.words == 0 and self.count > 0
+
+    @property
+    def good(self) -> bool:
+        """Whether it may be a row: numbers, and not more words than they."""
+        return self.count > 0 and self.count >= self.words
+
+    @property
+    def named(self) -> bool:
+        return self.words > 0 and self.count == 0
+
+
+def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, own: bool, sheet: bool) -> Found:
+    """Find the table that begins in the first lines of a text.
+
+    Parameters
+    ----------
+    lines
+        Numbers of lines and lines, blank ones and comments left out; at least one.
+    given
+        What a person says; the rest is found.
+    source
+        What errors call the file.
+    own
+        A file of ftlm's own: commas, decimal points, one line of names.
+    sheet
+        Rows of a sheet, cells between tabs.
+
+    Raises
+    ------
+    DataError
+        Nothing that could be a row, or more than one way to read it.
+    """
+    if own:
+        given = Layout(separator="comma", decimal="point", skip=0, header=1).under(given)
+    elif sheet:
+        given = Layout(separator="tab", decimal="point").under(given)
+    kept = [(at, line) for at, line in lines if at > (given.skip or 0)]
+    if not kept:
+        raise DataError(f"{source}: no table below the first {given.skip} lines; say another number with layout=")
+    separator, comma, cut = _chosen(kept, given, source)
+    width = _width(cut)
+    first = 0 if given.skip is not None and given.header is not None else _first_row(cut, width)
+    top = first if given.skip is None or given.header is None else min(given.header, len(cut))
+    names, units, top = _header(cut, top, width, given, source, own=own)
+    layout, assumed = _said(cut, given, separator, comma, names, units, top, first)
+    if given.skip is None:
+        _check_above(cut[: top - (0 if names is None else 1 if units is None else 2)], width, source, comma=comma)
+    if not own and names is None and top < len(cut):
+        _check_headless(cut[top], source, given)
+    if names is not None and not own and given.separator is None:
+        _check_mixed(cut, top, separator, comma, source)
+    line = cut[top - (2 if units else 1)].at if names is not None else 0
+    begin = cut[top].at if top < len(cut) else cut[-1].at + 1
+    if names is not None:
+        width = len(names)
+    return Found(separator, comma, names, line, units, begin, width, layout, assumed)
+
+
+def _cut(kept: Sequence[tuple[int, str]], separator: str | None, source: str, *, comma: bool) -> list[_Line]:
+    """Lines cut into cells; a line whose quotes cannot be read is cut as it stands, the rows say so later."""
+    cut = []
+    for at, line in kept:
+        try:
+            (cells,) = split([line], separator, source, at)
+        except DataError:
+            cells = line.split(separator)
+        there = [bool(cell.strip()) for cell in cells]
+        numbers = [
+            full and (is_number(cell, comma=comma) or is_moment(cell))
+            for cell, full in zip(cells, there, strict=True)
+        ]  # fmt: skip
+        cut.append(_Line(at, cells, numbers, sum(there) - sum(numbers)))
+    return cut
+
+
+def _ways(text: str, given: Layout) -> Iterator[tuple[str | None, bool]]:
+    """Separators and decimals that there may be."""
+    for separator in _ORDER if given.separator is None else (SEPARATORS[given.separator],):
+        if given.separator is None and separator is not None and separator not in text:
+            continue
+        for comma in (False, True) if given.decimal is None else (given.decimal == "comma",):
+            if comma and (separator == "," or ("," not in text and given.decimal is None)):
+                continue
+            yield separator, comma
+
+
+def _chosen(kept: Sequence[tuple[int, str]], given: Layout, source: str) -> tuple[str | None, bool, list[_Line]]:
+    """The way of cutting under which most lines are rows of one width."""
+    text = "".join(line for _, line in kept)
+    best: tuple[tuple[int, ...], str | None, bool, list[_Line]] | None = None
+    for separator, comma in _ways(text, given):
+        cut = _cut(kept, separator, source, comma=comma)
+        if comma and given.decimal is None and _decimal_comma(cut) is None:
+            continue
+        width = _width(cut)
+        rows = [line for line in cut[_first_row(cut, width) :] if line.width == width and line.good]
+        half = 2 * sum(line.width > 1 for line in cut[:20]) >= len(cut[:20])
+        rank = (len(rows), -sum(line.words for line in rows), half and not rows)
+        if best is None or rank > best[0]:
+            best = rank, separator, comma, cut
+    if best is None:
+        raise DataError(f"{source}: the separator and the decimals that layout= says do not go together; say others")
+    _, separator, comma, cut = best
+    if given.decimal is None and given.separator is None and separator == ",":
+        _check_commas(kept, cut, source)
+    if given.decimal is None and comma:
+        _check_thousands(cut, source)
+    return separator, comma, cut
+
+
+def _decimal_comma(cut: list[_Line]) -> str | None:
+    """The first number with a decimal comma."""
+    return next((c.strip() for line in cut for c in line.cells if DECIMAL_COMMA.fullmatch(c.strip())), None)
+
+
+def _width(cut: list[_Line]) -> int:
+    """Cells a row: of most lines that hold numbers alone, else of most that hold numbers, else of the first."""
+    for rows in ([line for line in cut if line.full], [line for line in cut if line.good]):
+        counts = Counter(line.width for line in rows)
+        if counts:
+            most = max(counts.values())
+            widths = [width for width, count in counts.items() if count == most]
+            return cut[0].width if cut[0].width in widths else max(widths)
+    return cut[0].width
+
+
+def _first_row(cut: list[_Line], width: int) -> int:
+    """Where the rows begin: the first one that looks like most of them, and damaged ones right above it."""
+    rows = [line for line in cut if line.width == width and line.good]
+    if not rows:
+        return 1 if cut[0].named else 0
+    most = [2 * sum(line.numbers[k] for line in rows) > len(rows) for k in range(width)]
+
+    def alike(line: _Line) -> bool:
+        return line.width == width and all(n or not m for n, m in zip(line.numbers, most, strict=True))
+
+    first = next((k for k, line in enumerate(cut) if alike(line) and line.count), None)
+    if first is None:
+        first = next(k for k, line in enumerate(cut) if line is rows[0])
+    while first > 0 and cut[first - 1].width == width and cut[first - 1].count:
+        if _above_units(cut, first) or _settings(cut, first - 1):
+            break
+        first -= 1
+    # Short rows right below a line of names are rows; what is wrong with them is said when all are read.
+    above = first
+    while above > 0 and cut[above - 1].full:
+        above -= 1
+    return above if above > 0 and cut[above - 1].named and cut[above - 1].width == width else first
+
+
+def _above_units(cut: list[_Line], first: int) -> bool:
+    """Whether the line above is a header although it holds numbers, as of channels 1 and 2: units stand below it."""
+    return first < len(cut) and _units(cut[first])
+
+
+def _settings(cut: list[_Line], at: int) -> bool:
+    """Whether a line below one of names holds units and settings, as oscilloscopes write start and increment there."""
+    line = cut[at]
+    words = [c.strip() for c, n in zip(line.cells, line.numbers, strict=True) if c.strip() and not n]
+    units = [word for word in words if is_unit(word)]
+    others = {word.casefold() for word in words if not is_unit(word)}
+    return at > 0 and cut[at - 1].named and line.count > 0 and bool(units) and others <= {_COUNTED}
+
+
+def _units(line: _Line) -> bool:
+    cells = [cell for cell in line.cells if cell.strip()]
+    return line.named and all(is_unit(cell) for cell in cells)
+
+
+def _header(
+    cut: list[_Line], top: int, width: int, given: Layout, source: str, *, own: bool
+) -> tuple[list[str] | None, list[str] | None, int]:
+    """Names and units above the rows, and where the rows begin."""
+    rows = [line for line in cut[top:] if line.width == width]
+    spare = bool(rows) and all(not line.cells[-1].strip() for line in rows)
+
+    def fitted(line: _Line) -> list[str]:
+        """Names without a last one that rows leave out, or with one for a last cell that they leave empty."""
+        names = [cell.strip() for cell in line.cells]
+        if len(names) == width + 1 and names[-1].casefold() in ("", _REMARKS):
+            return names[:-1]
+        return [*names, ""] if spare and len(names) == width - 1 else names
+
+    count = given.header
+    if count is None:
+        count = 0
+        units_above = top > 1 and (_units(cut[top - 1]) or _settings(cut, top - 1))
+        if top > 0 and (cut[top - 1].named or own or units_above):
+            count = 1
+            if units_above and len(fitted(cut[top - 2])) == width and cut[top - 2].words:
+                count = 2
+            elif len(fitted(cut[top - 1])) != width and top > 1:
+                count = 0
+    if count > top and given.skip is None and count < len(cut):
+        # Names that are numbers look like a row.
+        top = count
+    if count > top:
+        raise DataError(f"{source}: layout= says {count} lines of header, and {top} stand above the rows; say fewer")
+    if count == 0:
+        return None, None, top
+    line = cut[top - count]
+    names = fitted(line)
+    if not own and count == 1 and line.count and given.header is None:
+        raise _mixed_line(line, source)
+    commas = [cell for cell in names if DECIMAL_COMMA.fullmatch(cell)]
+    if commas and not own and count == 1:
+        raise DataError(
+            f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, so it is no line of names; say "
+            "layout=dict(decimal='comma')"
+        )
+    check_distinct(names, line.at, source)
+    if count == 1:
+        return names, None, top
+    units = [unit_of(cell) for cell in cut[top - 1].cells]
+    units += [""] * (len(names) - len(units))
+    return names, units[: len(names)], top
+
+
+def check_distinct(names: list[str], at: int, source: str) -> None:
+    """Refuse a name of a header that is there twice."""
+    times = Counter(names)
+    for name in names:
+        if name and times[name] > 1:
+            raise DataError(
+                f"{source}: line {at}: the column name {name!r} is there {times[name]} times; rename all but one"
+            )
+
+
+def _check_headless(line: _Line, source: str, given: Layout) -> None:
+    """Refuse words among the numbers of a first row: it could be a header as well."""
+    if line.words and given.header is None:
+        raise _mixed_line(line, source)
+
+
+def _check_above(above: list[_Line], width: int, source: str, *, comma: bool) -> None:
+    """Refuse to leave out what may be rows: lines of several numbers and nothing else."""
+    rows = [line for line in above if line.full and sum(is_number(cell, comma=comma) for cell in line.cells) > 1]
+    if rows:
+        raise DataError(
+            f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
+            f"a table of {width} cells a row; give every line the same number of cells, or say how many lines to leave "
+            "out with layout=dict(skip=LINES)"
+        )
+
+
+def _mixed_line(line: _Line, source: str) -> DataError:
+    words = [
+        cell.strip() for cell, is_n in zip(line.cells, line.numbers, strict=True) if cell.strip() and not is_n
+    ]  # fmt: skip
+    commas = [word for word in words if DECIMAL_COMMA.fullmatch(word)]
+    if commas:
+        return DataError(
+            f"{source}: line {line.at}: {commas[0]!r} has a decimal comma, and others have points; write all numbers "
+            "alike"
+        )
+    return DataError(
+        f"{source}: line {line.at} mixes words and numbers ({words[0][:40]!r} is not a number, {len(words)} in "
+        "all), so it is neither a header nor a row; correct that cell, or give the columns names"
+    )
+
+
+def _check_commas(kept: Sequence[tuple[int, str]], cut: list[_Line], source: str) -> None:
+    """Refuse commas that may be separators or decimals: pairs of them with spaces between, one of whole numbers."""
+    rows = [(line, text) for line, (_, text) in zip(cut, kept, strict=True) if line.full]
+    if not rows:
+        return
+    pairs = all(_PAIRS.fullmatch(text) for _, text in rows)
+    single = not any(line.named and line.width == 2 for line in cut) and all(
+        line.width == 2 and all(cell.strip().lstrip("+-").isdecimal() for cell in line.cells) for line, _ in rows
+    )
+    if pairs or single:
+        at, shown = rows[0][0].at, rows[0][1].strip()[:40]
+        raise DataError(
+            f"{source}: line {at}: the commas of {shown!r} may stand between cells or before decimals; say "
+            "layout=dict(separator='comma'), or layout=dict(decimal='comma') where spaces separate"
+        )
+
+
+def _check_thousands(cut: list[_Line], source: str) -> None:
+    """Refuse commas that may group thousands: three digits behind every one."""
+    cells = [
+        (line.at, cell.strip()) for line in cut for cell, n in zip(line.cells, line.numbers, strict=True)
+        if n and "," in cell and not is_moment(cell)
+    ]  # fmt: skip
+    if cells and all(_THOUSANDS.fullmatch(cell) for _, cell in cells):
+        at, shown = cells[0]
+        raise DataError(
+            f"{source}: line {at}: the comma of {shown!r} may stand before decimals or group thousands, as in every "
+            "other number there; say layout=dict(decimal='comma'), or write them without"
+        )
+
+
+def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool, source: str) -> None:
+    """Refuse a second separator that header and rows share: decimals would not stand in the names, too."""
+    if not comma or separator is None:
+        return
+    header = cut[top - 1]
+    both = [re.split(f"[,{separator}]", separator.join(line.cells)) for line in (header, *cut[top : top + 20])]
+    if len(both[0]) > header.width and len(both) > 1 and len({len(cells) for cells in both}) == 1:
+        raise DataError(
+            f"{source}: line {header.at} and the rows below it have commas and {SEPARATOR_WORDS[separator]}s between "
+            f"their cells; write one separator, or say layout=dict(separator={_WORDS[separator]!r}, decimal='comma')"
+        )
+
+
+def _said(
+    cut: list[_Line], given: Layout, separator: str | None, comma: bool, names: list[str] | None,
+    units: list[str] | None, top: int, first: int,
+) -> tuple[Layout, tuple[Assumption, ...]]:  # fmt: skip
+    """The layout, and what of it nobody said."""
+    header = 0 if names is None else 2 if units is not None else 1
+    start = top - header
+    skip = given.skip if given.skip is not None else 0 if start == 0 else cut[start].at - 1 if start < len(cut) else 0
+    layout = Layout(
+        separator=_WORDS[separator], decimal="comma" if comma else "point", skip=skip, header=header
+    ).under(given)  # fmt: skip
+    assumed = []
+    if given.separator is None:
+        words = f"{SEPARATOR_WORDS[separator]} between cells"
+        assumed.append(Assumption("separator", str(layout.separator), words, "layout=dict(separator=NAME)", False))
+    if given.decimal is None and comma:
+        shown = _decimal_comma(cut)
+        words, otherwise = f"decimal commas, as in {shown!r}", "layout=dict(decimal='point')"
+        assumed.append(Assumption("decimal", "comma", words, otherwise))
+    if given.skip is None and skip:
+        words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
+        assumed.append(Assumption("skip", skip, words, "layout=dict(skip=LINES)"))
+    if given.header is None and units is not None:
+        words = f"line {cut[top - 1].at} holds units"
+        assumed.append(Assumption("header", 2, words, "layout=dict(header=1)"))
+    elif given.header is None and header == 0:
+        assumed.append(
+            Assumption("header", 0, "no line of names: columns are c1, c2, …", "layout=dict(header=1)", False)
+        )
+    return layout, tuple(assumed)

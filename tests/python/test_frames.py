@@ -1,0 +1,127 @@
+"""Frames and datasets in and out: dates, time zones, indices, and what a round trip keeps."""
+
+import datetime
+import sys
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+
+import ftlm
+
+N = 40
+U, Y = np.arange(N) % 7 * 1.0, np.sin(np.arange(N) / 5)
+STAMPS = pd.date_range("2024-03-31 01:59:50", periods=N, freq="500ms")
+ZONED = pd.date_range("2024-03-31 01:59:50", periods=N, freq="500ms", tz="Europe/Berlin")
+ROLES = {"inputs": ["u"], "outputs": ["y"]}
+SIGNALS = {"inputs": {"u": U}, "outputs": {"y": Y}}
+
+
+def frame(index):
+    return pd.DataFrame({"u": U, "y": Y}, index=index)
+
+
+DATES = {
+    "numpy": STAMPS.to_numpy(), "seconds of numpy": STAMPS[::2].to_numpy().astype("datetime64[s]"),
+    "pandas": pd.Series(STAMPS), "zoned": pd.Series(ZONED), "index": ZONED, "polars": pl.Series(STAMPS.to_numpy()),
+    "datetime": STAMPS.to_pydatetime().tolist(), "zoned datetime": ZONED.to_pydatetime().tolist(),
+    "lapses": (STAMPS - STAMPS[0]).to_numpy(), "days": np.arange(N) + np.datetime64("2024-02-20", "D"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", DATES)
+def test_dates_are_times(kind):
+    time = DATES[kind]
+    signals = {role: {n: v[: len(time)] for n, v in given.items()} for role, given in SIGNALS.items()}
+    run = ftlm.Run.from_arrays(time=time, **signals)
+    assert (run.start, run.step) == (0.0, {"days": 86400.0, "seconds of numpy": 1.0}.get(kind, 0.5))
+    said = [w for w in run.warnings if "time counted from" in w]
+    assert len(said) == (kind != "lapses")
+    with pytest.raises(ftlm.DataError, match="time_unit='ms' is the unit of numbers"):
+        ftlm.Run.from_arrays(time=time, time_unit="ms", **signals)
+
+
+BAD = {
+    "no date": ([*STAMPS[:5], None, *STAMPS[6:]], "time: no date, first at row 5, 1 in all"),
+    "two at once": ([*STAMPS[:5], STAMPS[4], *STAMPS[6:]], "repeated time"),
+    "backwards": (STAMPS[::-1], "decreasing"),
+    "dates among numbers": ([*STAMPS[:5].to_pydatetime(), 3.0, *STAMPS[6:].to_pydatetime()], "not one date per row"),
+    "words": (["2024-01-01"] * N, "'2024-01-01' is not a number"),
+    "too far apart": (
+        np.array(["-9000-01-01", "9000-01-01", *["9001-01-01"] * (N - 2)], "datetime64[s]"),
+        "nanoseconds",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_dates_that_are_none_are_refused(case):
+    time, words = BAD[case]
+    with pytest.raises(ftlm.DataError, match=words):
+        ftlm.Run.from_arrays(time=time, **SIGNALS)
+
+
+def test_an_index_is_the_time_where_it_says_so():
+    for index in (STAMPS, ZONED, STAMPS - STAMPS[0], pd.Index(np.arange(N) * 0.5, name="t")):
+        assert ftlm.Run.from_frame(frame(index), **ROLES).step == 0.5
+    run = ftlm.Run.from_frame(frame(pd.Index(np.arange(N) * 500.0, name="time [ms]")), **ROLES)
+    assert run.step == 0.5
+    assert "time read in ms, as the header 'time [ms]' says" in run.warnings
+    assert ftlm.Run.from_frame(frame(STAMPS), step=2.0, **ROLES).step == 2.0
+    named = frame(pd.Index(np.arange(N) * 0.5, name="clock"))
+    assert ftlm.Run.from_frame(named, time="clock", **ROLES).step == 0.5
+    for index in (None, pd.Index(np.arange(N) * 0.5), named.index, pd.MultiIndex.from_arrays([U, Y])):
+        with pytest.raises(ftlm.DataError, match="step= and time=: neither is given"):
+            ftlm.Run.from_frame(frame(index), **ROLES)
+    with pytest.raises(ftlm.DataError, match=r"time \(the index\): decreasing"):
+        ftlm.Run.from_frame(frame(STAMPS[::-1]), **ROLES)
+    column = pd.DataFrame({"when": ZONED, "u": U, "y": Y})
+    assert ftlm.Run.from_frame(column, time="when", **ROLES).step == 0.5
+    assert (
+        ftlm.Run.from_frame(pl.DataFrame({"when": STAMPS.to_numpy(), "u": U, "y": Y}), time="when", **ROLES).step == 0.5
+    )
+
+
+@pytest.fixture
+def run():
+    made = ftlm.Run.from_arrays(
+        time=1.25 + np.arange(N) * 0.1, units={"y": "deg", "u": "mA"}, intersample={"u": "foh"}, name="bench", **SIGNALS
+    )
+    return made
+
+
+@pytest.mark.parametrize("kind", ["frame", "xarray"])
+def test_a_run_goes_out_and_comes_back(run, kind):
+    out = run.to_frame() if kind == "frame" else run.to_xarray()
+    back = ftlm.Run.from_frame(out, **ROLES, units=run.units, intersample=run.intersample, name=out.attrs["name"])
+    assert (back.step, back.start, back.units, back.intersample) == (run.step, run.start, run.units, run.intersample)
+    assert all(back[n].tobytes() == run[n].tobytes() for n in run.signals)
+    assert out.attrs["inputs"] == ["u"]
+    # What is done to it is not done to the run.
+    assert not any(np.shares_memory(np.asarray(out[n]), run[n]) for n in run.signals)
+    assert run["y"].any()
+
+
+def test_a_dataset_of_others_is_read_by_its_variables(run):
+    xarray = pytest.importorskip("xarray")
+    data = xarray.Dataset({"u": ("when", U), "y": ("when", Y), "gain": 3.0}, coords={"when": STAMPS})
+    assert ftlm.Run.from_frame(data, **ROLES).step == 0.5
+    assert ftlm.Run.from_frame(data.drop_vars("when"), step=0.5, **ROLES).length == N
+    two = xarray.Dataset({"u": ("when", U), "y": ("where", Y)}, coords={"when": STAMPS, "where": np.arange(N)})
+    with pytest.raises(ftlm.DataError, match="neither is given"):
+        ftlm.Run.from_frame(two, **ROLES)
+    with pytest.raises(ftlm.DataError, match=r"'v' .* is not in the frame.*'when'"):
+        ftlm.Run.from_frame(data, inputs=["v"], outputs=["y"])
+
+
+@pytest.mark.parametrize(("library", "way"), [("pandas", "to_frame"), ("xarray", "to_xarray")])
+def test_what_is_missing_is_named(run, monkeypatch, library, way):
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ftlm.ModelError, match=f"pip install {library}"):
+        getattr(run, way)()
+
+
+def test_dates_of_python_count_like_those_of_numpy():
+    day = [datetime.date(2024, 2, 28), datetime.date(2024, 2, 29), datetime.date(2024, 3, 1)]
+    assert ftlm.Run.from_arrays(time=day, outputs={"y": [1.0, 2.0, 4.0]}, inputs=None).step == 86400.0

@@ -1,0 +1,141 @@
+"""`ftlm open`: what names say of columns, what is asked, what is printed, and that its options work."""
+
+import json
+import shlex
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm.files.roles import guessed_roles, known_unit, signal_names
+from test_files import messages, rows, write
+from test_strangers import command
+
+
+@pytest.mark.parametrize(
+    ("columns", "roles"),
+    [
+        (["u", "y"], (["u"], ["y"])),
+        (["u1", "u2", "y1", "y2"], (["u1", "u2"], ["y1", "y2"])),
+        (["Im1_meas_A", "th11_deg", "th12_deg"], (["Im1_meas_A"], ["th11_deg", "th12_deg"])),
+        (["Motor Voltage (V)", "Shaft Speed (rpm)"], (["Motor Voltage (V)"], ["Shaft Speed (rpm)"])),
+        (["input angle", "output angle"], (["input angle"], ["output angle"])),
+        (["inputVoltage", "outputVoltage"], (["inputVoltage"], ["outputVoltage"])),
+        (["Strom (A)", "Kanal 2"], (["Strom (A)"], ["Kanal 2"])),
+        (["Channel A", "Temperature"], (["Channel A"], ["Temperature"])),
+        # Nothing is guessed where names leave anything open.
+        (["CH1", "CH2"], ([], [])),
+        (["Voltage_0", "Voltage_1"], ([], [])),
+        (["u", "a", "b"], ([], [])),
+        # A motor's current follows its voltage, a cell's voltage its current.
+        (["Current [A]", "Voltage [V]"], ([], [])),
+        (["y"], ([], [])),
+        ([], ([], [])),
+    ],
+)
+def test_roles_by_names(columns, roles):
+    assert guessed_roles(columns) == roles
+
+
+def test_names_and_units_that_equations_and_runs_can_hold():
+    named = signal_names({"Strom (A)": "u", "2nd": "u", "D": "y", "größe": "y", "a b": "u", "a  b": "u", "g/x": "y"})
+    assert named == {"Strom (A)": "Strom", "2nd": "u", "D": "y", "größe": "größe", "a b": "a_b", "a  b": "a_b_2",
+                     "g/x": "x"}  # fmt: skip
+    for name in named.values():
+        assert ftlm.equation(f"D^alpha {name} = a0 {name} + b0 drive").equations
+    units = {"Volt": "V", "deg": "deg", "degrees": "deg", "furlong": "", "U/min": "rpm", "": ""}
+    assert {stated: known_unit(stated) for stated in units} == units
+
+
+def test_what_names_leave_open_is_asked_and_then_answered(tmp_path):
+    path = write(tmp_path, "Time,CH1,CH2,note\n" + rows().replace("\n", ",a\n"))
+    opened = ftlm.open_file(path)
+    assert (opened.step, opened.command()) == (None, "")
+    assert "there are 'CH1', 'CH2'" in opened.problem
+    messages(["no output is named"], opened.load)
+    shown = command("open", path)
+    assert shown.exit_code == 0
+    assert "to do: which columns are inputs and which are outputs" in shown.stdout
+    assert "-u NAME=COLUMN and -y NAME=COLUMN" in shown.stdout
+    assert "no numbers (line 2: 'a' is not a number)" in shown.stdout
+    answered = command("open", path, "-u", "CH1", "-y", "y=CH2", "--unit", "y=mm", "--slice", "0.02:", "--json")
+    told = json.loads(answered.stdout)
+    assert (told["step"], told["problem"]) == (0.01, "")
+    words = shlex.split(told["commands"][1])
+    assert words[:3] == ["ftlm", "identify", str(path)]
+    assert words[3:-2] == ["--time", "Time", "--slice", "0.02:", "-u", "CH1", "-y", "y=CH2", "--unit", "y=mm"]
+    assert json.loads(command(*shlex.split(told["commands"][0])[1:], "--json").stdout)[0]["rows"] == 10
+
+
+def test_a_run_of_ftlm_is_opened_as_one(tmp_path, small_run):
+    small_run.to_csv(tmp_path / "run.csv")
+    opened = ftlm.open_file(tmp_path / "run.csv")
+    assert (opened.problem, opened.assumed, opened.step) == ("", (), small_run.step)
+    assert [c.role for c in opened.columns] == ["time", "input", "output"]
+    assert opened.load()["y"].tobytes() == small_run["y"].tobytes()
+    assert shlex.split(opened.command("select"))[3:] == ["-u", "u", "-y", "y", "--structure", "auto"]
+
+
+def test_what_stands_in_the_way_is_said_and_the_options_that_help_are_passed_on(tmp_path):
+    uneven = "t,u,y\n" + "".join(f"{0.1 * k + 0.03 * (k % 2)},{k % 3},{k}\n" for k in range(9))
+    path = write(tmp_path, uneven)
+    opened = ftlm.open_file(path)
+    assert "jitter" in opened.problem
+    assert "resample=STEP" in opened.problem
+    mended = ftlm.open_file(path, resample=0.1)
+    assert mended.problem == ""
+    assert "--resample 0.1" in mended.command()
+    assert mended.load().step == 0.1
+    gaps = write(tmp_path, "t,u,y\n0,1,2\n1,1,\n2,1,3\n3,1,5\n4,1,5\n", "gaps.csv")
+    assert "missing='weight'" in ftlm.open_file(gaps).problem
+    assert "--missing weight" in ftlm.open_file(gaps, missing="weight").command()
+    clockless = write(tmp_path, "a,u,y\n" + rows(), "clockless.csv")
+    assert "name it with time=" in ftlm.open_file(clockless).problem
+    assert ftlm.open_file(clockless, step=0.5).step == 0.5
+    assert ftlm.open_file(clockless, time="a", time_unit="ms").step == pytest.approx(1e-5)
+
+
+BAD = {
+    "no such file": (["no.csv"], "does not exist"),
+    "no such column": (["x.csv", "-u", "w"], "column 'w' (signal 'w') is not in"),
+    "no such unit": (["x.csv", "--unit", "y=furlong", "-y", "y"], "furlong"),
+    "detrend": (["x.csv", "--detrend", "constant"], "--detrend is not used with open"),
+    "skip": (["x.csv", "--skip", "-3"], "skip is -3"),
+    "header": (["x.csv", "--header", "7"], "header is 7"),
+    "sheet": (["x.csv", "--sheet", "a"], "'sheet' is not used with text"),
+    "dates": (["x.csv", "--dates", "ydm"], "'ydm'"),
+    "encoding": (["x.csv", "--encoding", "klingon"], "'klingon'"),
+    "two files": (["x.csv", "x.csv"], "unexpected extra argument"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_typos_are_refused_in_words(tmp_path, monkeypatch, case):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, "t,u,y\n" + rows())
+    words, said = BAD[case]
+    done = command("open", *words)
+    text = " ".join((done.stderr + done.stdout).split())
+    assert said in text
+    if case == "no such unit":
+        assert (done.exit_code, "to do: unit" in text) == (0, True)
+        return
+    assert done.exit_code in (2, 3)
+    assert "Traceback" not in text
+    messages(["path is a list"], lambda: ftlm.open_file(["x.csv"]))
+
+
+def test_a_file_whose_name_looks_like_an_option_is_named_so_that_it_works(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    write(tmp_path, "t,u,y\n" + rows(), "-u.csv")
+    told = shlex.split(ftlm.open_file("-u.csv").command("inspect"))
+    assert command(*told[1:]).exit_code == 0
+
+
+def test_what_is_opened_is_a_record(tmp_path):
+    opened = ftlm.open_file(write(tmp_path, "t,u,y\n" + rows()))
+    with pytest.raises(AttributeError):
+        opened.rows = 3
+    assert [(c.name, c.role, c.first) for c in opened.columns[:1]] == [("t", "time", 0.0)]
+    assert json.loads(json.dumps(opened.to_dict()))["columns"][2]["high"] == pytest.approx(1.1)
+    assert np.isfinite([c.high for c in opened.columns]).all()

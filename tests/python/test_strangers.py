@@ -1,0 +1,93 @@
+"""Files of strangers: from each to a validated model by one command, the truth within its intervals; `ftlm open`."""
+
+import json
+import re
+import shlex
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import ftlm
+import strangers
+from ftlm.cli.app import app
+
+
+def command(*words):
+    return CliRunner().invoke(app, list(map(str, words)), env={"COLUMNS": "200", "NO_COLOR": "1"})
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Each stranger's file in a folder."""
+    folder = tmp_path_factory.mktemp("strangers")
+    made = {name: strangers.made(name, folder) for name in strangers.MAKERS}
+    for stranger in made.values():
+        (folder / stranger.name).write_bytes(stranger.content)
+    return folder, made
+
+
+@pytest.mark.parametrize("name", strangers.MAKERS)
+def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
+    folder, made = files
+    path = folder / made[name].name
+    done = command("identify", path, *made[name].words, "--structure", strangers.EQUATION, "--slice", ":3.6",
+                   "--intervals", "quadratic", "--validation", path, "--json")  # fmt: skip
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    for number, true in strangers.TRUTH.items():
+        low, high = found["intervals"][number]
+        assert low < true < high, number
+        assert high - low < 0.2 * abs(true), number
+    assert found["validation"]["output_error"]["y"]["fit"] > 95
+
+
+@pytest.mark.parametrize("name", strangers.MAKERS)
+def test_the_record_is_the_one_that_was_written_and_open_says_all_that_was_assumed(files, name):
+    folder, made = files
+    path, stranger = folder / made[name].name, made[name]
+    asked = {"inputs": {"u": stranger.words[1].partition("=")[2] or "u"}}
+    asked["outputs"] = {"y": stranger.words[3].partition("=")[2] or "y"}
+    opened = ftlm.open_file(path, **asked)
+    assert (opened.problem, opened.rows) == ("", strangers.ROWS)
+    run = opened.load()
+    _, u, y = strangers.record()
+    factor = np.pi / 180 if opened.options.get("units", {}).get("y") == "deg" else 1.0
+    assert (run.length, run.step) == (strangers.ROWS, pytest.approx(strangers.STEP, rel=1e-12))
+    assert run.start == pytest.approx(stranger.start, abs=1e-12)
+    np.testing.assert_allclose(run["u"], u, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(run["y"], factor * y, rtol=0, atol=1e-12)
+    # Said explicitly, nothing is assumed any more, and the run is the same.
+    said = {str(a) for a in opened.assumed if a.counts and a.option not in ("inputs", "outputs")}
+    assert not said & set(run.warnings)
+    plain = ftlm.load(path, **asked, units=opened.options.get("units"))
+    assert said <= set(plain.warnings)
+    assert plain.step == run.step == opened.step
+    assert all(run[n].tobytes() == plain[n].tobytes() for n in run.signals)
+
+
+def test_the_manual_shows_what_is_printed(files, monkeypatch, root):
+    folder, made = files
+    monkeypatch.chdir(folder)
+    (block,) = re.findall(r"^```text\n(.*?)^```", (root / "docs" / "files.md").read_text(encoding="utf-8"), re.S | re.M)
+    shown, printed = block.splitlines(), command("open", made["German csv"].name).stdout.splitlines()
+    assert shown[0] == "$ ftlm open messung.csv"
+    for line, real in zip(shown[1:], printed, strict=True):
+        assert real.startswith(line.removesuffix("…"))
+
+
+@pytest.mark.parametrize("name", ["German csv", "LabVIEW text", "oscilloscope", "dates", "xlsx", "utf-16"])
+def test_the_command_that_open_names_works(files, name):
+    folder, made = files
+    path, stranger = folder / made[name].name, made[name]
+    shown = command("open", path, *stranger.words)
+    assert shown.exit_code == 0, shown.output
+    lines = [line.removeprefix("next: ") for line in shown.stdout.splitlines() if line.startswith("next: ")]
+    assert [line.split()[1] for line in lines] == ["inspect", "identify"]
+    assert "layout=" not in shown.stdout
+    looked = command(*shlex.split(lines[0])[1:], "--json")
+    assert looked.exit_code == 0, looked.output
+    (figures,) = json.loads(looked.stdout)
+    assert (figures["rows"], figures["step"]) == (strangers.ROWS, pytest.approx(strangers.STEP))
+    words = shlex.split(lines[1])[1:]
+    assert words[words.index("--structure") + 1] == strangers.EQUATION
