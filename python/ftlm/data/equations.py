@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from msgspec import UNSET, UnsetType
@@ -284,6 +284,22 @@ class Equation:
                 f"{words} acts on its velocity, but alpha = {alpha:g} is outside (1, 2]; leave it out, or choose "
                 "another order"
             )
+
+    def check_drives(self, outputs: Sequence[str]) -> None:
+        """Refuse inputs that jump in the velocity of a body; outputs that are followed have inertia of their own.
+
+        Raises
+        ------
+        ModelError
+            An input of alpha or above, as far as both are numbers.
+        """
+        for item in self.terms:
+            known = not (self.order.names or item.order.names or item.signal in outputs)
+            if known and item.order.constant >= self.order.constant - 1e-9:
+                raise ModelError(
+                    f"order {item.order.constant:g} of {item.signal} is not below alpha = {self.order.constant:g}, and "
+                    f"friction in the equation of {self.output} then has no velocity to follow; lower it"
+                )
 
     @property
     def friction(self) -> Friction | None:
