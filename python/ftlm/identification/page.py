@@ -16,9 +16,11 @@ from ftlm.data.run import Run
 from ftlm.data.several import as_runs
 from ftlm.fit.joint import JointFit
 from ftlm.fit.recursion import multi_innovation_trace, trace_chart
+from ftlm.identification.first import behaviour_tables, first_warnings, title_of, verdict_box
 from ftlm.identification.judged import Judged, Task
 from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.settings import settings_rows
+from ftlm.identification.verdict import verdict, verdict_html
 from ftlm.identification.warnings import validate
 from ftlm.judge.charts import comparison_charts, residual_charts
 from ftlm.judge.comparison import Comparison, errors_table, initial_terms_table, warned
@@ -93,6 +95,8 @@ def identification_page(
     compared = [("estimation", result.comparison), *(("validation", c) for c in validated)]
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
     tests += tests_on(model, others)
+    pooled = validate(result, others) if len(others) > 1 else validated[0] if validated else None
+    judged = verdict(result, pooled)
     sections = first_sections(model, warnings, compared, bool(others), result.joint)
     sections.append(residual_section(tests, result.information))
     task = result.task
@@ -103,7 +107,9 @@ def identification_page(
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
     sections.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
-    return write_page(path, title=model.structure.name, sections=sections, lead=lead_of(compared), force=force)
+    return write_page(
+        path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)
+    )
 
 
 def first_sections(
@@ -120,6 +126,7 @@ def first_sections(
     if not validated:
         words.append("No validation run was given: how well the model predicts other data is not known.")
     warned = list(dict.fromkeys(warnings))
+    shown, left = first_warnings(warned)
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # Two lines a chart, drawn once wide and once narrow with half the points.
     points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
@@ -129,8 +136,8 @@ def first_sections(
         STICKS if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
     ]
     sections = [
-        Section("Warnings", words[1:] if warned else words, warned),
-        Section("Equations", equations, tables=[parameter_table(model, joint)]),
+        Section("Warnings", words[1:] if warned else words, shown, more=left),
+        Section("Equations", equations, tables=[*behaviour_tables(model), parameter_table(model, joint)]),
     ]
     if compared:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."
@@ -313,11 +320,12 @@ _INDEPENDENCE = {"yes": "independent of", "no": "not independent of", "undecided
 def identification_html(result: Judged) -> str:
     """Return warnings, equations, parameters with intervals, both errors and the residual verdicts."""
     model = result.model
-    parts = [warned(result.warnings)]
+    parts = [verdict_html(verdict(result))]
     parts += [
         Markup("<p>{}</p>").format(equation_html(e, model.structure.delay, model.structure.limits))
         for e in model.equations
     ]
+    parts += [table.to_html() for table in behaviour_tables(model)]
     parts.append(parameter_table(model, result.joint).to_html())
     parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
     if result.residuals is not None:
@@ -329,4 +337,9 @@ def identification_html(result: Judged) -> str:
             for o, white in result.residuals.white.items()
         ]  # fmt: skip
         parts.append(Markup("<p>{} (99 %).</p>").format(Markup("; ").join(verdicts)))
+    shown, left = first_warnings(result.warnings)
+    parts.append(warned(shown))
+    if left:
+        folded = Markup("<details><summary>{} more warning{}</summary>{}</details>")
+        parts.append(folded.format(len(left), "" if len(left) == 1 else "s", warned(left)))
     return str(Markup("").join(parts))

@@ -90,7 +90,7 @@ class Model(Solved):
         return dcgain(self)
 
     def step(self, time: ArrayLike | None = None) -> Answer:
-        """Response to unit steps from rest, with its uncertainty: a record that prints and, in a notebook, draws itself.
+        """Response to unit steps from rest, with its uncertainty: a record that prints and draws itself in a notebook.
 
         Parameters
         ----------

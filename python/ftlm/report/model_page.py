@@ -11,6 +11,7 @@ from markupsafe import Markup
 from ftlm.base.output import check_free
 from ftlm.data.run import Run
 from ftlm.data.several import as_runs
+from ftlm.identification.first import title_of
 from ftlm.identification.page import first_sections, frequency_section, lead_of, residual_section, tests_on
 from ftlm.judge.comparison import compare, initial_terms_table, lost_fits
 from ftlm.model.model import Model
@@ -64,4 +65,4 @@ def model_page(
         about += [[n.upper().replace("AICC", "AICc"), v] for n, v in known.information.items()]
     initial = [t for _, c in compared if (t := initial_terms_table(c)) is not None]
     sections.append(Section("Settings", tables=[Table("What the file says", ("setting", "value"), about), *initial]))
-    return write_page(path, title=model.structure.name, sections=sections, lead=lead_of(compared), force=force)
+    return write_page(path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force)

@@ -12,6 +12,7 @@ import numpy as np
 from ftlm.base.arrays import Complex, Floats
 from ftlm.base.statistics import NORMAL_95
 from ftlm.data.solved import Solved, check_solved
+from ftlm.paint.text import with_error
 from ftlm.solve.frequency import (
     GRAIN,
     Polynomial,
@@ -74,16 +75,13 @@ class Mode:
         return self.damping < 0
 
     def __str__(self) -> str:
-        def spread(value: float | None) -> str:
-            return "" if value is None or not math.isfinite(value) else f" ± {value:.2g}"
-
         end = ", grows" if self.grows else ""
         if not self.swings:
-            return f"time constant {self.time_constant:.4g}{spread(self.time_constant_error)} s{end}"
+            return f"time constant {with_error(self.time_constant, self.time_constant_error)} s{end}"
         hertz = self.frequency / (2 * math.pi)
         return (
-            f"{self.frequency:.4g}{spread(self.frequency_error)} rad/s ({hertz:.3g} Hz), damping "
-            f"{self.damping:.3g}{spread(self.damping_error)}{end}"
+            f"{with_error(self.frequency, self.frequency_error)} rad/s ({hertz:.3g} Hz), damping "
+            f"{with_error(self.damping, self.damping_error)}{end}"
         )
 
 
