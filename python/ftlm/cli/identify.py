@@ -12,8 +12,10 @@ from typing import Annotated, Literal
 import typer
 from typer import Argument, Option
 
+from ftlm.base.checks import check_threads
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
+from ftlm.base.pace import by_output_error, expected
 from ftlm.base.progress import Progress
 from ftlm.cli.command import EXIT_INTERRUPTED, command, show_json
 from ftlm.cli.options import (
@@ -82,7 +84,12 @@ def identify(
     wanted = shape.measured(structure, runs)
     # The slice is of the runs that are identified from.
     others = replace(reading, sliced=None).runs([validation]) if validation is not None else []
-    with resumable(store, "the same command"), Progress("searching orders", quiet=as_json) as progress:
+    label = "fitting" if method == "output-error" else "searching orders"
+    with resumable(store, "the same command"), Progress(label, quiet=as_json) as progress:
+        if method == "output-error":
+            samples = sum(run.length for run in runs) * len(wanted.outputs)
+            numbers = len(wanted.order_names) + len(wanted.coefficient_names) + len(wanted.free_inputs)
+            progress.expect("the fit", expected(by_output_error(samples, numbers), check_threads(threads)))
         result = estimation.identify(
             runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
             genetic=genetic.settings(method), threads=threads, progress=progress, store=store,

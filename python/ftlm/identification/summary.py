@@ -3,39 +3,41 @@
 from __future__ import annotations
 
 import contextlib
-import re
+import copy
 import textwrap
 from collections.abc import Sequence
+from dataclasses import replace
 
 from ftlm.base.errors import FtlmError
-from ftlm.data.equations import numeric
+from ftlm.data.equations import Equation, numeric
+from ftlm.data.orders import Order
 from ftlm.data.units import coefficient_unit
 from ftlm.identification.judged import Judged
-from ftlm.identification.verdict import Verdict, verdict
+from ftlm.identification.verdict import verdict
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.concerns import SHOWN, concerns, left_over
 from ftlm.model.model import Model
+from ftlm.model.typesetting import ORDER_DECIMALS
 from ftlm.paint.text import unbounded, with_error
 from ftlm.solve.modes import Mode, SteadyState, modes, steady_states
 
 #: Columns of a line in a terminal, and most modes that are listed.
 WIDTH = 110
 MOST_MODES = 6
-#: An order with more digits than it is worth reading.
-_LONG_ORDER = re.compile(r"D\^(-?\d+\.\d{5,})")
 
 
 def summary(result: Judged, validation: Comparison | None = None) -> str:
     """The first screen as text."""
     judged = verdict(result, validation)
-    lines = [*_wrapped(str(judged)), ""]
+    lines = [*wrapped(str(judged)), ""]
     lines += equations_in_words(result.model, result.comparison)
     lines += ["", *numbers_in_words(result), *behaviour_in_words(result.model), ""]
     lines += [*fits_in_words(result, validation), *_residuals(result), *concerns_in_words(result.warnings)]
     return "\n".join(lines)
 
 
-def _wrapped(text: str, lead: str = "") -> list[str]:
+def wrapped(text: str, lead: str = "") -> list[str]:
+    """Lines no longer than a terminal, those after the first set in."""
     return textwrap.wrap(text, WIDTH, initial_indent=lead, subsequent_indent=" " * (len(lead) or 2),
                          break_long_words=False, break_on_hyphens=False)  # fmt: skip
 
@@ -46,11 +48,17 @@ def equations_in_words(model: Model, comparison: Comparison | None = None) -> li
     lines = []
     for item in model.equations:
         known = _offset(item.output, comparison)
-        if known is None:
-            lines.append(structure.written(item))
-        else:
-            lines.append(numeric(item, structure.acting(".6g")) + known)
-    return [_LONG_ORDER.sub(lambda found: f"D^{float(found[1]):.4f}", line) for line in lines]
+        tail = structure.offset_in_words if known is None else known
+        lines.append(numeric(_readable(item), structure.acting(".6g")) + tail)
+    return lines
+
+
+def _readable(item: Equation) -> Equation:
+    """The equation with orders of four decimals, and those within that of 0 at 0."""
+    new = copy.copy(item)
+    terms = tuple(replace(t, order=Order(round(t.order.constant, ORDER_DECIMALS) + 0.0)) for t in item.terms)
+    vars(new).update(order=Order(round(item.order.constant, ORDER_DECIMALS)), terms=terms)
+    return new
 
 
 def _offset(output: str, comparison: Comparison | None) -> str | None:
@@ -140,8 +148,8 @@ def gain_in_words(state: SteadyState, model: Model) -> str:
     unit = f" {above}/{below}" if above and below else ""
     rate = with_error(state.rate, state.error)
     if state.order > 0:
-        of = "per second" if state.order == 1 else f"per s^{state.order:.4g}/Γ({state.order + 1:.4g})"
-        return f"{pair}: none, it integrates, {rate}{unit} {of}"
+        course = "per second" if state.order == 1 else f"t^{state.order:.4g}/Γ({state.order + 1:.4g})"
+        return f"{pair}: none, it integrates: {rate}{unit} {course}"
     if state.order < 0:
         return f"{pair}: 0, a step dies away"
     return f"{pair}: {rate}{unit}"
@@ -173,13 +181,8 @@ def concerns_in_words(warnings: Sequence[str], how: str = "print(result.details(
     found = concerns(warnings)
     lines = []
     for concern in found[:SHOWN]:
-        lines += _wrapped(f"{concern.warnings[0]}{concern.count}", "! ")
+        lines += wrapped(f"{concern.warnings[0]}{concern.count}", "! ")
         if concern.remedy and concern.remedy not in concern.warnings[0]:
-            lines += _wrapped(concern.remedy, "  -> ")
+            lines += wrapped(concern.remedy, "  -> ")
     more = left_over(found)
     return [*lines, f"  ({more}: {how})"] if more else lines
-
-
-def verdict_in_words(judged: Verdict) -> list[str]:
-    """A verdict as lines."""
-    return _wrapped(str(judged))

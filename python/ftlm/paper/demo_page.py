@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
 from ftlm.identification.page import estimates_table
+from ftlm.identification.summary import behaviour_in_words, concerns_in_words, equations_in_words, wrapped
 from ftlm.judge.charts import comparison_charts
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
@@ -47,8 +49,48 @@ def validation_table(demo: Demo) -> Table:
     return Table("Validation on the other input", columns, rows, note="Free runs; error in rad.")
 
 
+#: Models whose fits the first screen shows, and what the paper calls the method.
+SHOWN_MODELS = ("integer order", "p = 1", "p = 7", "least squares", "output error")
+
+
 def demo_text(demo: Demo) -> str:
-    """Tables for a terminal of 120 columns, warnings last."""
+    """What came out on one screen: both verdicts, both models, who predicts the run that nobody saw, three warnings."""
+    square = demo.square
+    lines = [
+        f"A simulated flexible two-link arm: {square.length} rows of a square current, checked on a sine that no model "
+        "saw.", "",
+    ]  # fmt: skip
+    for stage, results in demo.results.items():
+        best = results["output error"]
+        checked = demo.checked[stage]
+        estimates = {**best.orders, **best.joint_values}
+        near = sum(abs(v - demo.truth[stage][n]) <= 2 * best.standard_errors[n] for n, v in estimates.items())
+        lines += wrapped(f"Stage {stage}, output error: {checked.verdict}")
+        lines += [f"  {line}" for line in equations_in_words(best.model)]
+        lines += [line for line in behaviour_in_words(best.model) if "mode" in line or "integrates" in line][:3]
+        lines += [f"  {near} of {len(estimates)} numbers within two standard errors of the arm's own", ""]
+    outputs = [r.output for stage in demo.rows for r in demo.rows[stage] if r.label == SHOWN_MODELS[0]]
+    lines.append(f"{'Fit of the free run, %':<24}" + "".join(f"{o:>20}" for o in outputs))
+    lines.append(f"{'':<24}" + f"{'square':>12}{'sine':>8}" * len(outputs))
+    for label in SHOWN_MODELS:
+        fits = [
+            fit for stage in demo.rows for r in demo.rows[stage] if r.label == label
+            for fit in (r.output_error.fit, r.validation.fit)
+        ]  # fmt: skip
+        shown = [f"{fit:.1f}" if math.isfinite(fit) else "–" for fit in fits]
+        lines.append(f"{label:<24}" + "".join(f"{v:>{(12, 8)[k % 2]}}" for k, v in enumerate(shown)))
+    lines += ["", "p weighs the data against a prior near zero (paper (42)–(44)); least squares has none."]
+    said = [w for results in demo.results.values() for w in results["output error"].warnings]
+    lines += concerns_in_words(said, how="-v")
+    others = sum(
+        len(r.warnings) for results in demo.results.values() for n, r in results.items() if n != "output error"
+    )
+    lines.append(f"{others} warnings about the other models: ftlm demo -v, or the page")
+    return "\n".join(lines)
+
+
+def demo_details(demo: Demo) -> str:
+    """All tables for a terminal of 120 columns, warnings last."""
     lines = []
     for stage in demo.rows:
         lines += [f"Stage {stage}, square current (the shape of the paper's Table {3 + stage})"]
