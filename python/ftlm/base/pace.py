@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 
 import numpy as np
@@ -21,11 +20,7 @@ def pace() -> float:
     while time.perf_counter() - begun < TIMED:
         np.fft.rfft(values)
         count += 1
-    here = (time.perf_counter() - begun) / max(count, 1) / KNOWN
-    # What else runs takes turns on the cores, at intervals longer than this look.
-    cores = os.cpu_count() or 1
-    busy = os.getloadavg()[0] / cores if hasattr(os, "getloadavg") else 0.0
-    return max(here, 0.1) * max(1.0, busy)
+    return max((time.perf_counter() - begun) / max(count, 1) / KNOWN, 0.1)
 
 
 def expected(seconds: float, threads: int) -> float:
@@ -34,5 +29,8 @@ def expected(seconds: float, threads: int) -> float:
 
 
 def by_output_error(samples: int, numbers: int) -> float:
-    """Seconds of one core that a fit by output error takes, within a factor of three: of all runs and outputs."""
-    return 0.05 * numbers**2 * (0.3 + samples / 2000)
+    """Seconds of one core that a fit by output error takes on the known machine, within a factor of about three.
+
+    The race of starts grows with the numbers squared, what follows with the samples of all runs and outputs.
+    """
+    return 0.04 * numbers**2 + 3.5e-4 * samples

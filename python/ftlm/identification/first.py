@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 
@@ -10,11 +11,15 @@ from markupsafe import Markup
 from ftlm.base.errors import FtlmError
 from ftlm.identification.verdict import Verdict
 from ftlm.judge.concerns import SHOWN, concerns
+from ftlm.model.charts import pole_charts
 from ftlm.model.model import Model
+from ftlm.paint.figure import Figure
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, number, symbol, symbol_html
 from ftlm.solve.modes import modes, steady_states
 
+#: Figures of what a model does by itself, on a page.
+MOST_FIGURES = 9
 _LOOKS = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
@@ -92,3 +97,14 @@ def behaviour_tables(model: Model) -> list[Table]:
         columns = ("mode", "pole s [rad/s]", "frequency [rad/s]", "±", "damping", "±", "time constant [s]", "±")
         tables.append(Table("Modes", columns, rows, note=note))
     return tables
+
+
+def behaviour_figures(model: Model) -> list[Figure]:
+    """Pole map and step responses; nothing of what has none, or leaves the range of numbers."""
+    figures: list[Figure] = []
+    if model.structure.has_friction or model.structure.limits:
+        return figures
+    with contextlib.suppress(FtlmError):
+        figures += pole_charts(model)
+        figures += model.step().figures()
+    return figures[:MOST_FIGURES]

@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 from markupsafe import Markup
 
 from ftlm.base.output import check_free
@@ -16,13 +17,13 @@ from ftlm.data.run import Run
 from ftlm.data.several import as_runs
 from ftlm.fit.joint import JointFit
 from ftlm.fit.recursion import multi_innovation_trace, trace_chart
-from ftlm.identification.first import behaviour_tables, first_warnings, title_of, verdict_box
+from ftlm.identification.first import behaviour_figures, behaviour_tables, first_warnings, title_of, verdict_box
 from ftlm.identification.judged import Judged, Task
 from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.settings import settings_rows
 from ftlm.identification.verdict import verdict, verdict_html
 from ftlm.identification.warnings import validate
-from ftlm.judge.charts import comparison_charts, residual_charts
+from ftlm.judge.charts import comparison_charts, input_charts, residual_charts, residual_series
 from ftlm.judge.comparison import Comparison, errors_table, initial_terms_table, warned
 from ftlm.judge.criteria import InformationCriteria, information_table
 from ftlm.judge.residuals import Residuals, resid, residual_table
@@ -32,6 +33,7 @@ from ftlm.model.typesetting import equation_html, parameter_table
 from ftlm.paint.axes import POINTS
 from ftlm.paint.figure import Figure
 from ftlm.paint.heat import heat_map
+from ftlm.paint.matrix import correlation_map
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, number, symbol, symbol_html, unbounded
@@ -43,6 +45,8 @@ PAGE_CHARTS = 60
 PAGE_POINTS = 90_000
 #: Charts of residuals, and of the frequency response, on a page.
 SMALL_CHARTS = 24
+#: Points of a line of residuals in a small chart.
+SERIES_POINTS = 600
 #: Lags of the residual tests.
 LAGS = 25
 #: Innovation lengths of the paper's tables, and points of a convergence curve.
@@ -97,9 +101,11 @@ def identification_page(
     tests += tests_on(model, others)
     pooled = validate(result, others) if len(others) > 1 else validated[0] if validated else None
     judged = verdict(result, pooled)
-    sections = first_sections(model, warnings, compared, bool(others), result.joint)
-    sections.append(residual_section(tests, result.information))
     task = result.task
+    runs = [*(() if task is None else task.runs), *others]
+    sections = first_sections(model, warnings, compared, bool(others), result.joint, runs)
+    sections.append(residual_section(tests, result.information, compared, model.units))
+    sections += correlation_sections(result.joint)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
     sections.append(frequency_section(model, steps))
     sections += _search_sections(result)
@@ -114,9 +120,9 @@ def identification_page(
 
 def first_sections(
     model: Model, warnings: Sequence[str], compared: Sequence[tuple[str, Comparison]], validated: bool,
-    joint: JointFit | None,
+    joint: JointFit | None, runs: Sequence[Run] = (),
 ) -> list[Section]:  # fmt: skip
-    """Warnings, equations, errors, charts."""
+    """Warnings, equations, what the model does by itself, errors, charts with the inputs below."""
     units = model.units
     words = [
         "No check raised a warning. Checked: free run against equation error, orders close to one another or on the "
@@ -137,13 +143,20 @@ def first_sections(
     ]
     sections = [
         Section("Warnings", words[1:] if warned else words, shown, more=left),
-        Section("Equations", equations, tables=[*behaviour_tables(model), parameter_table(model, joint)]),
+        Section("Equations", equations, tables=[parameter_table(model, joint)]),
     ]
+    if figures := behaviour_figures(model):
+        sections.append(Section("Gain, modes and steps", tables=behaviour_tables(model), figures=figures, small=True))
     if compared:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."
+        inputs = [s for s in model.structure.signals if s not in model.outputs]
+        room = max(PAGE_CHARTS - len(drawn), 0)
+        drawn += input_charts(runs, inputs, points=max(points // 2, 4))[:room]
         sections += [
             Section("Errors", tables=[errors_table(compared, units=units)]),
-            Section("Measured and simulated", left_out if charts > PAGE_CHARTS else (), figures=drawn[:PAGE_CHARTS]),
+            Section(
+                "Measured and simulated", left_out if charts > PAGE_CHARTS else (), figures=drawn[: max(PAGE_CHARTS, 1)]
+            ),
         ]
     return sections
 
@@ -153,12 +166,30 @@ def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
     return [("validation", resid(model, run)) for run in runs if run.length >= 2 * LAGS + 3]
 
 
-def residual_section(tests: Sequence[tuple[str, Residuals]], information: InformationCriteria | None) -> Section:
-    """Residual tests, information criteria, correlations as charts."""
+def correlation_sections(joint: JointFit | None) -> list[Section]:
+    """How the numbers of a joint fit go together; nothing for one number, or where there is no covariance."""
+    if joint is None or len(joint.names) < 2:
+        return []
+    words = (
+        "Two numbers near 1 or −1 can be moved together with little harm: the runs know their combination better than "
+        "each. That matters where a standard error is large as well."
+    )
+    values = np.clip(joint.correlation, -1.0, 1.0)
+    figure = correlation_map(joint.names, values, title="Correlations of the estimates")
+    return [Section("How the numbers go together", words, figures=[figure], small=True)]
+
+
+def residual_section(
+    tests: Sequence[tuple[str, Residuals]], information: InformationCriteria | None,
+    compared: Sequence[tuple[str, Comparison]] = (), units: Mapping[str, str] | None = None,
+) -> Section:  # fmt: skip
+    """Residual tests, information criteria, residuals over time and how often, correlations as charts."""
     tables = [residual_table(t, title=f"{label}: {', '.join(t.runs)}") for label, t in tests]
     if information is not None:
         tables.append(information_table(information))
-    figures = [f for label, t in tests for f in residual_charts(t, label=label)]
+    figures = [f for label, c in compared for f in residual_series(c, units=units, label=label, points=SERIES_POINTS)]
+    figures = figures[: SMALL_CHARTS // 2]
+    figures += [f for label, t in tests for f in residual_charts(t, label=label)]
     words = () if tests else "The runs are too short for residual tests."
     return Section("Residuals", words, tables=tables, figures=figures[:SMALL_CHARTS], small=True)
 

@@ -14,8 +14,10 @@ from ftlm.base.statistics import NORMAL_95
 from ftlm.data.solved import Solved, check_solved
 from ftlm.paint.figure import SMALL, Figure
 from ftlm.paint.lines import line_chart
+from ftlm.paint.plane import plane_chart
 from ftlm.paint.text import symbol
 from ftlm.solve.frequency import frequency_response, response_deviation, response_inputs, transfer_functions
+from ftlm.solve.modes import modes
 from ftlm.solve.records import COULOMB
 from ftlm.solve.response import Response, response
 
@@ -67,6 +69,48 @@ def drawn_bode(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
                 )
             )  # fmt: skip
     return figures
+
+
+def pole_charts(model: Solved) -> list[Figure]:
+    """Poles in the plane of s^q, q the highest order over the next whole number, with the sector that is not stable.
+
+    Empty for a model with friction, which has none, and for one without poles.
+    """
+    if model.structure.has_friction:
+        return []
+    found = modes(model)
+    if not found:
+        return []
+    q = plane_order(model)
+    upper = np.array([q * (math.log(m.frequency) + 1j * math.acos(max(-1.0, min(1.0, -m.damping)))) for m in found])
+    # Beyond the negative axis of s a relaxation of fractional order stands on the one of s^q.
+    turned = [complex(w.real, math.pi) if not m.swings and not m.grows and q < 1 else w
+              for w, m in zip(upper, found, strict=True)]  # fmt: skip
+    points = np.exp(np.array(turned))
+    points = np.where(np.abs(points.imag) <= 1e-9 * np.abs(points), points.real + 0j, points)
+    every = np.concatenate([points, np.conj(points[points.imag != 0])])
+    plane = "s" if q == 1 else f"s^{q:.4g}"
+    inside = sum(m.grows for m in found)
+    words = "none is in it" if not inside else f"{inside} of {len(found)} modes in it: the model is not stable"
+    caption = f"Shade: |arg {plane}| < {90 * q:.4g} degrees, where poles make a free run grow; {words}."
+    if q != 1:
+        caption += f" A relaxation is drawn at −T^−{q:.4g}."
+    unit = "rad/s" if q == 1 else f"(rad/s)^{q:.4g}"
+    return [
+        plane_chart(
+            every.tolist(), title=f"Poles in the plane of {plane}", x_label=f"real part of {plane} [{unit}]",
+            y_label=f"imaginary part [{unit}]", sector=q * math.pi / 2, caption=caption,
+        )
+    ]  # fmt: skip
+
+
+def plane_order(model: Solved) -> float:
+    """Order q of the plane s^q in which the poles of a model are shown: 1 for whole orders, else between 0.5 and 1."""
+    orders = [e.order.constant for e in model.equations]
+    orders += [t.order.constant for e in model.equations for t in e.terms]
+    highest = max(orders)
+    whole = all(abs(o - round(o)) < 1e-9 for o in orders) or highest <= 0
+    return 1.0 if whole else round(highest / math.ceil(highest - 1e-9), 4)
 
 
 @dataclass(frozen=True)

@@ -54,9 +54,9 @@ def model_page(
             words += ["it has the name of a run that the model was identified from"] * (run.name in known.runs)
         warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in words]
     compared = [("validation", comparison) for comparison in validated]
-    sections = first_sections(model, warnings, compared, bool(others), None)
+    sections = first_sections(model, warnings, compared, bool(others), None, others)
     if tests := tests_on(model, others):
-        sections.append(residual_section(tests, None))
+        sections.append(residual_section(tests, None, compared, model.units))
     sections.append(frequency_section(model, [(r.step, r.duration) for r in others]))
     about: list[list[Cell]] = [["structure", model.structure.name], ["coupling in free runs", model.structure.coupling]]
     if known is not None:
