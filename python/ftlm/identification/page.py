@@ -29,7 +29,7 @@ from ftlm.judge.criteria import InformationCriteria, information_table
 from ftlm.judge.residuals import Residuals, resid, residual_table
 from ftlm.model.charts import bode_charts, response_frequencies
 from ftlm.model.model import Model
-from ftlm.model.typesetting import equation_html, parameter_table
+from ftlm.model.typesetting import equations_html, parameter_table
 from ftlm.paint.axes import POINTS
 from ftlm.paint.figure import Figure
 from ftlm.paint.heat import heat_map
@@ -136,9 +136,10 @@ def first_sections(
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # Two lines a chart, drawn once wide and once narrow with half the points.
     points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
-    drawn = [f for label, c in compared for f in comparison_charts(c, units=units, label=label, points=points)]
+    drawn = _with_inputs(model, compared, runs, points)
+    own = compared[0][1] if compared and compared[0][0] == "estimation" else None
     equations = [
-        *(equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations),
+        *equations_html(model, None if own is None else own.offsets),
         STICKS if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
     ]
     sections = [
@@ -149,9 +150,6 @@ def first_sections(
         sections.append(Section("Gain, modes and steps", tables=behaviour_tables(model), figures=figures, small=True))
     if compared:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."
-        inputs = [s for s in model.structure.signals if s not in model.outputs]
-        room = max(PAGE_CHARTS - len(drawn), 0)
-        drawn += input_charts(runs, inputs, points=max(points // 2, 4))[:room]
         sections += [
             Section("Errors", tables=[errors_table(compared, units=units)]),
             Section(
@@ -159,6 +157,22 @@ def first_sections(
             ),
         ]
     return sections
+
+
+def _with_inputs(
+    model: Model, compared: Sequence[tuple[str, Comparison]], runs: Sequence[Run], points: int
+) -> list[Figure]:
+    """Outputs of each run measured and simulated, and below them what drove them, where the runs are at hand."""
+    inputs = [s for s in model.structure.signals if s not in model.outputs]
+    left, drawn = list(runs), []
+    for label, comparison in compared:
+        figures = comparison_charts(comparison, units=model.units, label=label, points=points)
+        for k, (name, _, _) in enumerate(comparison.per_run):
+            here = len(comparison.output_error)
+            drawn += figures[k * here : (k + 1) * here]
+            if left and left[0].name == name:
+                drawn += input_charts([left.pop(0)], inputs, points=max(points // 2, 4))
+    return drawn
 
 
 def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
@@ -171,8 +185,8 @@ def correlation_sections(joint: JointFit | None) -> list[Section]:
     if joint is None or len(joint.names) < 2:
         return []
     words = (
-        "Two numbers near 1 or −1 can be moved together with little harm: the runs know their combination better than "
-        "each. That matters where a standard error is large as well."
+        "Two numbers whose correlation is near 1 or −1 can be moved together with little harm: the runs know what they "
+        "make together better than each. That matters where a standard error is large as well."
     )
     values = np.clip(joint.correlation, -1.0, 1.0)
     figure = correlation_map(joint.names, values, title="Correlations of the estimates")
@@ -352,10 +366,7 @@ def identification_html(result: Judged) -> str:
     """Return warnings, equations, parameters with intervals, both errors and the residual verdicts."""
     model = result.model
     parts = [verdict_html(verdict(result))]
-    parts += [
-        Markup("<p>{}</p>").format(equation_html(e, model.structure.delay, model.structure.limits))
-        for e in model.equations
-    ]
+    parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
     parts += [table.to_html() for table in behaviour_tables(model)]
     parts.append(parameter_table(model, result.joint).to_html())
     parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())

@@ -11,13 +11,12 @@ from dataclasses import replace
 from ftlm.base.errors import FtlmError
 from ftlm.data.equations import Equation, numeric
 from ftlm.data.orders import Order
-from ftlm.data.units import coefficient_unit
 from ftlm.identification.judged import Judged
 from ftlm.identification.verdict import verdict
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.concerns import SHOWN, concerns, left_over
 from ftlm.model.model import Model
-from ftlm.model.typesetting import ORDER_DECIMALS
+from ftlm.model.typesetting import ORDER_DECIMALS, units_of
 from ftlm.paint.text import unbounded, with_error
 from ftlm.solve.modes import Mode, SteadyState, modes, steady_states
 
@@ -68,28 +67,6 @@ def _offset(output: str, comparison: Comparison | None) -> str | None:
     parts = comparison.offsets[0][output]
     written = [(parts["constant"], ""), *([(parts["ramp"], " t")] if "ramp" in parts else [])]
     return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in written)
-
-
-def units_of(model: Model) -> dict[str, str]:
-    """Unit of every named coefficient, friction and delay whose unit is known."""
-    out = {}
-    for item in model.equations:
-        alpha = item.order.constant
-        for term in item.terms:
-            if term.name is not None:
-                unit = coefficient_unit(model.units, item.output, alpha, term.signal, term.order.constant)
-                out[term.name] = unit
-        if item.friction is not None:
-            own = model.units.get(item.output, "")
-            force = f"{own} s^{-alpha:g}" if own else ""
-            near = item.friction.stribeck
-            named = [(item.friction.name, force)]
-            if near is not None:
-                named += [(near.name, force), (near.speed_name, f"{own}/s" if own else "")]
-            out |= {name: unit for name, unit in named if name is not None}
-    out |= {f"delay_{name}": "s" for name in model.structure.delay}
-    out |= {limit.name: model.units.get(limit.signal, "") for limit in model.structure.limits}
-    return {name: unit for name, unit in out.items() if unit}
 
 
 def numbers_in_words(result: Judged) -> list[str]:

@@ -68,7 +68,8 @@ def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = P
     """
     return [
         line_chart(
-            run.time, [("", run[name])], title=f"Input {symbol(name)}, {run.name}", x_label="time [s]",
+            run.time, [(f"input {symbol(name)}", run[name])], x_label="time [s]",
+            title=f"Input {symbol(name)}, {run.name}",
             y_label=with_unit(symbol(name), run.units, name), points=points, height=180,
         )
         for run in runs

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError
-from ftlm.paint.axes import ticks
+from ftlm.paint.axes import TINY, ticks
 from ftlm.paint.figure import NARROW, SMALL, Figure, svg, svg_text, text_width
 from ftlm.paint.lines import LINES
 from ftlm.paint.text import number, shortened
@@ -48,7 +48,9 @@ def histogram(values: ArrayLike, *, title: str, x_label: str, caption: str = "")
         raise DataError(f"a histogram needs two finite values at least, not {there.size}; give a longer run")
     # As many bars as Sturges and the spread of outliers ask for, symmetric about the mean.
     mean, deviation = float(np.mean(there)), float(np.std(there))
-    reach = max(float(np.max(np.abs(there - mean))), 1e-300)
+    reach = float(np.max(np.abs(there - mean)))
+    if reach <= max(1e-12 * abs(mean), TINY):
+        reach = 0.1 * abs(mean) if abs(mean) > TINY else 1.0
     bars = min(MOST_BARS, 2 * math.ceil(math.log2(there.size)) + 1)
     edges = mean + np.linspace(-reach, reach, bars + 1)
     counts, _ = np.histogram(there, edges)
