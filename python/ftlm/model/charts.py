@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ftlm.base.arrays import Floats
+from ftlm.base.arrays import Complex, Floats
 from ftlm.base.statistics import NORMAL_95
 from ftlm.data.solved import Solved, check_solved
 from ftlm.paint.figure import SMALL, Figure
@@ -71,24 +71,29 @@ def drawn_bode(omega: Floats, curves: Sequence[BodeCurve]) -> list[Figure]:
     return figures
 
 
+def pole_points(model: Solved) -> tuple[float, Complex]:
+    """Order q of the plane, and the poles in it with their conjugates; none of a model with friction."""
+    q = plane_order(model)
+    found = () if model.structure.has_friction else modes(model)
+    points = []
+    for m in found:
+        angle = math.acos(max(-1.0, min(1.0, -m.damping)))
+        # Beyond the negative axis of s a relaxation of fractional order stands on the one of s^q.
+        turn = math.pi if not m.swings and not m.grows else q * angle
+        value = m.frequency**q * complex(math.cos(turn), math.sin(turn))
+        points += [value, value.conjugate()] if m.swings else [complex(value.real)]
+    return q, np.array(points, dtype=np.complex128)
+
+
 def pole_charts(model: Solved) -> list[Figure]:
     """Poles in the plane of s^q, q the highest order over the next whole number, with the sector that is not stable.
 
     Empty for a model with friction, which has none, and for one without poles.
     """
-    if model.structure.has_friction:
+    q, points = pole_points(model)
+    if not points.size:
         return []
     found = modes(model)
-    if not found:
-        return []
-    q = plane_order(model)
-    upper = np.array([q * (math.log(m.frequency) + 1j * math.acos(max(-1.0, min(1.0, -m.damping)))) for m in found])
-    # Beyond the negative axis of s a relaxation of fractional order stands on the one of s^q.
-    turned = [complex(w.real, math.pi) if not m.swings and not m.grows and q < 1 else w
-              for w, m in zip(upper, found, strict=True)]  # fmt: skip
-    points = np.exp(np.array(turned))
-    points = np.where(np.abs(points.imag) <= 1e-9 * np.abs(points), points.real + 0j, points)
-    every = np.concatenate([points, np.conj(points[points.imag != 0])])
     plane = "s" if q == 1 else f"s^{q:.4g}"
     inside = sum(m.grows for m in found)
     words = "none is in it" if not inside else f"{inside} of {len(found)} modes in it: the model is not stable"
@@ -98,7 +103,7 @@ def pole_charts(model: Solved) -> list[Figure]:
     unit = "rad/s" if q == 1 else f"(rad/s)^{q:.4g}"
     return [
         plane_chart(
-            every.tolist(), title=f"Poles in the plane of {plane}", x_label=f"real part of {plane} [{unit}]",
+            points.tolist(), title=f"Poles in the plane of {plane}", x_label=f"real part of {plane} [{unit}]",
             y_label=f"imaginary part [{unit}]", sector=q * math.pi / 2, caption=caption,
         )
     ]  # fmt: skip
