@@ -23,11 +23,14 @@ MOST_FIGURES = 9
 _LOOKS = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 
-def verdict_box(judged: Verdict) -> Markup:
-    """A verdict as the first box of a page; its word says what its colour says."""
+def verdict_box(judged: Verdict, of: str = "") -> Markup:
+    """A verdict as the first box of a page, perhaps of one of several; its word says what its colour says."""
     remedy = Markup('<span class="todo">{}</span>').format(judged.remedy) if judged.remedy else ""
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
-        _LOOKS[judged.level], judged.level.capitalize(), judged.reason[0].upper() + judged.reason[1:], remedy
+        _LOOKS[judged.level],
+        f"{of}{judged.level}" if of else judged.level.capitalize(),
+        judged.reason[0].upper() + judged.reason[1:],
+        remedy,
     )
 
 
@@ -79,7 +82,9 @@ def behaviour_tables(model: Model) -> list[Table]:
                 runs = f" t^{state.order:.4g}/Γ({state.order + 1:.4g})" if state.order != 1 else " per second"
                 rows.append([pair, state.rate, state.error, unit, f"none: it runs on, so much{runs}"])
             else:
-                rows.append([pair, state.gain, state.error, unit, "gain" if state.order == 0 else "0: it dies away"])
+                back = state.order < 0
+                what = "0: it dies away" if back else "gain"
+                rows.append([pair, state.gain, None if back else state.error, unit, what])
         tables.append(Table("Steady state under a unit step", ("output", "value", "standard error", "unit", ""), rows))
     if found:
         rows = [

@@ -121,7 +121,7 @@ def _histogram(
 
 def bar_chart(
     names: Sequence[str], groups: Sequence[tuple[str, ArrayLike]], *, title: str, x_label: str, low: float = 0.0,
-    high: float | None = None, caption: str = "",
+    high: float | None = None, caption: str = "", width: int = 720,
 ) -> Figure:  # fmt: skip
     """Figures of several things as bars, those of one thing together.
 
@@ -138,6 +138,8 @@ def bar_chart(
         largest.
     caption
         Sentence below.
+    width
+        Of the wide drawing, in pixels; it scales.
 
     Raises
     ------
@@ -161,16 +163,16 @@ def bar_chart(
         f"{thing}: " + ", ".join(f"{group} {number(float(v[k]), 3)}" for group, v in tables) + "."
         for k, thing in enumerate(names)
     )
-    wide, small = (_bars(names, tables, (low, end), (title, described, x_label), narrow=n) for n in (False, True))
+    words = (title, described, x_label)
+    wide, small = (_bars(names, tables, (low, end), words, NARROW if n else width, narrow=n) for n in (False, True))
     return Figure(title, wide, small, caption)
 
 
 def _bars(
     names: Sequence[str], tables: Sequence[tuple[str, Floats]], ends: tuple[float, float],
-    words: tuple[str, str, str], *, narrow: bool,
+    words: tuple[str, str, str], width: int, *, narrow: bool,
 ) -> Markup:  # fmt: skip
     title, described, x_label = words
-    width = NARROW if narrow else 720
     shown = [shortened(n, 16 if narrow else MOST_LETTERS) for n in names]
     left, value = 10 + max(map(text_width, shown)), 52.0
     top = 8.0 + 18.0 * (len(tables) > 1)

@@ -386,7 +386,7 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     axis.plot(points.real, points.imag, "x", color=LINES[2][0], markersize=8, markeredgewidth=2)
     plane = "s" if q == 1 else f"s^{{{q:.4g}}}"
     axis.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel=f"real part of ${plane}$", ylabel="imaginary part")
-    axis.set_aspect("equal", adjustable="datalim" if ax is None else "box")
+    axis.set_aspect("equal")
     axis.axhline(0, color=LINES[0][0], linewidth=0.6)
     axis.axvline(0, color=LINES[0][0], linewidth=0.6)
     axis.grid(visible=True, alpha=0.3)
@@ -558,5 +558,6 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
     axis.set_yticks(range(len(compared)), [_plain(n) for n in compared])
     axis.invert_yaxis()
     axis.set(xlabel="fit of the free run [%]", xlim=(0, 112))
-    axis.legend(loc="lower right", fontsize="small")
+    if len(outputs) > 1:
+        axis.legend(loc="lower right", fontsize="small")
     return figure

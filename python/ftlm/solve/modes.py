@@ -271,7 +271,7 @@ class SteadyState:
     gain
         Where the output comes to rest; 0 where it returns, infinite where it runs on.
     error
-        Standard error of the gain, or of the rate where it runs on; None without a covariance.
+        Standard error of the rate; None without a covariance.
     order
         Order with which it runs on: 0 for none, 1 for an integrator, below 0 where it returns to 0.
     rate
