@@ -181,6 +181,20 @@ def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checke
     )
 
 
+def test_a_hidden_offset_is_named(found, checked):
+    hidden = worse(found, comparison=replace(found.comparison, offsets=({"y": {}},)))
+    judged = hidden.verdict(checked)
+    assert judged.level == "with care"
+    assert judged.reason == "the offset of y is not told apart from what a run did before its start"
+    assert "offset in the equation of y in square: not told apart" in str(hidden)
+
+
+def test_a_run_in_motion_says_so(found):
+    moving = worse(found, comparison=replace(found.comparison, initial=[{"y": {0.0: 1.0, 1.0: 2.0}}]))
+    assert "in motion at its start, initial terms estimated with it: square (2)" in str(moving)
+    assert "in motion" not in str(found)
+
+
 def test_what_may_not_be_used_comes_before_what_needs_care(found):
     poor = worse(found, joint=replace(found.joint, converged=False), comparison=replace(
         found.comparison, output_error={"y": replace(found.output_error["y"], nr=0.8, fit=20.0)}

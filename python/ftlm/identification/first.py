@@ -85,7 +85,9 @@ def behaviour_tables(model: Model) -> list[Table]:
                 back = state.order < 0
                 what = "0: it dies away" if back else "gain"
                 rows.append([pair, state.gain, None if back else state.error, unit, what])
-        tables.append(Table("Steady state under a unit step", ("output", "value", "standard error", "unit", ""), rows))
+        tables.append(
+            Table("Steady state under a unit step", ("output", "value", "standard error", "unit", "what it is"), rows)
+        )
     if found:
         rows = [
             [

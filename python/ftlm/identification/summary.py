@@ -13,7 +13,7 @@ from ftlm.data.equations import Equation, numeric
 from ftlm.data.orders import Order
 from ftlm.identification.judged import Judged
 from ftlm.identification.verdict import verdict
-from ftlm.judge.comparison import Comparison
+from ftlm.judge.comparison import Comparison, offsets_in_words
 from ftlm.judge.concerns import SHOWN, concerns, left_over
 from ftlm.model.model import Model
 from ftlm.model.typesetting import ORDER_DECIMALS, units_of
@@ -31,7 +31,8 @@ def summary(result: Judged, validation: Comparison | None = None) -> str:
     lines = [*wrapped(str(judged)), ""]
     lines += equations_in_words(result.model, result.comparison)
     lines += ["", *numbers_in_words(result), *behaviour_in_words(result.model), ""]
-    lines += [*fits_in_words(result, validation), *_residuals(result), *concerns_in_words(result.warnings)]
+    lines += [*fits_in_words(result, validation), *_residuals(result), *_starts(result)]
+    lines += concerns_in_words(result.warnings)
     return "\n".join(lines)
 
 
@@ -151,6 +152,22 @@ def _residuals(result: Judged) -> list[str]:
     white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in result.residuals.white.items())
     free = ", ".join(f"{o} {w}" for o, w in result.residuals.independence.items())
     return [f"residuals white: {white}; independent of the inputs: {free} (99 %)"]
+
+
+def _starts(result: Judged) -> list[str]:
+    """Offsets that are no number of the equations above, and runs that start in motion."""
+    comparison = result.comparison
+    shown = {o for o in result.output_error if _offset(o, comparison) is not None}
+    hidden = any(o not in shown for run in comparison.offsets for o in run)
+    lines = offsets_in_words(comparison) if hidden else []
+    moving = [
+        f"{name} ({sum(map(len, terms.values()))})"
+        for (name, _, _), terms in zip(comparison.per_run, comparison.initial, strict=True)
+        if sum(map(len, terms.values())) and not comparison.offsets
+    ]
+    if moving:
+        lines += wrapped(f"in motion at its start, initial terms estimated with it: {', '.join(moving)}")
+    return lines
 
 
 def concerns_in_words(warnings: Sequence[str], how: str = "print(result.details())") -> list[str]:

@@ -136,6 +136,10 @@ def _rules(result: Judged, validation: Comparison | None) -> Iterator[_Against]:
     vague = [_vague(result, n) for n in errors if n not in unseen and _is_vague(result, n)]
     if vague:
         yield of(_KINDS["vague"], f"the runs hardly tell {_listed(vague)}")
+    hidden = dict.fromkeys(o for run in result.comparison.offsets for o, values in run.items() if not values)
+    if hidden:
+        words = f"the offset of {_listed(list(hidden))} is not told apart from what a run did before its start"
+        yield of(_KINDS["history"], words)
     # A test of whiteness that fails by rounding alone, or numbers that are vague and not very, are no reasons.
     judged = ("residuals", "loop", "vague", "unseen", "identity", "useless", "lost", "unstable", "range")
     for name, concern in kinds.items():
@@ -190,9 +194,9 @@ def _residuals(result: Judged) -> Iterator[_Against]:
     looped = "reference" in result.settings
     judged = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE}
     # A model that is wrong leaves what a periodic input repeats, which looks like a loop: first what it lacks.
-    following = [(o, s) for o, r in judged.items() for s, t in r.judged.items() if t.failed]
-    if following:
-        words = ", ".join(f"{o} still follow {s}" for o, s in following)
+    following = {o: [s for s, t in r.judged.items() if t.failed] for o, r in judged.items()}
+    if any(following.values()):
+        words = ", ".join(f"{o} still follow {_listed(signals)}" for o, signals in following.items() if signals)
         yield _Against(CARE, f"residuals of {words}: it leaves something out", _KINDS["residuals"].remedy)
     for output, tests in judged.items():
         if tests.feedback and not tests.whiteness.passed and not looped:
