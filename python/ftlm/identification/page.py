@@ -45,6 +45,8 @@ PAGE_CHARTS = 60
 PAGE_POINTS = 90_000
 #: Charts of residuals, and of the frequency response, on a page.
 SMALL_CHARTS = 24
+#: Points of a line in a notebook, which keeps what it shows.
+NOTEBOOK_POINTS = 600
 #: Points of a line of residuals in a small chart.
 SERIES_POINTS = 600
 #: Lags of the residual tests.
@@ -369,6 +371,9 @@ def identification_html(result: Judged) -> str:
     parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
     parts += [table.to_html() for table in behaviour_tables(model)]
     parts.append(parameter_table(model, result.joint).to_html())
+    # One run is enough to see; a report has all.
+    figures = comparison_charts(result.comparison, units=model.units, points=NOTEBOOK_POINTS)
+    parts += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # made of escaped parts
     parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
     if result.residuals is not None:
         verdicts = [

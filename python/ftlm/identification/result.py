@@ -237,7 +237,8 @@ class Identification(Judged):
         *With care*: a fit that falls by 20 points on validation; residuals that follow an input; a closed loop with
         coloured residuals; residuals that are not white (all three no smaller than a thousandth of the output); a fit
         that did not stand still; a coefficient known to no more than half of itself, an order to no more than 0.25; an
-        offset that is hidden by what a run did before its start; every other warning of weight; no standard errors; no validation.
+        offset that is hidden by what a run did before its start; every other warning of weight; no standard errors; no
+        validation.
         """
         if not (validation is None or isinstance(validation, Comparison)):
             raise ModelError(f"validation is {type(validation).__name__}; give what validate(run) returns")
@@ -255,7 +256,7 @@ class Identification(Judged):
         return summary(self, validation)
 
     def details(self) -> str:
-        """All that is known as text: settings, both errors, criteria, searches, initial terms, and every warning."""
+        """All that is known as text: settings, both errors, criteria, searches, initial terms, every warning."""
         lines = [f"{self.model.structure.name}: {self.method}, {settings_in_words(self.settings)}"]
         lines += [f"  {self.model.structure.written(e)}" for e in self.model.equations]
         reference = self.model.structure.reference
