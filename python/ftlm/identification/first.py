@@ -25,7 +25,7 @@ _LOOKS = {"trust": "trust", "with care": "care", "do not use": "not"}
 
 def verdict_box(judged: Verdict, of: str = "") -> Markup:
     """A verdict as the first box of a page, perhaps of one of several; its word says what its colour says."""
-    remedy = Markup('<span class="todo">{}</span>').format(judged.remedy) if judged.remedy else ""
+    remedy = Markup(' <span class="todo">→ {}</span>').format(judged.remedy) if judged.remedy else ""
     return Markup('<div class="first {}" role="note"><strong>{}</strong>{}{}</div>').format(
         _LOOKS[judged.level],
         f"{of}{judged.level}" if of else judged.level.capitalize(),
@@ -44,7 +44,7 @@ def first_warnings(warnings: Sequence[str]) -> tuple[list[str], list[str]]:
             left += concern.warnings
             continue
         remedy = concern.remedy if concern.remedy not in concern.warnings[0] else ""
-        todo = Markup('<span class="todo">{}</span>').format(remedy) if remedy else Markup("")
+        todo = Markup(' <span class="todo">→ {}</span>').format(remedy) if remedy else Markup("")
         shown.append(Markup("{}{}{}").format(concern.warnings[0], concern.count, todo))
         left += concern.warnings[1:]
     return shown, left
