@@ -7,13 +7,18 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import ftlm
+from ftlm import cli
 from ftlm.fit import history
 from ftlm.fit.joint import fit_output_error
+from ftlm.identification.verdict import saved_verdict
 from ftlm.judge.concerns import KINDS, OTHER, SHOWN, concerns, kind_of
+from ftlm.report import model_page
 from loops import loop
 
 SOURCE = Path(ftlm.__file__).parent
@@ -309,3 +314,45 @@ def test_json_and_page_say_the_same(found, checked, other, tmp_path):
     assert "<strong>Trust</strong>" in checked._repr_html_()
     page = found.report(tmp_path / "r.html", validation=other).read_text("utf-8")
     assert page.index("Trust") < page.index("<math>") < page.index("Residuals</h2>")
+
+
+def test_a_saved_model_is_judged_by_what_its_file_knows(found, other, run, tmp_path):
+    saved = ftlm.load_model(found.model.save(tmp_path / "m.json"))
+    assert saved_verdict(saved, [saved.compare(other)]).level == "trust"
+    for seen in ([], [saved.compare(run)]):
+        assert saved_verdict(saved, seen).reason == "no run that it was not fitted to has been tried"
+    page = model_page(saved, tmp_path / "m.html", validation=other).read_text("utf-8")
+    assert page.index("Trust") < page.index("<math>")
+    bare = replace(saved, estimate=None)
+    assert saved_verdict(bare, []).reason == "its file says nothing of how it was identified"
+    estimate = replace_estimate(saved, standard_errors={**saved.estimate.standard_errors, "b0": None})
+    judged = saved_verdict(estimate, [])
+    assert (judged.level, judged.reason) == ("do not use", "the runs do not tell b0 apart")
+    warned = replace_estimate(saved, warnings=("order alpha = 2 is on its bound; widen it",))
+    assert saved_verdict(warned, [saved.compare(other)]).reason == (
+        "an order or a number is on its bound: order alpha = 2 is on its bound"
+    )
+    better = replace_estimate(saved, fit={"y": 130.0})
+    assert "falls from 130 to" in saved_verdict(better, [saved.compare(other)]).reason
+    grown = ftlm.Model(ftlm.equation("D y = 0.3 y + u"))
+    assert saved_verdict(grown, []).level == "do not use"
+
+
+def replace_estimate(model, **changes):
+    return replace(model, estimate=msgspec.structs.replace(model.estimate, **changes))
+
+
+def test_the_command_line_has_verdict_validation_and_more(run, other, tmp_path):
+    run.to_csv(tmp_path / "run.csv")
+    other.to_csv(tmp_path / "other.csv")
+    words = ["identify", str(tmp_path / "run.csv"), "--structure", "D^1.8 y = a1 D^0.8 y + a0 y + b0 u"]
+    alone = CliRunner().invoke(cli.app, words)
+    assert alone.exit_code == 0, alone.output
+    assert alone.output.startswith("WITH CARE: no run that it was not fitted to has been tried")
+    assert len(alone.output.splitlines()) < 24
+    both = CliRunner().invoke(cli.app, [*words, "--validation", str(tmp_path / "other.csv"), "-v"])
+    assert both.output.startswith("TRUST: it predicts runs it was not fitted to (y ")
+    assert "equation error" in both.output
+    assert "validation on chirp" in both.output
+    document = json.loads(CliRunner().invoke(cli.app, [*words, "--json"]).output)
+    assert document["verdict"]["level"] == "with care"

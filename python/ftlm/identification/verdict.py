@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -13,9 +13,11 @@ from ftlm.identification.judged import Judged
 from ftlm.judge.comparison import LOST, USELESS, Comparison
 from ftlm.judge.concerns import BAD, CARE, KINDS, Kind, concerns
 from ftlm.judge.residuals import NEGLIGIBLE
+from ftlm.model.model import Model
 from ftlm.paint.text import unbounded
 
 TRUST = "trust"
+NOT_TRIED = "no run that it was not fitted to has been tried"
 #: A coefficient that is known to no more than this share of itself, an order to no more than this: half of what its
 #: 95 % interval spans is then as large as itself, or as the steps of 0.5 in which mechanisms differ.
 VAGUE_SHARE, VAGUE_ORDER = 0.5, 0.25
@@ -106,12 +108,50 @@ def verdict(result: Judged, validation: Comparison | None = None) -> Verdict:
 
     Warnings of weight that no rule names count in the order of :data:`ftlm.judge.concerns.KINDS`.
     """
-    found = [*_rules(result, validation)]
-    bad = [a for a in found if a.level == BAD] + [a for a in found if a.level == CARE]
-    if bad:
-        return Verdict(bad[0].level, bad[0].reason, bad[0].remedy, tuple(dict.fromkeys(a.reason for a in bad)))
+    against = _most_serious([*_rules(result, validation)])
+    if against is not None:
+        return against
     fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
     return Verdict(TRUST, f"it predicts runs it was not fitted to ({fits}), residuals are noise, every number is known")
+
+
+def _most_serious(found: Sequence[_Against]) -> Verdict | None:
+    """The verdict of what speaks against a model; None where nothing does."""
+    bad = [a for a in found if a.level == BAD] + [a for a in found if a.level == CARE]
+    if not bad:
+        return None
+    return Verdict(bad[0].level, bad[0].reason, bad[0].remedy, tuple(dict.fromkeys(a.reason for a in bad)))
+
+
+def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
+    """Judge a saved model by what its file knows of its identification, and by runs that it is compared with."""
+    known, found = model.estimate, [*_growing(model)]
+    for comparison in validation:
+        found += _useless("the validation run of ", comparison)
+    if known is None:
+        found.append(_Against(CARE, "its file says nothing of how it was identified", "compare it with measured runs"))
+    else:
+        unseen = [n for n, e in known.standard_errors.items() if e is None]
+        if unseen:
+            reason = f"the runs do not tell {_listed(unseen)} apart"
+            found.append(_Against(BAD, reason, _KINDS["unseen"].remedy))
+        before = {n: f for n, f in known.fit.items() if f is not None}
+        for comparison in validation:
+            found += _lost(before, comparison)
+        for concern in concerns(known.warnings):
+            if concern.kind.level in (BAD, CARE) and concern.kind.name not in ("unstable", "unseen"):
+                reason = f"{concern.kind.what}: {_first(concern.warnings[0])}"
+                found.append(_Against(concern.kind.level, reason, concern.kind.remedy))
+        if not known.standard_errors:
+            found.append(_Against(CARE, f"{known.method} gives no standard errors", "use method='output-error'"))
+        seen = all(name in known.runs for c in validation for name, _, _ in c.per_run)
+        if not validation or seen:
+            found.append(_Against(CARE, NOT_TRIED, "give a run that the model has not seen"))
+    against = _most_serious(found)
+    if against is not None:
+        return against
+    fits = ", ".join(f"{o} {f.fit:.3g} %" for c in validation for o, f in c.output_error.items())
+    return Verdict(TRUST, f"it predicts runs it was not fitted to ({fits}), and nothing spoke against its fit")
 
 
 def _rules(result: Judged, validation: Comparison | None) -> Iterator[_Against]:
@@ -128,7 +168,8 @@ def _rules(result: Judged, validation: Comparison | None) -> Iterator[_Against]:
         yield of(_KINDS["unseen"], f"the runs do not tell {_listed(unseen)} apart")
     if "identity" in kinds:
         yield of(_KINDS["identity"])
-    yield from _lost(result, validation)
+    if validation is not None:
+        yield from _lost(result.fit_percent, validation)
     yield from _residuals(result)
     if joint is not None and not joint.converged:
         kinds.pop("provisional", None)
@@ -151,38 +192,43 @@ def _rules(result: Judged, validation: Comparison | None) -> Iterator[_Against]:
             "use method='output-error'",
         )  # fmt: skip
     if validation is None or not _is_other(validation):
-        yield _Against(
-            CARE, "no run that it was not fitted to has been tried", "validate(run), or --validation FILE"
-        )  # fmt: skip
+        yield _Against(CARE, NOT_TRIED, "validate(run), or --validation FILE")
 
 
 def _free_runs(result: Judged, validation: Comparison | None, kinds: object) -> Iterator[_Against]:
     """What free runs say: whether they stay, and what they explain."""
     if not all(math.isfinite(f.nr) for f in result.output_error.values()):
         yield _Against(BAD, _KINDS["range"].what, _KINDS["range"].remedy)
-    model = result.model
-    if not model.structure.has_friction:
-        stable = model.stability(coupling=model.structure.coupling)
-        if stable.unstable_poles > 0:
-            count = int(stable.unstable_poles)
-            poles = f"{count} pole{'s' if count > 1 else ''} with a positive real part"
-            yield _Against(BAD, f"{_KINDS['unstable'].what} ({poles})", _KINDS["unstable"].remedy)
-    compared = [("", result.comparison), *([("the validation run of ", validation)] if validation else [])]
-    for where, comparison in compared:
-        useless = [o for o, f in comparison.output_error.items() if not f.nr <= USELESS]
-        if useless:
-            shown = ", ".join(f"{o} (fit {comparison.output_error[o].fit:.3g} %)" for o in useless)
-            yield _Against(BAD, f"the free run explains little of {where}{shown}", _KINDS["useless"].remedy)
+    yield from _growing(result.model)
+    yield from _useless("", result.comparison)
+    if validation is not None:
+        yield from _useless("the validation run of ", validation)
 
 
-def _lost(result: Judged, validation: Comparison | None) -> Iterator[_Against]:
-    """Outputs whose fit on validation is far below that on estimation."""
-    if validation is None:
+def _growing(model: Model) -> Iterator[_Against]:
+    """Poles with a positive real part; with friction no poles say what a body does."""
+    if model.structure.has_friction:
         return
+    stable = model.stability(coupling=model.structure.coupling)
+    if stable.unstable_poles > 0:
+        count = int(stable.unstable_poles)
+        poles = f"{count} pole{'s' if count > 1 else ''} with a positive real part"
+        yield _Against(BAD, f"{_KINDS['unstable'].what} ({poles})", _KINDS["unstable"].remedy)
+
+
+def _useless(where: str, comparison: Comparison) -> Iterator[_Against]:
+    """Outputs that the free run explains by less than half."""
+    useless = [o for o, f in comparison.output_error.items() if not f.nr <= USELESS]
+    if useless:
+        shown = ", ".join(f"{o} (fit {comparison.output_error[o].fit:.3g} %)" for o in useless)
+        yield _Against(BAD, f"the free run explains little of {where}{shown}", _KINDS["useless"].remedy)
+
+
+def _lost(before: Mapping[str, float], validation: Comparison) -> Iterator[_Against]:
+    """Outputs whose fit on validation is far below that on estimation."""
     for output, figures in validation.output_error.items():
-        before = result.output_error[output].fit
-        if not figures.fit >= before - LOST:
-            words = f"the fit of {output} falls from {before:.3g} to {figures.fit:.3g} % on validation"
+        if output in before and not figures.fit >= before[output] - LOST:
+            words = f"the fit of {output} falls from {before[output]:.3g} to {figures.fit:.3g} % on validation"
             yield _Against(CARE, words, _KINDS["lost"].remedy)
 
 
