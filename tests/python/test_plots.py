@@ -4,11 +4,14 @@ import io
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import ftlm
+from ftlm import cli
 
 pytest.importorskip("matplotlib")
 HOSTILE = r"$\frac{ <b> & $x^"
@@ -222,3 +225,14 @@ def test_what_is_nothing_to_draw_is_refused(bad):
                  plot.residual_series, plot.models):  # fmt: skip
         with pytest.raises(ftlm.errors.ModelError):
             draw(bad)
+
+
+def test_every_kind_is_drawn_by_the_command(joint, small_run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    joint.model.save("m.json")
+    small_run.to_csv("r.csv")
+    for kind, runs in (("poles", []), ("step", []), ("impulse", []), ("series", ["r.csv"]), ("fit", ["r.csv"])):
+        ran = CliRunner().invoke(cli.app, ["plot", "m.json", *runs, "-o", f"{kind}.svg", "--kind", kind])
+        assert ran.exit_code == 0, ran.output
+        assert "<svg" in Path(f"{kind}.svg").read_text("utf-8")
+    assert CliRunner().invoke(cli.app, ["plot", "m.json", "-o", "x.svg", "--kind", "series"]).exit_code == 2

@@ -513,6 +513,7 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
         left.set_title(_plain(f"residual, {comparison.per_run[k][0]}"), fontsize="small", loc="left")
         right.hist(there, bins=31, color=LINES[2][0], alpha=0.7)
         right.set(xlabel=_unit(name, units), ylabel="samples")
+        right.locator_params(axis="x", nbins=3)
     return figure
 
 
