@@ -31,6 +31,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.identification.many import Identified, identify_many
     from ftlm.identification.physical import PhysicalParameter, physical_parameters
     from ftlm.identification.result import Identification
+    from ftlm.identification.verdict import Validation, Verdict
     from ftlm.judge.comparison import Comparison, compare
     from ftlm.judge.criteria import InformationCriteria, information_criteria
     from ftlm.judge.feedback import FeedbackTest
@@ -60,8 +61,8 @@ __all__ = [
     "InformationCriteria", "InternalError", "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError",
     "OpenedFile", "Order", "OutputResiduals", "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals",
     "RigFault", "Run", "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck",
-    "Structure", "Term", "Trace", "Trial", "__version__", "block_pulse_matrix", "compare", "equation",
-    "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse",
+    "Structure", "Term", "Trace", "Trial", "Validation", "Verdict", "__version__", "block_pulse_matrix", "compare",
+    "equation", "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse",
     "haar_matrix", "haar_transform", "identify", "identify_many", "information_criteria", "lattice", "link_model",
     "load", "load_model", "metrics", "multi_innovation_trace", "open_file", "operational_matrix", "order_law",
     "physical_parameters", "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status", "select",
@@ -93,6 +94,7 @@ _HOMES = {
         "identification.many": "Identified identify_many",
         "identification.physical": "PhysicalParameter physical_parameters",
         "identification.result": "Identification",
+        "identification.verdict": "Validation Verdict",
         "judge.comparison": "Comparison compare",
         "judge.criteria": "InformationCriteria information_criteria",
         "judge.feedback": "FeedbackTest",

@@ -1,5 +1,8 @@
-"""Figures for papers as matplotlib objects: fits, residual tests, order landscapes, Bode plots."""
+"""Figures for papers: matplotlib objects, with ``ax=`` in every function; nothing is shown, saved or kept."""
 
-from ftlm.report.plots import bode, fit, landscape, residuals
+from ftlm.report.plots import (  # noqa: I001 — packed, so that a face stays short
+    bode, correlation, fit, impulse, landscape, models, poles, residual_series, residuals, run, step,
+)  # fmt: skip
 
-__all__ = ["bode", "fit", "landscape", "residuals"]
+__all__ = ["bode", "correlation", "fit", "impulse", "landscape", "models", "poles", "residual_series", "residuals",
+           "run", "step"]  # fmt: skip

@@ -8,7 +8,7 @@ import re
 
 #: From the ground up; folders on one storey do not import each other. What is public lies on top of all.
 STOREYS = (
-    ("base",), ("data", "paint"), ("files", "solve"), ("judge", "fit"), ("model",), ("search", "arm"),
+    ("base",), ("paint",), ("data",), ("files", "solve"), ("judge", "fit"), ("model",), ("search", "arm"),
     ("identification", "rig"), ("selection", "paper"), ("report",), ("cli",), (".",),
 )  # fmt: skip
 LEVEL = {folder: level for level, folders in enumerate(STOREYS) for folder in folders}

@@ -120,14 +120,14 @@ def test_zoom_by_buttons(browser, folder):
         page = opened.page
         chart = page.locator("svg.chart.wide[data-frame]").first
         whole = [float(v) for v in chart.get_attribute("data-frame").split()]
-        labels = chart.locator(".ticks text").all_inner_texts()
+        labels = chart.locator(".ticks text").all_text_contents()
         bar = page.locator(".zoom.wide").first
         assert bar.get_by_role("button", name="Zoom out").is_disabled()
         bar.get_by_role("button", name="Zoom in").click()
         low, high, *heights = view_of(page)
         assert (high - low) == pytest.approx((whole[1] - whole[0]) / 2)
         assert heights == whole[2:]
-        assert chart.locator(".ticks text").all_inner_texts() != labels
+        assert chart.locator(".ticks text").all_text_contents() != labels
         bar.get_by_role("button", name="Move right").click()
         assert view_of(page)[1] == pytest.approx(whole[1])
         bar.get_by_role("button", name="Move left").focus()

@@ -121,7 +121,7 @@ def test_a_run_in_motion_starts_with_a_filter_in_motion(filtered):
     assert sorted(started) == [-2.0, -1.0, 0.0, 1.0]
     again = found.model.simulate(run, initial=compared.initial[0], tolerance=1e-4)
     np.testing.assert_allclose(again["y"], compared.simulated["y"][0], atol=2e-4 * np.abs(again["y"]).max())
-    assert "filter's state 1" in str(found)
+    assert "filter's state 1" in found.details()
     # Exponents that are given are all there is.
     given = ftlm.Model(replace(found.model.structure, initial=(0.0, 1.0))).compare(run).fit_percent["y"]
     assert given < 99.0
@@ -201,7 +201,7 @@ def test_coupled_runs_in_motion_are_identified_from_their_own_start(filtered):
     for name, value in (TRUTH | SECOND).items():
         assert found.coefficients[name] == pytest.approx(value, rel=1e-5), name
     assert min(found.model.compare(run).fit_percent.values()) > 99.999
-    assert "filter's state 1" in str(found)
+    assert "filter's state 1" in found.details()
 
 
 def test_slopes_beside_a_filter_in_motion_are_those_of_finite_differences():

@@ -10,7 +10,7 @@ import ftlm
 from ftlm import frequency
 from ftlm.paper.arm import demo_plant
 from ftlm.solve.frequency import model_numbers
-from ftlm.solve.stability import _roots, right_zeros
+from ftlm.solve.stability import right_zeros, roots_in_base
 
 TWO = "D^1.7 y = -20 y - 2 D^0.7 y + 15 z + 10 u; D^1.2 z = -5 z + 3 D^0.4 y + 2 D^0.3 u + v"
 
@@ -161,7 +161,7 @@ def test_matignon_and_the_argument_principle_agree():
         powers = np.sort(rng.choice(np.arange(1, 31), terms, replace=False)) / 10
         values = rng.choice([-1, 1], terms + 1, p=[0.25, 0.75]) * 10 ** rng.uniform(-2, 2, terms + 1)
         polynomial = {0.0: float(values[0])} | dict(zip(powers.tolist(), values[1:].tolist(), strict=True))
-        base, roots = _roots(polynomial)
+        base, roots = roots_in_base(polynomial)
         by_roots = int(np.sum(np.abs(np.angle(roots)) < base * math.pi / 2))
         count, on_axis = right_zeros(polynomial)
         assert not on_axis

@@ -119,7 +119,7 @@ def test_runs_that_do_not_start_at_rest_get_initial_terms(small_run, structure):
     found = ftlm.identify([small_run, piece], structure, method="least-squares", m=256)
     assert found.settings["initial"] == "history, 10 powers of t up to 2.25"
     assert found.coefficients == {n: pytest.approx(v, rel=0.05) for n, v in TRUTH.items()}
-    assert "initial terms of y in piece (of that run alone): " in str(found)
+    assert "initial terms of y in piece (of that run alone): " in found.details()
     fixed = ftlm.identify(piece, replace(structure, initial=(0.0, 1.0)), method="least-squares", m=256)
     assert fixed.settings["initial"] == "t^[0.0, 1.0]"
     assert set(fixed.comparison.initial[0]["y"]) == {0.0, 1.0}
@@ -267,7 +267,7 @@ def test_printed_figures_are_those_of_compare(small_run, second, with_noise, met
 def test_results_print_and_are_json(clean_a, plants):
     structure = ftlm.flexible_link(form="published").with_orders(plants["A"]["free_orders"])
     found = ftlm.identify(clean_a, structure, method="multi-innovation", prior_covariance=100.0, m=256)
-    text = str(found)
+    text = found.details()
     assert text.startswith(
         "flexible link, stage 1: multi-innovation, M = 256, p = 7, K0 = 100, haar rows, initial terms: rest"
     )

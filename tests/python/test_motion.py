@@ -158,7 +158,7 @@ def test_an_offset_beside_a_history_is_not_told_apart(halves):
     assert found.settings["initial"].startswith("history")
     assert abs(found.orders["alpha"] - 0.7) < 3.5 * found.standard_errors["alpha"]
     assert found.comparison.offsets == ({"y": {}},)
-    assert "offset in the equation of y in second half: not told apart from what the run did before" in str(found)
+    assert "offset in the equation of y in second half: not told apart from what the run did before" in found.details()
 
 
 def test_an_offset_and_a_power_of_the_history_may_be_one_term():
@@ -218,7 +218,7 @@ def test_a_comparison_has_the_history_of_the_fit(halves, tmp_path):
     simulated = found.model.simulate(run, initial=terms)["y"]
     np.testing.assert_allclose(simulated, found.comparison.simulated["y"][0], atol=1e-4 * np.std(simulated))
     assert found.residuals.initial_terms == 8
-    assert "initial terms of y in second half (of that run alone): " in str(found)
+    assert "initial terms of y in second half (of that run alone): " in found.details()
 
 
 def test_a_run_in_motion_is_judged_with_its_own_history(halves):

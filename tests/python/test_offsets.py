@@ -107,7 +107,7 @@ def test_two_runs_have_two_offsets():
         assert found.coefficients == pytest.approx(TRUTH, rel=0.05)
         assert found.to_dict()["offsets"] == list(found.comparison.offsets)
         for name in ("first", "second"):
-            assert f"offset in the equation of y in {name} (estimated on that run, for it alone): " in str(found)
+            assert f"offset in the equation of y in {name} (estimated on that run, for it alone): " in found.details()
 
 
 def test_a_ramp_is_found():
@@ -332,7 +332,7 @@ def test_auto_estimates_an_offset_where_the_runs_ask_for_one_and_says_so(tmp_pat
             low, high = found.intervals[name]
             # Three standard errors: 95 % would fail one number in twenty.
             assert abs(found.joint_values[name] - value) < 3 * (high - low) / 3.92
-        assert "offset found by test: constant, since the runs ask for one" in str(found)
+        assert "offset found by test: constant, since the runs ask for one" in found.details()
         # Estimated anew on the run that the model is judged on, and said.
         other, _, _ = loops.offset_run(kind, -2.0, 2)
         checked = found.validate(other)

@@ -215,7 +215,7 @@ def test_the_choice_of_an_optimum_is_given_in_words() -> None:
     level = joint.starts[0][0]
     same = sum(v <= 1.001 * level for v, _ in joint.starts)
     assert joint.choice.startswith(f"{same} of {len(joint.starts)} starts ended in the lowest optimum, first that of: ")
-    assert joint.choice in str(found)
+    assert joint.choice in found.details()
     assert found.to_dict()["choice"] == joint.choice
     given = fit_output_error([three_terms(40, 0)], structure(), start=THREE_TERMS)
     assert given.choice == "from the start that was given"

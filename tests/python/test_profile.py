@@ -194,7 +194,7 @@ def test_terminal_json_frame_page_and_file_say_the_same(found: ftlm.Identificati
     assert found.intervals["c"] == (own.low, own.high)
     assert found.joint is not None
     assert found.joint.intervals["c"] == (own.low, own.high)
-    text = str(found)
+    text = found.details()
     assert f"−∞ to {own.high:.6g}" in text
     assert "but those written out: by profile likelihood" in text
     assert [w for w in found.warnings if "do not bound c below" in w]
@@ -385,7 +385,7 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
     monkeypatch.setattr("ftlm.identification.intervals.is_lower", lambda *_: True)
     again = ftlm.identify(run, structure, threads=1, intervals="profile")
     assert [w for w in again.warnings if "led to this optimum, but the search for intervals did" in w]
-    assert "from a lower optimum" in str(again)
+    assert "from a lower optimum" in again.details()
     for name, value in right.coefficients.items():
         assert again.coefficients[name] == pytest.approx(value, rel=1e-4)
 

@@ -15,6 +15,7 @@ from ftlm import report
 from ftlm.paint import axes
 from ftlm.paint import text as words
 from ftlm.paint.figure import LINE
+from ftlm.paint.text import number
 
 HOSTILE = "</script><script>alert(1)</script>\"><svg onload=alert(1)> & 'x'"
 VOID = {"meta", "link", "br", "hr", "img", "input"}
@@ -142,7 +143,9 @@ def test_charts_are_named_for_those_who_cannot_see_them(page):
     fits = 2 * 2  # outputs, runs
     residuals = 2 * 2 * 2  # outputs; itself and the current; runs
     bode, maps = 2 * 2, 1
-    assert len(charts) == 2 * (fits + residuals + bode + maps)  # wide and narrow
+    inputs, series = 2, 2 * fits  # over time and how often
+    own = 1 + 2  # poles, steps
+    assert len(charts) == 2 * (fits + inputs + residuals + series + bode + maps + own)  # wide and narrow
     assert all('role="img"' in c and "viewBox" in c for c in charts)
     assert parsed.tags.count("desc") == len(charts)
     assert "prefers-color-scheme" in page
@@ -305,7 +308,9 @@ def test_results_are_rich_in_a_notebook(identified, square):
     }
     for name, text in shown.items():
         parsed = Page(text)
-        assert not {"script", "img", "svg"} & set(parsed.tags), name
+        assert not {"script", "img"} & set(parsed.tags), name
+        # Its free run is worth a picture; the others are tables.
+        assert ("svg" in parsed.tags) == (name == "identification"), name
         assert not re.search(r"https?:|src=", text), name
     assert "<math>" in shown["identification"]
     values = {float(v) for v in Page(shown["identification"]).data}
@@ -645,3 +650,108 @@ def test_convergence_and_error_charts(square, identified):
     found = report.error_chart([("best", identified.comparison)], "theta12", units={"theta12": "rad"})
     assert "|error| [rad]" in found.svg
     assert found._repr_html_().startswith("<figure>")
+
+
+# ------------------------------------------------------------------------------------------------ pictures
+
+
+def test_a_pole_map_has_every_pole_and_its_sector():
+    model = ftlm.Model(ftlm.equation("D^1.8 y = -0.6 D^0.8 y - 9 y + 4 u"))
+    (figure,) = report.pole_charts(model)
+    assert "s^0.9" in figure.title
+    lam = [m.pole**0.9 for m in model.modes()]
+    assert f"{lam[0].real:.3g}".replace("-", "−")[:5] in figure.svg
+    assert "2 points in the plane" in figure.svg
+    assert "|arg s^0.9| < 81 degrees" in figure.caption
+    assert "none is in it" in figure.caption
+    (grown,) = report.pole_charts(ftlm.Model(ftlm.equation("D^2 y = 0.6 D y - 9 y + u")))
+    assert grown.title == "Poles in the plane of s"
+    assert "1 of 1 modes in it: the model is not stable" in grown.caption
+    assert "2 in the shaded sector" in grown.svg
+    # A relaxation of fractional order stands on the negative axis.
+    (slow,) = report.pole_charts(ftlm.Model(ftlm.equation("D^0.5 y = -2 y + u")))
+    assert "−2.00 + 0j" in slow.svg
+    assert report.pole_charts(ftlm.Model(ftlm.equation("D^2 y = -3 D y + 6 u - 0.5*sign(D y)"))) == []
+    with pytest.raises(ftlm.errors.DataError, match="point 1 of 2 is not finite"):
+        report.plane_chart([1j, complex("nan")], title="t", x_label="x", y_label="y")
+    for bad in (0.0, 4.0, -1.0):
+        with pytest.raises(ftlm.errors.DataError, match="no angle"):
+            report.plane_chart([1j], title="t", x_label="x", y_label="y", sector=bad)
+
+
+def test_a_correlation_map_has_every_number():
+    values = np.array([[1.0, -0.5], [-0.5, 1.0]])
+    figure = report.correlation_map(["alpha", HOSTILE], values, title="t")
+    assert figure.svg.count("−.50") == 2
+    assert HOSTILE not in figure.svg
+    assert "The largest" in figure.svg
+    assert "–" in report.correlation_map(["a", "b"], [[1, np.nan], [np.nan, 1]], title="t").svg
+    for names, bad, message in (
+        (["a"], values, "shape"),
+        ([], np.zeros((0, 0)), "shape"),
+        (["a", "b"], 3 * values, "beyond 1"),
+    ):
+        with pytest.raises(ftlm.errors.DataError, match=message):
+            report.correlation_map(names, bad, title="t")
+
+
+def test_a_histogram_counts_every_value():
+    values = np.random.default_rng(1).standard_normal(500)
+    figure = report.histogram([*values, np.nan], title="t", x_label="x")
+    heights = [float(h) for h in re.findall(r'<rect class="shade2"[^>]* height="([\d.]+)"', figure.svg)]
+    reach = np.max(np.abs(values - values.mean()))
+    counts, _ = np.histogram(values, values.mean() + np.linspace(-reach, reach, len(heights) + 1))
+    assert np.allclose(np.array(heights) / max(heights), counts / counts.max(), atol=0.01)
+    assert "1 values are not finite" in figure.caption
+    assert "Histogram of 500 values" in figure.svg
+    constant = report.histogram([2.0, 2.0, 2.0], title="t", x_label="x")
+    assert "standard deviation 0" in constant.svg
+    for bad in ([], [1.0], [np.nan, np.inf, 1.0]):
+        with pytest.raises(ftlm.errors.DataError, match="two finite values"):
+            report.histogram(bad, title="t", x_label="x")
+
+
+def test_models_stand_side_by_side_as_bars(identified, square, sine):
+    own, other = identified.comparison, identified.model.compare(sine)
+    both = [
+        ("one", [("estimation", own), ("validation", other)]),
+        (HOSTILE, [("estimation", own), ("validation", own)]),
+    ]
+    figures = report.compared_bars(both)
+    assert [f.title for f in figures] == ["Fit of the free run of θ₁₁", "Fit of the free run of θ₁₂"]
+    assert HOSTILE not in figures[0].svg
+    widths = [float(w) for w in re.findall(r'<rect class="shade1"[^>]* width="([\d.]+)"', figures[1].svg)]
+    assert widths[0] == widths[1] > 0
+    below = report.bar_chart(["a", "b"], [("fit", [-50.0, np.nan])], title="t", x_label="x", high=100.0)
+    assert "−50.00" in below.svg
+    assert "–" in below.svg
+    for bad, message in (
+        ([], "at least one model"),
+        ([("one", [("estimation", own)]), ("two", [("validation", own)])], "compare like with like"),
+    ):
+        with pytest.raises(ftlm.errors.DataError, match=message):
+            report.compared_bars(bad)
+    for names, groups in (([], [("a", [])]), (["x"], []), (["x"], [("a", [1.0])] * 6), (["x"], [("a", [1.0, 2.0])])):
+        with pytest.raises(ftlm.errors.DataError, match=r"names|shape"):
+            report.bar_chart(names, groups, title="t", x_label="x")
+
+
+def test_residuals_over_time_are_those_of_the_comparison(identified):
+    figures = report.residual_series(identified.comparison, units=identified.model.units, label="estimation")
+    assert [f.title.rpartition(": ")[2] for f in figures] == ["over time", "how often"] * 2
+    missed = identified.comparison.measured["theta11"][0] - identified.comparison.simulated["theta11"][0]
+    assert f"from {number(float(missed.min()), 4)} to {number(float(missed.max()), 4)}" in figures[0].svg
+    assert "[rad]" in figures[1].svg
+
+
+def test_coefficients_have_units_and_an_offset_its_number():
+    model = ftlm.Model(
+        ftlm.equation("D^2 y = a y + b u").with_coefficients({"a": -4.0, "b": 2.0}), units={"y": "rad", "u": "A"}
+    )  # fmt: skip
+    table = report.parameter_table(model)
+    at = table.columns.index("unit")
+    assert [str(row[at]) for row in table.rows] == ["s<sup>−2</sup>", "s<sup>−2</sup> rad/A"]
+    html = str(report.equation_html(model.equations[0], offset={"constant": -0.25, "ramp": 0.5}))
+    assert "0.25000" in html
+    assert html.count('class="term"') == 4
+    assert "<mi>c</mi>" in str(report.equation_html(model.equations[0], offset=" + c"))

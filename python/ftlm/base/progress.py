@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import threading
 import time
@@ -14,6 +15,67 @@ from rich.progress import TaskID
 
 #: Work that ends sooner needs no bar.
 PATIENCE = 1.0
+#: Who waits longer than this [s] wants to know beforehand how long.
+WONDER = 2.0
+
+
+#: Work without a count of its own is told in so many parts.
+PARTS = 1000
+
+
+def left_in_words(seconds: float) -> str:
+    """Time left as a person says it: what is behind tells it to a digit, not to a second."""
+    if seconds < 90:
+        return f"about {rounded(seconds):g} s left"
+    if seconds < 5400:
+        return f"about {rounded(seconds / 60):g} min left"
+    return f"about {rounded(seconds / 3600):g} h left"
+
+
+def rounded(value: float) -> float:
+    """Return one of 1, 2, 3, 5, 7 times a power of ten, at least 1."""
+    power = 10.0 ** max(math.floor(math.log10(max(value, 1.0))), 0)
+    return power * min((1, 2, 3, 5, 7, 10), key=lambda digit: abs(digit * power - value))
+
+
+class Course:
+    """The share of a whole that is done, of work whose parts do not know each other; it never goes back.
+
+    Parameters
+    ----------
+    told
+        Called with (parts done, ``PARTS``); None for nobody.
+    """
+
+    def __init__(self, told: Callable[[int, int], None] | None) -> None:
+        self._told = told
+        self.reached = 0.0
+        self._said = -1
+
+    def at(self, share: float) -> None:
+        """So much of the whole is done."""
+        self.reached = max(self.reached, min(share, 1.0))
+        parts = round(PARTS * self.reached)
+        if self._told is not None and parts > self._said:
+            self._said = parts
+            self._told(parts, PARTS)
+
+    def until(self, share: float, sweep: float = 0.5) -> Callable[[int, int], None]:
+        """What a part that ends at this share of the whole is to call with (done, total).
+
+        Where it begins to count anew, each sweep takes the same share of what is left.
+        """
+        begun, last = self.reached, 0.0
+
+        def told(done: int, total: int) -> None:
+            nonlocal begun, last
+            fraction = done / max(total, 1)
+            if fraction < last:
+                begun = self.reached
+            last = fraction
+            self.at(begun + sweep * (share - begun) * fraction)
+
+        return told
 
 
 class _Bars:
@@ -26,22 +88,21 @@ class _Bars:
     def start(self, label: str, total: int) -> TaskID:
         """Add a bar."""
         from rich.console import Console  # noqa: PLC0415 — only a terminal needs it
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn  # noqa: PLC0415
+        from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
 
         with self._lock:
             if self._shown is None:
                 self._shown = Progress(
                     TextColumn("{task.description}"),
                     BarColumn(),
-                    TextColumn("{task.completed:,.0f}/{task.total:,.0f}"),
-                    TextColumn("{task.fields[rate]:,.0f}/s"),
+                    TextColumn("{task.fields[counted]}"),
                     TextColumn("{task.fields[pruned]}"),
-                    TimeRemainingColumn(),
+                    TextColumn("{task.fields[left]}"),
                     console=Console(stderr=True),
                     transient=True,
                 )
                 self._shown.start()
-            return self._shown.add_task(label, total=total, rate=0.0, pruned="")
+            return self._shown.add_task(label, total=total, counted="", pruned="", left="")
 
     def update(self, task: TaskID, **state: Any) -> None:
         """Move a bar."""
@@ -89,9 +150,14 @@ class Progress:
             return
         if self._task is None:
             self._task = self._bars.start(self._label, total)
-        rate = done / max(time.monotonic() - self._start, 1e-9)
+        passed = max(time.monotonic() - self._start, 1e-9)
+        counted = f"{done:,.0f}/{total:,.0f} {done / passed:,.0f}/s"
+        # Of work without a count of its own a person wants to know the share.
+        counted = f"{100 * done // total:.0f} %" if total == PARTS else counted
         share = "" if pruned is None else f"{100 * pruned / max(done, 1):.1f} % pruned"
-        self._bars.update(self._task, completed=done, total=total, rate=rate, pruned=share)
+        left = left_in_words(passed * (total - done) / done) if done else ""
+        state = {"description": self._label, "counted": counted, "pruned": share, "left": left}
+        self._bars.update(self._task, completed=done, total=total, **state)
         if done >= total:
             # The next search of the same job starts a bar of its own.
             self._stop()
@@ -101,6 +167,12 @@ class Progress:
         other = Progress(self._label, quiet=self._quiet)
         other._bars = self._bars
         return other
+
+    def expect(self, what: str, seconds: float) -> None:
+        """Say beforehand about how long it takes, where that is long enough to wonder."""
+        if not self._quiet and seconds >= WONDER:
+            about = left_in_words(seconds).removesuffix(" left")
+            print(f"{what} takes {about}; Ctrl-C ends it", file=sys.stderr)
 
     def name(self, label: str) -> None:
         """Name what comes next on the bar alone."""

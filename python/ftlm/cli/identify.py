@@ -12,10 +12,12 @@ from typing import Annotated, Literal
 import typer
 from typer import Argument, Option
 
+from ftlm.base.checks import check_threads
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
+from ftlm.base.pace import by_output_error, expected
 from ftlm.base.progress import Progress
-from ftlm.cli.command import EXIT_INTERRUPTED, command, show, show_json
+from ftlm.cli.command import EXIT_INTERRUPTED, command, show_json
 from ftlm.cli.options import (
     Files,
     Force,
@@ -28,6 +30,7 @@ from ftlm.cli.options import (
     StructureText,
     Text,
     Threads,
+    Verbose,
 )  # fmt: skip
 from ftlm.cli.words import in_options
 from ftlm.data.lattice import Lattice
@@ -71,9 +74,9 @@ def identify(
     out: Out = None,
     report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
     validation: Annotated[Text, Option(metavar="FILE", help="Another run.")] = None,
-    force: Force = False, as_json: Json = False,
+    force: Force = False, verbose: Verbose = False, as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Identify a model: orders on a lattice, coefficients, both errors, warnings in words."""
+    """Identify a model: whether to trust it, its equations, numbers, gain and modes, its fit, and warnings in words."""
     check_free(out, report, force=force, words=COMMAND)
     shape.structure(structure)
     begin = None if start is None else load_model(start)
@@ -81,7 +84,12 @@ def identify(
     wanted = shape.measured(structure, runs)
     # The slice is of the runs that are identified from.
     others = replace(reading, sliced=None).runs([validation]) if validation is not None else []
-    with resumable(store, "the same command"), Progress("searching orders", quiet=as_json) as progress:
+    label = "fitting" if method == "output-error" else "searching orders"
+    with resumable(store, "the same command"), Progress(label, quiet=as_json) as progress:
+        if method == "output-error":
+            samples = sum(run.length for run in runs) * len(wanted.outputs)
+            numbers = len(wanted.order_names) + len(wanted.coefficient_names) + len(wanted.free_inputs)
+            progress.expect("the fit", expected(by_output_error(samples, numbers), check_threads(threads)))
         result = estimation.identify(
             runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
             genetic=genetic.settings(method), threads=threads, progress=progress, store=store,
@@ -94,11 +102,18 @@ def identify(
         result.report(report, validation=others or None, force=force)
     checked = result.validate(others) if others else None
     if as_json:
-        show_json({**result.to_dict(), "validation": None if checked is None else checked.to_dict()})
+        judged = {"verdict": result.verdict(checked).to_dict()}
+        show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
-    show(result, as_json=False)
-    if checked is not None:
+    # What Python has as a method, the command line has as an option.
+    print(in_options(result.summary(checked)).replace("print(result.details())", "--verbose shows all"))
+    if verbose:
+        print(f"\n{in_options(result.details())}")
+    if verbose and checked is not None:
         print(f"\nvalidation on {', '.join(r.name for r in others)}\n{in_options(str(checked))}")
+    elif checked is not None:
+        print(f"validation on {', '.join(r.name for r in others)}")
+        print(in_options("\n".join(f"! {w}" for w in checked.warnings)), end="\n" if checked.warnings else "")
 
 
 @command

@@ -99,23 +99,29 @@ def report(
 def plot(
     *, model: SavedModel,
     out: Annotated[str, Option("-o", "--out", metavar="FILE", help="Figure to write: .png, .pdf or .svg.")],
-    files: Annotated[Texts, Argument(metavar="[RUN]...", help="Runs; bode needs none.")] = None,
-    kind: Annotated[Literal["fit", "residuals", "bode"], Option(help="What to draw.")] = "fit",
+    files: Annotated[Texts, Argument(metavar="[RUN]...", help="Runs, for fit, residuals and series.")] = None,
+    kind: Annotated[
+        Literal["fit", "residuals", "series", "bode", "poles", "step", "impulse"],
+        Option(help="What to draw; series: residuals over time and how often."),
+    ] = "fit",
     reading: ReadingOptions, force: Force = False, as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Draw a saved model for a paper: its fit or residual tests on runs, or its Bode plot."""
+    """Draw a saved model for a paper: its fit or residuals on runs, or its Bode plot, poles, step or impulse."""
     check_free(out, force=force, words=COMMAND)
     suffix = Path(out).suffix.removeprefix(".").lower()
     if suffix not in ("png", "pdf", "svg"):
         raise ModelError(f"{out} ends in {suffix or 'nothing'!r}; write .png, .pdf or .svg")
     loaded = load_model(model)
     runs = reading.runs(files)
-    if not runs and kind != "bode":
+    alone = {"bode": plots.bode, "poles": plots.poles, "step": plots.step, "impulse": plots.impulse}
+    if not runs and kind not in alone:
         raise ModelError(f"--kind {kind} needs at least one run; give files")
-    if kind == "bode":
-        figure = plots.bode(loaded)
+    if kind in alone:
+        figure = alone[kind](loaded)
     elif kind == "fit":
-        figure = plots.fit(loaded, runs)
+        figure = plots.fit(loaded, runs, inputs=True)
+    elif kind == "series":
+        figure = plots.residual_series(loaded.compare(runs))
     else:
         figure = plots.residuals(loaded.resid(runs))
     data = io.BytesIO()

@@ -51,6 +51,7 @@ Out = Annotated[Text, Option("-o", "--out", metavar="FILE", help="Where to write
 Page = Annotated[str, Option("-o", "--out", metavar="HTML", help="Page to write.")]
 Force = Annotated[bool, Option("--force", help="Overwrite files.")]
 Json = Annotated[bool, Option("--json", help="Results as JSON.")]
+Verbose = Annotated[bool, Option("-v", "--verbose", help="Also all that is known: both errors, searches, warnings.")]
 
 
 @dataclass(frozen=True)

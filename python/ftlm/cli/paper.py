@@ -7,18 +7,34 @@ from typing import Annotated
 
 from typer import Option
 
+from ftlm.base.checks import check_threads
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_folder, check_free
+from ftlm.base.pace import expected
 from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show_json
-from ftlm.cli.options import Files, Force, GeneticOptions, Json, LatticeStep, Page, ReadingOptions, Text, Threads
+from ftlm.cli.options import (
+    Files,
+    Force,
+    GeneticOptions,
+    Json,
+    LatticeStep,
+    Page,
+    ReadingOptions,
+    Text,
+    Threads,
+    Verbose,
+)
 from ftlm.paper import reproduction
 from ftlm.paper.demo import run_demo
-from ftlm.paper.demo_page import demo_page, demo_text
+from ftlm.paper.demo_page import demo_details, demo_page, demo_text
 from ftlm.paper.page import reproduction_text
 from ftlm.paper.reproduction import ALWAYS_SAVED
 from ftlm.paper.unseen import orders_on_unseen_runs
 from ftlm.paper.unseen_page import unseen_page, unseen_text
+
+#: Processor seconds of `ftlm demo` and of its pages, and of `ftlm reproduce`, on the machine that base/pace.py knows.
+DEMO_SECONDS, REPRODUCE_SECONDS = 22.0, 200.0
 
 
 @command
@@ -28,23 +44,26 @@ def demo(
     step: LatticeStep = 0.1,
     noise: Annotated[float, Option(help="Noise on every angle [rad].")] = 1e-4,
     seed: Annotated[int, Option(min=0, help="Seed of the noise.")] = 1,
-    threads: Threads = None, force: Force = False, as_json: Json = False,
+    threads: Threads = None, force: Force = False, verbose: Verbose = False, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Simulate both stages, identify every equation with p = 1, 3, 5, 7, compare, save, draw.
 
     The paper's lattice is that of --step 0.05, which takes minutes.
     """
     with Progress("", quiet=as_json) as progress:
+        progress.expect("the demo", expected(DEMO_SECONDS * (0.1 / step) ** 2, check_threads(threads)))
         result = run_demo(
-            Path(out), step=step, noise=noise, seed=seed, threads=threads, force=force, say=progress.say,
+            Path(out), step=step, noise=noise, seed=seed, threads=threads, force=force, say=progress.name,
             progress=progress,
         )  # fmt: skip
-        progress.say("writing the page")
         result.files.append(demo_page(result, Path(out) / "demo.html", force=force))
     if as_json:
         show_json(result.to_dict())
     else:
-        print(f"{demo_text(result)}\n\nwritten: {', '.join(str(f) for f in result.files)}")
+        if verbose:
+            print(f"{demo_details(result)}\n")
+        files = f"{Path(out) / 'demo.html'} (open it), and {len(result.files) - 1} runs and models"
+        print(f"{demo_text(result)}\nwritten: {files}")
 
 
 @command
@@ -66,6 +85,8 @@ def reproduce(
         raise ModelError("--sine is given without --square; give both, or neither for the virtual rig")
     measured = reading.runs([f for f in (square, sine) if f is not None], apart=True)
     with Progress("", quiet=as_json) as progress:
+        whole = REPRODUCE_SECONDS * (0.05 / step) ** 2
+        progress.expect("the reproduction", expected(whole, check_threads(threads)))
         result = reproduction.reproduce(
             *measured, step=step, noise=noise, seed=seed, genetic=genetic.settings(), threads=threads,
             say=progress.say, progress=progress,

@@ -19,6 +19,7 @@ from ftlm.data.frames import asked_of_frame, dataset_of, frame_of
 from ftlm.data.limits import Limit
 from ftlm.data.measured import Measured
 from ftlm.data.names import check_signal_name
+from ftlm.data.picture import picture
 from ftlm.data.readings import Readings, read
 from ftlm.data.samples import (
     FEWEST_ROWS,
@@ -37,6 +38,7 @@ from ftlm.data.samples import (
 )
 from ftlm.data.structures import Structure
 from ftlm.data.written import write_csv, write_parquet
+from ftlm.paint.figure import Figures
 
 
 class Run(Measured):
@@ -449,6 +451,16 @@ class Run(Measured):
                 thing, what = f"output {name!r} of run {self.name!r}", f"constant, every row is {float(there[0])!r}"
                 way_out = "check the sensor and the column, or load a part of the record in which it moves with slice="
                 raise bad_rows(thing, what, 0, values.size, way_out)
+
+    def plot(self, *signals: str) -> Figures:
+        """Charts of signals over time, outputs first: a notebook shows them; for matplotlib see ``ftlm.plot.run``.
+
+        Raises
+        ------
+        DataError
+            A name that is no signal of the run.
+        """
+        return picture(self, *signals)
 
     def advice(self, structure: Structure | None = None) -> Advice:
         """What to know about this run before a model is identified from it, in sentences with numbers.

@@ -105,3 +105,20 @@ def checked_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> 
                 f"the known units are {listed(UNITS)}; convert other data before loading"
             )
     return {signal: UNITS[str(given.get(signal, ""))] for signal in signals}
+
+
+def coefficient_unit(units: Mapping[str, str], output: str, alpha: float, signal: str, order: float) -> str:
+    """Unit of the coefficient of D^order of a signal in the equation of D^alpha of an output, ``s^-1.8 rad/A``.
+
+    Empty where the unit of one of two signals is not known, and where there is none.
+    """
+    seconds = round(order - alpha, 4)
+    time = "" if seconds == 0 else f"s^{seconds:g}"
+    if signal == output or units.get(signal) == units.get(output) != "":
+        return time
+    above, below = units.get(output, ""), units.get(signal, "")
+    if not above or not below:
+        return ""
+    below = f"({below})" if "/" in below or "·" in below else below
+    ratio = above if below == "1" else f"{above}/{below}"
+    return f"{time} {ratio}".strip()

@@ -15,6 +15,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import ConvergenceError, DataError, FtlmError
+from ftlm.base.progress import Course
 from ftlm.base.statistics import NORMAL_95, noise_of
 from ftlm.data.readings import read
 from ftlm.data.run import Run
@@ -203,12 +204,13 @@ def fit_output_error(
     # Starts are compared with every output weighing alike: noise decides where the optimum is, not how to get near it.
     alike = Grid(problem, runs, [1.0 / (COARSE_SHARE * sizes[o]) for o in outputs])
     weighed = Grid(problem, runs, [1.0 / noise[o] for o in outputs])
+    course = Course(progress)
     starts: list[tuple[float, str]] = []
     reached: list[Attempt] = []
     if start is None:
         floor = float(np.mean([(noise[o] / (COARSE_SHARE * sizes[o])) ** 2 for o in outputs]))
         runners = race_with_friction if structure.has_friction else race
-        reached = runners(alike, floor, threads, progress)
+        reached = runners(alike, floor, threads, course.until(0.5, 0.3))
         starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
         contenders = finalists(reached) if reached else []
         contenders += [given(problem, values) for values in known]
@@ -218,15 +220,19 @@ def fit_output_error(
         raise ConvergenceError(
             f"no start of {', '.join(outputs)} has a finite free run; check the signs of the data and the bounds"
         )
+    course.at(0.5)
     # Where a step passes faster than the samples see, a grid as coarse as the samples has an optimum of its own.
     while weighed.every < FINEST and weighed.matters(contenders[0]):
         weighed = weighed.finer
     best = weighed.descend(winner(contenders, replace(alike, every=weighed.every)), LAST_LAP)
+    course.at(0.65)
     best, weighed = with_settled_weights(best, weighed, loss)
+    course.at(0.75)
     best, weighed, growth = steadied(best, weighed, reached)
     if growth is not None and not growth.kept:
         best, weighed = with_settled_weights(best, weighed, loss)
     optimum = refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True)
+    course.at(1.0)
     return replace(joint_fit(optimum, starts), growth=growth)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
+from ftlm.base.progress import Course
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.data.settings import Intervals, Loss, Settings
@@ -117,19 +118,29 @@ def by_output_error(
     begins: list[dict[str, float]] = []
     if begin is not None:
         free = FreeProblem.of(replace(structure, initial="rest"))
-        told = values_of_model(free, begin, more or {}) if isinstance(begin, Solved) else begin
-        begins = known_starts(free, told)
+        given = values_of_model(free, begin, more or {}) if isinstance(begin, Solved) else begin
+        begins = known_starts(free, given)
+    # A fit that is made twice, with a history or without, is rare; profiles of intervals take a third, where they do.
+    course = Course(progress)
     joint = fit_any_start(
-        answers or task.runs, structure, start, threads=threads, progress=progress, loss=loss, known=begins
+        answers or task.runs,
+        structure,
+        start,
+        threads=threads,
+        progress=course.until(0.7, 0.9),
+        loss=loss,
+        known=begins,
     )
+    course.at(0.7)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))
     lower: list[str] = []
     if answers is not None:
         joint = instrumented(joint, problem, task.runs, answers)
     else:
         joint, lower = with_intervals(
-            joint, problem, task.runs, intervals, threads=threads, progress=progress, loss=loss
+            joint, problem, task.runs, intervals, threads=threads, progress=course.until(1.0, 0.9), loss=loss
         )
+    course.at(1.0)
     warnings = [*lower, *uncertain(joint, problem), *irregular(task.runs, joint, problem)]
     if start == "rest" and joint.initial != "rest":
         # The first value alone would tell a comparison otherwise.

@@ -8,6 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 from markupsafe import Markup
 
 from ftlm.base.output import check_free
@@ -16,20 +17,23 @@ from ftlm.data.run import Run
 from ftlm.data.several import as_runs
 from ftlm.fit.joint import JointFit
 from ftlm.fit.recursion import multi_innovation_trace, trace_chart
+from ftlm.identification.first import behaviour_figures, behaviour_tables, first_warnings, title_of, verdict_box
 from ftlm.identification.judged import Judged, Task
 from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.settings import settings_rows
+from ftlm.identification.verdict import verdict, verdict_html
 from ftlm.identification.warnings import validate
-from ftlm.judge.charts import comparison_charts, residual_charts
+from ftlm.judge.charts import comparison_charts, input_charts, residual_charts, residual_series
 from ftlm.judge.comparison import Comparison, errors_table, initial_terms_table, warned
 from ftlm.judge.criteria import InformationCriteria, information_table
 from ftlm.judge.residuals import Residuals, resid, residual_table
 from ftlm.model.charts import bode_charts, response_frequencies
 from ftlm.model.model import Model
-from ftlm.model.typesetting import equation_html, parameter_table
+from ftlm.model.typesetting import equations_html, parameter_table
 from ftlm.paint.axes import POINTS
 from ftlm.paint.figure import Figure
 from ftlm.paint.heat import heat_map
+from ftlm.paint.matrix import correlation_map
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, number, symbol, symbol_html, unbounded
@@ -41,6 +45,10 @@ PAGE_CHARTS = 60
 PAGE_POINTS = 90_000
 #: Charts of residuals, and of the frequency response, on a page.
 SMALL_CHARTS = 24
+#: Points of a line in a notebook, which keeps what it shows.
+NOTEBOOK_POINTS = 600
+#: Points of a line of residuals in a small chart.
+SERIES_POINTS = 600
 #: Lags of the residual tests.
 LAGS = 25
 #: Innovation lengths of the paper's tables, and points of a convergence curve.
@@ -93,9 +101,13 @@ def identification_page(
     compared = [("estimation", result.comparison), *(("validation", c) for c in validated)]
     tests = [] if result.residuals is None else [("estimation", result.residuals)]
     tests += tests_on(model, others)
-    sections = first_sections(model, warnings, compared, bool(others), result.joint)
-    sections.append(residual_section(tests, result.information))
+    pooled = validate(result, others) if len(others) > 1 else validated[0] if validated else None
+    judged = verdict(result, pooled)
     task = result.task
+    runs = [*(() if task is None else task.runs), *others]
+    sections = first_sections(model, warnings, compared, bool(others), result.joint, runs)
+    sections.append(residual_section(tests, result.information, compared, model.units))
+    sections += correlation_sections(result.joint)
     steps = [(r.step, r.duration) for r in ((() if task is None else task.runs) or others)]
     sections.append(frequency_section(model, steps))
     sections += _search_sections(result)
@@ -103,14 +115,16 @@ def identification_page(
     initial = [t for title, c in titled if (t := initial_terms_table(c, title=title)) is not None]
     starts = [starts_table(result.joint)] if result.joint is not None and result.joint.starts else []
     sections.append(Section("Settings", tables=[settings_table(result), *starts, *initial]))
-    return write_page(path, title=model.structure.name, sections=sections, lead=lead_of(compared), force=force)
+    return write_page(
+        path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)
+    )
 
 
 def first_sections(
     model: Model, warnings: Sequence[str], compared: Sequence[tuple[str, Comparison]], validated: bool,
-    joint: JointFit | None,
+    joint: JointFit | None, runs: Sequence[Run] = (),
 ) -> list[Section]:  # fmt: skip
-    """Warnings, equations, errors, charts."""
+    """Warnings, equations, what the model does by itself, errors, charts with the inputs below."""
     units = model.units
     words = [
         "No check raised a warning. Checked: free run against equation error, orders close to one another or on the "
@@ -120,25 +134,47 @@ def first_sections(
     if not validated:
         words.append("No validation run was given: how well the model predicts other data is not known.")
     warned = list(dict.fromkeys(warnings))
+    shown, left = first_warnings(warned)
     charts = sum(len(c.per_run) for _, c in compared) * len(model.outputs)
     # Two lines a chart, drawn once wide and once narrow with half the points.
     points = min(POINTS, PAGE_POINTS // (3 * max(min(charts, PAGE_CHARTS), 1)))
-    drawn = [f for label, c in compared for f in comparison_charts(c, units=units, label=label, points=points)]
+    drawn = _with_inputs(model, compared, runs, points)
+    own = compared[0][1] if compared and compared[0][0] == "estimation" else None
     equations = [
-        *(equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations),
+        *equations_html(model, None if own is None else own.offsets),
         STICKS if model.structure.has_friction else f"As a whole, the model is {model.stability()}.",
     ]
     sections = [
-        Section("Warnings", words[1:] if warned else words, warned),
+        Section("Warnings", words[1:] if warned else words, shown, more=left),
         Section("Equations", equations, tables=[parameter_table(model, joint)]),
     ]
+    if figures := behaviour_figures(model):
+        sections.append(Section("Gain, modes and steps", tables=behaviour_tables(model), figures=figures, small=True))
     if compared:
         left_out = f"{charts - PAGE_CHARTS} further charts are left out; the table above has every run."
         sections += [
             Section("Errors", tables=[errors_table(compared, units=units)]),
-            Section("Measured and simulated", left_out if charts > PAGE_CHARTS else (), figures=drawn[:PAGE_CHARTS]),
+            Section(
+                "Measured and simulated", left_out if charts > PAGE_CHARTS else (), figures=drawn[: max(PAGE_CHARTS, 1)]
+            ),
         ]
     return sections
+
+
+def _with_inputs(
+    model: Model, compared: Sequence[tuple[str, Comparison]], runs: Sequence[Run], points: int
+) -> list[Figure]:
+    """Outputs of each run measured and simulated, and below them what drove them, where the runs are at hand."""
+    inputs = [s for s in model.structure.signals if s not in model.outputs]
+    left, drawn = list(runs), []
+    for label, comparison in compared:
+        figures = comparison_charts(comparison, units=model.units, label=label, points=points)
+        for k, (name, _, _) in enumerate(comparison.per_run):
+            here = len(comparison.output_error)
+            drawn += figures[k * here : (k + 1) * here]
+            if left and left[0].name == name:
+                drawn += input_charts([left.pop(0)], inputs, points=max(points // 2, 4))
+    return drawn
 
 
 def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
@@ -146,12 +182,30 @@ def tests_on(model: Model, runs: Sequence[Run]) -> list[tuple[str, Residuals]]:
     return [("validation", resid(model, run)) for run in runs if run.length >= 2 * LAGS + 3]
 
 
-def residual_section(tests: Sequence[tuple[str, Residuals]], information: InformationCriteria | None) -> Section:
-    """Residual tests, information criteria, correlations as charts."""
+def correlation_sections(joint: JointFit | None) -> list[Section]:
+    """How the numbers of a joint fit go together; nothing for one number, or where there is no covariance."""
+    if joint is None or len(joint.names) < 2:
+        return []
+    words = (
+        "Two numbers whose correlation is near 1 or −1 can be moved together with little harm: the runs know what they "
+        "make together better than each. That matters where a standard error is large as well."
+    )
+    values = np.clip(joint.correlation, -1.0, 1.0)
+    figure = correlation_map(joint.names, values, title="Correlations of the estimates")
+    return [Section("How the numbers go together", words, figures=[figure], small=True)]
+
+
+def residual_section(
+    tests: Sequence[tuple[str, Residuals]], information: InformationCriteria | None,
+    compared: Sequence[tuple[str, Comparison]] = (), units: Mapping[str, str] | None = None,
+) -> Section:  # fmt: skip
+    """Residual tests, information criteria, residuals over time and how often, correlations as charts."""
     tables = [residual_table(t, title=f"{label}: {', '.join(t.runs)}") for label, t in tests]
     if information is not None:
         tables.append(information_table(information))
-    figures = [f for label, t in tests for f in residual_charts(t, label=label)]
+    figures = [f for label, c in compared for f in residual_series(c, units=units, label=label, points=SERIES_POINTS)]
+    figures = figures[: SMALL_CHARTS // 2]
+    figures += [f for label, t in tests for f in residual_charts(t, label=label)]
     words = () if tests else "The runs are too short for residual tests."
     return Section("Residuals", words, tables=tables, figures=figures[:SMALL_CHARTS], small=True)
 
@@ -313,12 +367,13 @@ _INDEPENDENCE = {"yes": "independent of", "no": "not independent of", "undecided
 def identification_html(result: Judged) -> str:
     """Return warnings, equations, parameters with intervals, both errors and the residual verdicts."""
     model = result.model
-    parts = [warned(result.warnings)]
-    parts += [
-        Markup("<p>{}</p>").format(equation_html(e, model.structure.delay, model.structure.limits))
-        for e in model.equations
-    ]
+    parts = [verdict_html(verdict(result))]
+    parts += [Markup("<p>{}</p>").format(e) for e in equations_html(model, result.comparison.offsets)]
+    parts += [table.to_html() for table in behaviour_tables(model)]
     parts.append(parameter_table(model, result.joint).to_html())
+    # One run is enough to see; a report has all.
+    figures = comparison_charts(result.comparison, units=model.units, points=NOTEBOOK_POINTS)
+    parts += [Markup(f._repr_html_()) for f in figures[: len(result.output_error)]]  # made of escaped parts
     parts.append(errors_table([("estimation", result.comparison)], units=model.units).to_html())
     if result.residuals is not None:
         verdicts = [
@@ -329,4 +384,9 @@ def identification_html(result: Judged) -> str:
             for o, white in result.residuals.white.items()
         ]  # fmt: skip
         parts.append(Markup("<p>{} (99 %).</p>").format(Markup("; ").join(verdicts)))
+    shown, left = first_warnings(result.warnings)
+    parts.append(warned(shown))
+    if left:
+        folded = Markup("<details><summary>{} more warning{}</summary>{}</details>")
+        parts.append(folded.format(len(left), "" if len(left) == 1 else "s", warned(left)))
     return str(Markup("").join(parts))

@@ -19,6 +19,8 @@ from ftlm.identification.judged import Judged
 from ftlm.identification.page import identification_html, identification_page
 from ftlm.identification.physical import PhysicalParameter, physical_parameters
 from ftlm.identification.settings import settings_in_words
+from ftlm.identification.summary import summary
+from ftlm.identification.verdict import Validation, Verdict, validated, verdict
 from ftlm.identification.warnings import validate
 from ftlm.judge.comparison import Comparison, filter_state
 from ftlm.judge.metrics import finite
@@ -125,7 +127,7 @@ class Identification(Judged):
         """Residual tests on other runs; see :func:`ftlm.resid`."""
         return resid(self.model, runs, lags=lags)
 
-    def validate(self, runs: Run | Sequence[Run]) -> Comparison:
+    def validate(self, runs: Run | Sequence[Run]) -> Validation:
         """Both errors on runs that the model was not identified from, with what they say against the model.
 
         Parameters
@@ -135,15 +137,16 @@ class Identification(Judged):
 
         Returns
         -------
-        Comparison
-            Its warnings name a fit that is lost, and runs that the model was identified from.
+        Validation
+            A :class:`ftlm.Comparison` whose ``.verdict`` says whether to trust the model. Its warnings name a fit that
+            is lost, and runs that the model was identified from.
 
         Raises
         ------
         DataError
             Runs that do not fit the model.
         """
-        return validate(self, runs)
+        return validated(self, validate(self, runs))
 
     def report(
         self, path: str | os.PathLike[str], *, validation: Run | Sequence[Run] | None = None, force: bool = False
@@ -208,7 +211,52 @@ class Identification(Judged):
             "warnings": list(self.warnings),
         }
 
-    def __str__(self) -> str:
+    def verdict(self, validation: Comparison | None = None) -> Verdict:
+        """Whether to trust this model: ``"trust"``, ``"with care"`` or ``"do not use"``, with one reason.
+
+        Parameters
+        ----------
+        validation
+            What :meth:`validate` said of runs that the model was not identified from. Without any, no model is
+            trusted: how well it predicts other data is not known.
+
+        Returns
+        -------
+        Verdict
+            Prints as one sentence; ``.reasons`` has all that speaks against the model, most serious first.
+
+        Notes
+        -----
+        The first of these rules that applies gives the reason.
+
+        *Do not use*: the free run leaves the range of numbers, or grows (a pole with a positive real part); numbers
+        that the runs do not tell apart at all (infinite standard errors); an output that the free run explains by less
+        than half (NR above 0.5), on its own runs or on validation; own orders by which an equation says that an output
+        equals itself.
+
+        *With care*: a fit that falls by 20 points on validation; residuals that follow an input; a closed loop with
+        coloured residuals; residuals that are not white (all three no smaller than a thousandth of the output); a fit
+        that did not stand still; a coefficient known to no more than half of itself, an order to no more than 0.25; an
+        offset that is hidden by what a run did before its start; every other warning of weight; no standard errors; no
+        validation.
+        """
+        if not (validation is None or isinstance(validation, Comparison)):
+            raise ModelError(f"validation is {type(validation).__name__}; give what validate(run) returns")
+        return verdict(self, validation)
+
+    def summary(self, validation: Comparison | None = None) -> str:
+        """The first screen, as print shows it: verdict, equations, numbers, gain, modes, fit, three warnings.
+
+        Parameters
+        ----------
+        validation
+            What :meth:`validate` said of runs that the model was not identified from.
+        """
+        self.verdict(validation)
+        return summary(self, validation)
+
+    def details(self) -> str:
+        """All that is known as text: settings, both errors, criteria, searches, initial terms, every warning."""
         lines = [f"{self.model.structure.name}: {self.method}, {settings_in_words(self.settings)}"]
         lines += [f"  {self.model.structure.written(e)}" for e in self.model.equations]
         reference = self.model.structure.reference
@@ -239,6 +287,9 @@ class Identification(Judged):
         lines += _initial_in_words(self.comparison)
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return self.summary()
 
     def _repr_html_(self) -> str:
         return identification_html(self)

@@ -8,9 +8,11 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError
+from ftlm.data.run import Run
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.residuals import CorrelationTest, Residuals
 from ftlm.paint.axes import POINTS
+from ftlm.paint.bars import bar_chart, histogram
 from ftlm.paint.figure import SMALL, Figure
 from ftlm.paint.lines import line_chart
 from ftlm.paint.text import number, symbol
@@ -49,6 +51,95 @@ def comparison_charts(
         )
         for k, (run, _, output_error) in enumerate(comparison.per_run)
         for name, figures in output_error.items()
+    ]  # fmt: skip
+
+
+def input_charts(runs: Sequence[Run], signals: Sequence[str], *, points: int = POINTS) -> list[Figure]:
+    """Inputs of every run, to stand below its outputs.
+
+    Parameters
+    ----------
+    runs
+        The runs.
+    signals
+        Which inputs, as far as a run has them.
+    points
+        Most points of a line.
+    """
+    return [
+        line_chart(
+            run.time, [(f"input {symbol(name)}", run[name])], x_label="time [s]",
+            title=f"Input {symbol(name)}, {run.name}",
+            y_label=with_unit(symbol(name), run.units, name), points=points, height=180,
+        )
+        for run in runs
+        for name in signals
+        if name in run.inputs
+    ]  # fmt: skip
+
+
+def residual_series(
+    comparison: Comparison, *, units: Mapping[str, str] | None = None, label: str = "", points: int = POINTS
+) -> list[Figure]:
+    """Residuals of the free run over time and how often each size occurs, for every output of every run.
+
+    Parameters
+    ----------
+    comparison, units, label, points
+        See :func:`comparison_charts`.
+    """
+    figures = []
+    suffix = f", {label}" if label else ""
+    for k, (run, _, _) in enumerate(comparison.per_run):
+        for name in comparison.output_error:
+            missed = comparison.measured[name][k] - comparison.simulated[name][k]
+            what = f"Residual of {symbol(name)}{suffix}, {run}"
+            axis = with_unit(f"residual of {symbol(name)}", units, name)
+            figures.append(
+                line_chart(
+                    pulse_times(comparison, k), [("", missed)], title=f"{what}: over time", x_label="time [s]",
+                    y_label=axis, points=points, width=SMALL, height=190,
+                )
+            )  # fmt: skip
+            if np.sum(np.isfinite(missed)) >= 2:
+                words = "Line: the normal curve of the same mean and deviation."
+                figures.append(histogram(missed, title=f"{what}: how often", x_label=axis, caption=words))
+    return figures
+
+
+def compared_bars(
+    compared: Sequence[tuple[str, Sequence[tuple[str, Comparison]]]], *, title: str = "Fit of the free run"
+) -> list[Figure]:
+    """Fits of several models side by side, a chart for every output.
+
+    Parameters
+    ----------
+    compared
+        (name of the model, its comparisons as (what the data were to it, comparison)), such as
+        ``("integer", [("estimation", a), ("validation", b)])``; the same kinds of data for every model.
+    title
+        What the charts are called.
+
+    Raises
+    ------
+    DataError
+        No model, or models with other outputs or data than the first.
+    """
+    if not compared:
+        raise DataError("bars need at least one model; give (name, comparisons) pairs")
+    first, kinds = compared[0], [kind for kind, _ in compared[0][1]]
+    outputs = list(first[1][0][1].output_error) if first[1] else []
+    for name, parts in compared:
+        if [kind for kind, _ in parts] != kinds or any(list(c.output_error) != outputs for _, c in parts):
+            raise DataError(f"model {name!r} has other outputs or data than {first[0]!r}; compare like with like")
+    return [
+        bar_chart(
+            [name for name, _ in compared],
+            [(kind, [parts[i][1].output_error[o].fit for _, parts in compared]) for i, kind in enumerate(kinds)],
+            title=f"{title} of {symbol(o)}", x_label="fit [%]", low=0.0, high=100.0,
+            caption="100 % is no error; a bar ends at 0, its number says how far below it is.",
+        )
+        for o in outputs
     ]  # fmt: skip
 
 

@@ -14,11 +14,13 @@ from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.judge.comparison import Comparison, compare
 from ftlm.judge.residuals import Residuals, resid
+from ftlm.model.charts import Answer, Bode, answer, bode
 from ftlm.model.file import read_model, write_model
 from ftlm.model.typesetting import model_html
 from ftlm.solve.approximation import to_control
 from ftlm.solve.free_run import simulate
 from ftlm.solve.frequency import frequency_response, step_response
+from ftlm.solve.modes import Mode, dcgain, modes
 from ftlm.solve.stability import Stability, poles, stability
 
 
@@ -78,6 +80,64 @@ class Model(Solved):
     def poles(self, *, coupling: str = "simulated") -> Complex:
         """Poles of a model whose orders have a common base; see :func:`ftlm.frequency.poles`."""
         return poles(self, coupling=coupling)
+
+    def modes(self, *, coupling: str = "simulated") -> tuple[Mode, ...]:
+        """Frequency, damping and time constant of every pole, whatever the orders; see :func:`ftlm.frequency.modes`."""
+        return modes(self, coupling=coupling)
+
+    def dcgain(self) -> Floats:
+        """Steady-state gain, shape (outputs, inputs); see :func:`ftlm.frequency.dcgain`."""
+        return dcgain(self)
+
+    def step(self, time: ArrayLike | None = None) -> Answer:
+        """Response to unit steps from rest, with its uncertainty: a record that prints and draws itself in a notebook.
+
+        Parameters
+        ----------
+        time
+            Regular instants from 0 [s], at least 3; by default until the model has settled.
+
+        Returns
+        -------
+        Answer
+            ``.time``, ``.values`` of shape (outputs, inputs, N), ``.deviation`` from the covariance or None.
+
+        Raises
+        ------
+        DataError
+            Instants that are not regular from 0.
+        ModelError
+            An input that saturates or has a dead zone.
+        ConvergenceError
+            A model so unstable that the response leaves the range of numbers.
+        """
+        return answer(self, time, "step")
+
+    def impulse(self, time: ArrayLike | None = None) -> Answer:
+        """Response to unit impulses, as the mean over each interval of the instants; else as :meth:`step`."""
+        return answer(self, time, "impulse")
+
+    def bode(self, w: ArrayLike | None = None) -> Bode:
+        """Gain and phase with 95 % bands: a record that prints and, in a notebook, draws itself.
+
+        Parameters
+        ----------
+        w
+            Angular frequencies [rad/s]; by default around the model's own.
+
+        Returns
+        -------
+        Bode
+            ``.frequency``, ``.curves`` with gain [dB] and phase [degrees].
+
+        Raises
+        ------
+        DataError
+            Frequencies that are not finite numbers from 0.
+        ModelError
+            An input that saturates or has a dead zone.
+        """
+        return bode(self, w)
 
     def to_control(self, *, band: tuple[float, float], order: int = 5) -> Any:
         """A python-control system by Oustaloup's approximation; see :func:`ftlm.exports.to_control`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 
 from markupsafe import Markup
@@ -13,6 +14,7 @@ from ftlm.data.equations import Equation
 from ftlm.data.limits import SHORT, WORDS, Limit, input_name
 from ftlm.data.orders import Order
 from ftlm.data.solved import Solved
+from ftlm.data.units import coefficient_unit
 from ftlm.fit.joint import JointFit
 from ftlm.paint.table import Table
 from ftlm.paint.text import GREEK, SYMBOL, Cell, Exact, number, symbol, symbol_html, unbounded
@@ -28,7 +30,10 @@ _FALL = Markup(
 _PLAIN_DIGITS = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
 
 
-def equation_html(item: Equation, delay: Mapping[str, float] | None = None, limits: Sequence[Limit] = ()) -> Markup:
+def equation_html(
+    item: Equation, delay: Mapping[str, float] | None = None, limits: Sequence[Limit] = (),
+    offset: Mapping[str, float] | str = "",
+) -> Markup:  # fmt: skip
     """Return an identified equation typeset as MathML, a piece for each term so that it breaks between terms.
 
     Parameters
@@ -39,6 +44,9 @@ def equation_html(item: Equation, delay: Mapping[str, float] | None = None, limi
         Delays of inputs [s]; a delayed input is written u(t − 0.035 s).
     limits
         Known saturations and dead zones of inputs; one that saturates is written sat(u, 0.94).
+    offset
+        The unknown constant of the equation, ``"constant"`` and perhaps ``"ramp"``, as it was estimated on one run, or
+        words for it.
     """
     parts = [_math(_derivative_math(item.order, item.output) + Markup("<mo>=</mo>"))]
     for k, term in enumerate(item.terms):
@@ -57,7 +65,47 @@ def equation_html(item: Equation, delay: Mapping[str, float] | None = None, limi
         if item.friction.stribeck is not None:
             fall = _FALL.format(speed, _number_math(vs))
             parts.append(_math(minus + _number_math(fs) + THIN + fall + THIN + sign, "term"))
+    if isinstance(offset, str):
+        words = offset.removeprefix(" + ")
+        parts += [_math(Markup('<mo form="infix">+</mo><mi>{}</mi>').format(words), "term")] if words else []
+    else:
+        for name, value in offset.items():
+            sign, time = Markup('<mo form="infix">{}</mo>').format("−" if value < 0 else "+"), _symbol_math("t")
+            tail = THIN + time if name == "ramp" else Markup("")
+            parts.append(_math(sign + _number_math(abs(value)) + tail, "term"))
     return Markup('<span class="equation">{}</span>').format(Markup(" ").join(parts))
+
+
+def equations_html(model: Solved, offsets: Sequence[Mapping[str, Mapping[str, float]]] | None = None) -> list[Markup]:
+    """Equations of a model; an offset as a number where there is one run, since every run has its own."""
+    structure = model.structure
+    own = offsets[0] if offsets is not None and len(offsets) == 1 else {}
+    return [
+        equation_html(e, structure.delay, structure.limits, own.get(e.output) or structure.offset_in_words)
+        for e in model.equations
+    ]
+
+
+def units_of(model: Solved) -> dict[str, str]:
+    """Unit of every named coefficient, friction, delay and limit whose unit is known."""
+    out = {}
+    for item in model.equations:
+        alpha = item.order.constant
+        for term in item.terms:
+            if term.name is not None:
+                unit = coefficient_unit(model.units, item.output, alpha, term.signal, term.order.constant)
+                out[term.name] = unit
+        if item.friction is not None:
+            own = model.units.get(item.output, "")
+            force = f"{own} s^{-alpha:g}" if own else ""
+            near = item.friction.stribeck
+            named = [(item.friction.name, force)]
+            if near is not None:
+                named += [(near.name, force), (near.speed_name, f"{own}/s" if own else "")]
+            out |= {name: unit for name, unit in named if name is not None}
+    out |= {f"delay_{name}": "s" for name in model.structure.delay}
+    out |= {limit.name: model.units.get(limit.signal, "") for limit in model.structure.limits}
+    return {name: unit for name, unit in out.items() if unit}
 
 
 def _math(content: Markup, name: str = "") -> Markup:
@@ -124,6 +172,7 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
         Caption.
     """
     reference = model.structure.reference
+    units = units_of(model) if any(model.units.values()) else {}
     errors: Mapping[str, float | None] = {}
     extra: Mapping[str, float] = {}
     profiles: Mapping[str, tuple[float, float]] = {}
@@ -145,7 +194,7 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
         ends: list[Cell] = [None, None] if half is None else [value - half, value + half]
         if name in profiles:
             ends = [v if math.isfinite(v) else unbounded(v) for v in profiles[name]]
-        return [symbol_html(name), value, error, *ends, stated, place]
+        return [symbol_html(name), value, error, *ends, stated, unit_html(units.get(name, "")), place]
 
     rows = [row(n, v if known else Exact(v), None, "free order") for n, v in model.orders.items()]
     shown = set(model.orders)
@@ -177,14 +226,14 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
         row(n, v, None, "free in the coefficient law") for n, v in extra.items() if n not in shown and n not in inputs
     ]
     rows += [row(n, v, None, place) for n, (place, v) in inputs.items()]
-    columns = ["parameter", "value", "standard error", "from", "to", "stated", "what it is"]
+    columns = ["parameter", "value", "standard error", "from", "to", "stated", "unit", "what it is"]
     if known:
         note = "A coefficient without an interval follows from the law. Intervals hold as far as the model does."
         if profiles:
             note += f" Those of {', '.join(map(symbol, profiles))} are by profile likelihood, the others symmetric."
     else:
         note = "No standard errors are given here: this table does not say how many of the digits mean something."
-    left_out = ([] if known else [2, 3, 4]) + ([] if reference else [5])
+    left_out = ([] if known else [2, 3, 4]) + ([] if reference else [5]) + ([] if units else [6])
     if reference:
         note += " Stated values belong to the integer orders of the maker's model."
     kept = [i for i in range(len(columns)) if i not in left_out]
@@ -193,11 +242,16 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
     return Table(title, tuple(columns[i] for i in kept), shown_rows, groups=groups, note=note)
 
 
+def unit_html(unit: str) -> Markup:
+    """A unit with raised powers."""
+    parts = re.split(r"\^(-?[\d.]+)", unit)
+    raised = (Markup("<sup>{}</sup>").format(p.replace("-", "−")) if k % 2 else Markup("{}").format(p)
+              for k, p in enumerate(parts))  # fmt: skip
+    return Markup("").join(raised)
+
+
 def model_html(model: Solved) -> str:
     """Return the equations of a model and its parameters."""
-    lines = Markup("").join(
-        Markup("<p>{}</p>").format(equation_html(e, model.structure.delay, model.structure.limits))
-        for e in model.equations
-    )
+    lines = Markup("").join(Markup("<p>{}</p>").format(e) for e in equations_html(model))
     known = model.orders or model.coefficients
     return str(lines + parameter_table(model).to_html() if known else lines)

@@ -43,6 +43,18 @@ class Figure:
         )
 
 
+class Figures(tuple[Figure, ...]):
+    """Charts that belong together: a notebook shows them, :func:`print` names them."""
+
+    __slots__ = ()
+
+    def __str__(self) -> str:
+        return "\n".join(figure.title for figure in self)
+
+    def _repr_html_(self) -> str:
+        return "".join(figure._repr_html_() for figure in self)
+
+
 def svg(
     width: int, height: int, title: str, described: str, parts: Iterable[Markup], *, narrow: bool,
     attributes: str = "",

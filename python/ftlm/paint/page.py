@@ -37,6 +37,8 @@ class Section:
         See :class:`ftlm.report.Table` and :func:`ftlm.report.line_chart`.
     small
         Whether two figures stand side by side where there is room.
+    more
+        Further warnings, folded away below the first ones.
     """
 
     heading: str
@@ -45,10 +47,11 @@ class Section:
     tables: Sequence[Table] = ()
     figures: Sequence[Figure] = ()
     small: bool = False
+    more: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         # A text is a sequence of letters, too; nobody wants a paragraph for each.
-        for name in ("paragraphs", "warnings"):
+        for name in ("paragraphs", "warnings", "more"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, (getattr(self, name),))
 
@@ -68,8 +71,9 @@ def _script() -> tuple[Markup, str]:
 
 
 def write_page(
-    path: str | os.PathLike[str], *, title: str, sections: Sequence[Section], lead: str = "", force: bool = False
-) -> Path:
+    path: str | os.PathLike[str], *, title: str, sections: Sequence[Section], lead: str = "", force: bool = False,
+    verdict: str = "",
+) -> Path:  # fmt: skip
     """Write sections as one HTML file.
 
     Parameters
@@ -84,6 +88,8 @@ def write_page(
         What a hurried reader should know, below the title.
     force
         Overwrite an existing file.
+    verdict
+        What stands before everything else, escaped unless it is ``Markup``.
 
     Returns
     -------
@@ -98,7 +104,7 @@ def write_page(
     script, digest = _script()
     page = _template().render(
         title=title, lead=lead, sections=list(sections), version=__version__, chart_css=chart_css(), script=script,
-        script_hash=digest,
+        script_hash=digest, verdict=verdict,
     )  # fmt: skip
     # A name may hold half a surrogate pair, which no file can.
     return write_atomically(path, page.encode("utf-8", "backslashreplace"), force=force)

@@ -68,3 +68,13 @@ def unbounded(value: float, spec: str = ".3g") -> str:
 def shortened(text: str, most: int) -> str:
     """A text of at most so many letters, with an ellipsis for the rest."""
     return text if len(text) <= most else text[: most - 1] + "…"
+
+
+def with_error(value: float, error: float | None) -> str:
+    """Return a number with two digits of its standard error, and as many digits itself; five without one."""
+    if error is None or not math.isfinite(error) or error <= 0 or not math.isfinite(value):
+        return f"{value:.5g}"
+    decimals = 1 - math.floor(math.log10(error))
+    if abs(value) >= 1e6 or not 0 <= decimals <= 9:
+        return f"{value:.5g} ± {error:.2g}"
+    return f"{value:.{decimals}f} ± {error:.{decimals}f}"

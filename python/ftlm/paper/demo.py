@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from ftlm.base.output import check_folder
+from ftlm.base.progress import Course
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.fit.recursion import Trace
 from ftlm.identification.result import Identification
+from ftlm.identification.verdict import Validation
 from ftlm.judge.metrics import Metrics, finite
 from ftlm.paper.arm import STAGES, demo_run, truth_of
 from ftlm.paper.printed import INNOVATION_LENGTHS, OUTPUTS
@@ -23,6 +26,8 @@ from ftlm.paper.work import Preset, StageWork
 KEEP = 20
 #: Steps between two points of a convergence curve: 128 points are more than a page shows.
 TRACE_EVERY = 16
+#: Parts of a stage that tell their names: an order search for each p and for least squares, and the joint fit.
+PARTS_OF_A_STAGE = len(INNOVATION_LENGTHS) + 2
 #: Models that are saved, by the end of their file's name.
 SAVED = {"paper": f"p = {INNOVATION_LENGTHS[-1]}", "output-error": "output error"}
 
@@ -81,6 +86,11 @@ class Demo:
     traces: dict[str, dict[int, Trace]]
     derived: dict[int, Derived]
     files: list[Path]
+
+    @cached_property
+    def checked(self) -> dict[int, Validation]:
+        """The models of output error on the sine run, by stage."""
+        return {stage: results["output error"].validate(self.sine) for stage, results in self.results.items()}
 
     @property
     def truth(self) -> dict[int, dict[str, float]]:
@@ -173,9 +183,20 @@ def run_demo(
     for run in (square, sine):
         demo.files.append(folder / f"{run.name}.csv")
         run.to_csv(demo.files[-1], force=force)
+    course = Course(progress)
+    parts = len(STAGES) * PARTS_OF_A_STAGE
+    at = 0
+
+    def named(label: str) -> None:
+        nonlocal at
+        course.at(at / parts)
+        at += 1
+        work.progress = course.until(at / parts)
+        say(label)
+
     preset = Preset(Lattice(step=step), KEEP, TRACE_EVERY, alike=False)
     for stage in STAGES:
-        work = StageWork(stage, square, sine, preset, threads, say, progress)
+        work = StageWork(stage, square, sine, preset, threads, named, None)
         models = {"integer order": work.stepped("integer order", work.manual("integer order")), **work.searches()}
         words = "all orders and coefficients together by output error, from the current alone"
         models["output error"] = work.joint("output error", work.coupled, words)

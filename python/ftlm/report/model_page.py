@@ -11,7 +11,9 @@ from markupsafe import Markup
 from ftlm.base.output import check_free
 from ftlm.data.run import Run
 from ftlm.data.several import as_runs
+from ftlm.identification.first import title_of, verdict_box
 from ftlm.identification.page import first_sections, frequency_section, lead_of, residual_section, tests_on
+from ftlm.identification.verdict import saved_verdict
 from ftlm.judge.comparison import compare, initial_terms_table, lost_fits
 from ftlm.model.model import Model
 from ftlm.paint.page import Section, write_page
@@ -53,9 +55,9 @@ def model_page(
             words += ["it has the name of a run that the model was identified from"] * (run.name in known.runs)
         warnings += [f"validation run {run.name}: {w.removeprefix(run.name + ': ')}" for w in words]
     compared = [("validation", comparison) for comparison in validated]
-    sections = first_sections(model, warnings, compared, bool(others), None)
+    sections = first_sections(model, warnings, compared, bool(others), None, others)
     if tests := tests_on(model, others):
-        sections.append(residual_section(tests, None))
+        sections.append(residual_section(tests, None, compared, model.units))
     sections.append(frequency_section(model, [(r.step, r.duration) for r in others]))
     about: list[list[Cell]] = [["structure", model.structure.name], ["coupling in free runs", model.structure.coupling]]
     if known is not None:
@@ -64,4 +66,7 @@ def model_page(
         about += [[n.upper().replace("AICC", "AICc"), v] for n, v in known.information.items()]
     initial = [t for _, c in compared if (t := initial_terms_table(c)) is not None]
     sections.append(Section("Settings", tables=[Table("What the file says", ("setting", "value"), about), *initial]))
-    return write_page(path, title=model.structure.name, sections=sections, lead=lead_of(compared), force=force)
+    judged = saved_verdict(model, validated)
+    return write_page(
+        path, title=title_of(model), sections=sections, lead=lead_of(compared), force=force, verdict=verdict_box(judged)
+    )

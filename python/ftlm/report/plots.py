@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.errors import ModelError
+from ftlm.base.statistics import NORMAL_95
 from ftlm.data.run import Run
 from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.result import Identification
 from ftlm.judge.charts import pulse_times, with_unit
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.residuals import Residuals
-from ftlm.model.charts import bode_curves, response_frequencies
+from ftlm.model.charts import Answer, bode_curves, pole_points, response_frequencies
 from ftlm.model.model import Model
 from ftlm.paint.heat import Landscape
 from ftlm.paint.lines import LINES
@@ -51,6 +52,22 @@ def _figure(rows: int, columns: int = 1, *, row: float = ROW, **options: Any) ->
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
+def _axes(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any, Any]:
+    """The axes that were given, or those of a new figure: (figure, grid of rows by columns)."""
+    if ax is None:
+        return _figure(rows, columns, **options)
+    given = np.atleast_1d(np.asarray(ax, dtype=object)).ravel()
+    strange = [type(a).__name__ for a in given if not hasattr(a, "plot") or not hasattr(a, "figure")]
+    if strange:
+        raise ModelError(f"ax holds {strange[0]}, which is no matplotlib axes; give what subplots returns")
+    if given.size != rows * columns:
+        raise ModelError(
+            f"this picture has {rows * columns} axes ({rows} by {columns}), and ax has {given.size}; give as many, "
+            f"such as subplots({rows}, {columns})[1], or leave ax out"
+        )
+    return given[0].figure, given.reshape(rows, columns)
+
+
 def _plain(text: str) -> str:
     """Text that matplotlib does not take for mathematics, whatever a name holds."""
     return text.replace("$", r"\$")
@@ -60,7 +77,10 @@ def _unit(name: str, units: Mapping[str, str]) -> str:
     return _plain(with_unit(symbol(name), units, name))
 
 
-def fit(result: Identification | Model | Comparison, runs: Run | Sequence[Run] | None = None) -> Any:
+def fit(
+    result: Identification | Model | Comparison, runs: Run | Sequence[Run] | None = None, *, inputs: bool = False,
+    ax: Any = None,
+) -> Any:  # fmt: skip
     """Measured and simulated outputs, the residual beneath each.
 
     Parameters
@@ -69,16 +89,21 @@ def fit(result: Identification | Model | Comparison, runs: Run | Sequence[Run] |
         A comparison; an identification (on its own runs unless others are given); or a model, which needs runs.
     runs
         Runs to compare with.
+    inputs
+        Draw the inputs of each run below its outputs.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Two axes for every output of every run, in SI units.
+        Two axes for every output of every run, in SI units, and one for every input that was asked for.
 
     Raises
     ------
     ModelError
-        A model without runs, something that is no result, or no matplotlib.
+        A model without runs, inputs without runs, something that is no result, axes that are none or too many or
+        few, or no matplotlib.
     DataError
         Runs that do not fit the model.
     """
@@ -98,35 +123,99 @@ def fit(result: Identification | Model | Comparison, runs: Run | Sequence[Run] |
             comparison = result.comparison
         else:
             raise ModelError("a model alone has nothing to be compared with; give runs")
-    pairs = [(k, name) for k in range(len(comparison.per_run)) for name in comparison.output_error]
-    figure, axes = _figure(2 * len(pairs), row=ROW * 0.75, height_ratios=[1.0, BENEATH] * len(pairs))
-    for i, (k, name) in enumerate(pairs):
+    drawn: list[tuple[int, str, str]] = []
+    shown = _runs_of(result, runs) if inputs else []
+    for k in range(len(comparison.per_run)):
+        drawn += [(k, name, kind) for name in comparison.output_error for kind in ("fit", "residual")]
+        drawn += [(k, name, "input") for name in (shown[k].inputs if inputs else ())]
+    heights = [BENEATH if kind == "residual" else 1.0 if kind == "fit" else 0.7 for _, _, kind in drawn]
+    figure, axes = _axes(ax, len(drawn), row=ROW * 0.75, height_ratios=heights)
+    upper = None
+    for axis, (k, name, kind) in zip(axes[:, 0], drawn, strict=True):
+        if kind == "input":
+            _line_of(axis, shown[k], name)
+            continue
         run, _, figures = comparison.per_run[k]
         time = pulse_times(comparison, k)
         measured, simulated = comparison.measured[name][k], comparison.simulated[name][k]
-        upper, lower = axes[2 * i, 0], axes[2 * i + 1, 0]
-        upper.plot(time, measured, color=LINES[0][0], linewidth=2.2, label="measured")
-        upper.plot(time, simulated, color=LINES[1][0], linewidth=1.0, label=f"simulated, fit {figures[name].fit:.4g} %")
-        # A run that runs away would flatten what it is to be compared with.
-        height = float(np.ptp(measured)) or 1.0
-        low, high = float(np.min(measured)) - 0.5 * height, float(np.max(measured)) + 0.5 * height
-        upper.set(ylim=(low, high), ylabel=_unit(name, units))
-        upper.set_title(_plain(run), fontsize="medium", loc="left")
-        upper.legend(loc="upper right", fontsize="small", ncols=2)
-        upper.tick_params(labelbottom=False)
-        lower.sharex(upper)
-        lower.plot(time, measured - simulated, color=LINES[2][0], linewidth=0.7)
-        lower.set(ylabel="residual", xlabel="time [s]")
+        if kind == "fit":
+            upper = axis
+            label = f"simulated, fit {figures[name].fit:.4g} %"
+            axis.plot(time, measured, color=LINES[0][0], linewidth=2.2, label="measured")
+            axis.plot(time, simulated, color=LINES[1][0], linewidth=1.0, label=label)
+            # A run that runs away would flatten what it is to be compared with.
+            height = float(np.ptp(measured)) or 1.0
+            low, high = float(np.min(measured)) - 0.5 * height, float(np.max(measured)) + 0.5 * height
+            axis.set(ylim=(low, high), ylabel=_unit(name, units))
+            axis.set_title(_plain(run), fontsize="medium", loc="left")
+            axis.legend(loc="upper right", fontsize="small", ncols=2)
+            axis.tick_params(labelbottom=False)
+            continue
+        if ax is None:
+            axis.sharex(upper)
+        axis.plot(time, measured - simulated, color=LINES[2][0], linewidth=0.7)
+        axis.set(ylabel="residual", xlabel="time [s]")
     return figure
 
 
-def residuals(tests: Residuals | Identification) -> Any:
+def _runs_of(result: Identification | Model | Comparison, runs: Run | Sequence[Run] | None) -> list[Run]:
+    """The runs of a comparison, for their inputs."""
+    if runs is not None:
+        return [runs] if isinstance(runs, Run) else list(runs)
+    task = result.task if isinstance(result, Identification) else None
+    if task is None:
+        raise ModelError("inputs=True needs the runs; give them")
+    return list(task.runs)
+
+
+def _line_of(axis: Any, run: Run, name: str) -> None:
+    """One signal of a run: outputs as they were read, commands held between rows."""
+    held = run.intersample.get(name) == "zoh"
+    axis.plot(run.time, run[name], color=LINES[2 if name in run.inputs else 0][0], linewidth=1.0,
+              drawstyle="steps-post" if held else "default")  # fmt: skip
+    axis.set(ylabel=_unit(name, run.units), xlabel="time [s]")
+    axis.grid(visible=True, alpha=0.3)
+
+
+def run(run: Run, *, ax: Any = None) -> Any:
+    """A run as it was recorded: its outputs, and its inputs below them.
+
+    Parameters
+    ----------
+    run
+        The run.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        One axes for every signal, in SI units.
+
+    Raises
+    ------
+    ModelError
+        Something that is no run, axes that are none or too many or few, or no matplotlib.
+    """
+    if not isinstance(run, Run):
+        raise ModelError(f"run is {type(run).__name__}; give a run, such as ftlm.load returns")
+    names = [*run.outputs, *run.inputs]
+    figure, axes = _axes(ax, len(names), row=ROW * 0.6)
+    for axis, name in zip(axes[:, 0], names, strict=True):
+        _line_of(axis, run, name)
+    axes[0, 0].set_title(_plain(run.name), fontsize="medium", loc="left")
+    return figure
+
+
+def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
     """Correlations of the residuals with themselves and with every input, with their 99 % bands.
 
     Parameters
     ----------
     tests
         From :func:`ftlm.resid`, or an identification (on its own runs).
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
 
     Returns
     -------
@@ -145,7 +234,7 @@ def residuals(tests: Residuals | Identification) -> Any:
         raise ModelError(f"tests is {type(found).__name__}; give what resid returns, or an identification")
     drawn = {output: [("itself", part.whiteness), *part.inputs.items()] for output, part in found.outputs.items()}
     columns = max(map(len, drawn.values()))
-    figure, axes = _figure(len(drawn), columns)
+    figure, axes = _axes(ax, len(drawn), columns)
     for row, (output, correlations) in zip(axes, drawn.items(), strict=True):
         for axis, (name, test) in zip(row, correlations, strict=False):
             keep = test.lags != 0 if name == "itself" else np.ones(test.lags.size, dtype=bool)
@@ -161,7 +250,7 @@ def residuals(tests: Residuals | Identification) -> Any:
     return figure
 
 
-def landscape(result: Identification | Landscape, output: str | None = None) -> Any:
+def landscape(result: Identification | Landscape, output: str | None = None, *, ax: Any = None) -> Any:
     """Score of an order search, or cost of a joint fit, over two of its orders.
 
     Parameters
@@ -171,6 +260,8 @@ def landscape(result: Identification | Landscape, output: str | None = None) -> 
         ``ftlm.report.output_error_landscape``), which may be of any two orders.
     output
         Which search of an identification; by default its first.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
 
     Returns
     -------
@@ -196,7 +287,7 @@ def landscape(result: Identification | Landscape, output: str | None = None) -> 
         found = scores_of(result.task.runs, part, result.searches[name], result.task.lattice_of(part))
     if not isinstance(found, Landscape):
         raise ModelError(f"result is {type(found).__name__}; give an identification or a landscape")
-    figure, axes = _figure(1, row=3.2)
+    figure, axes = _axes(ax, 1, row=3.2)
     axis = axes[0, 0]
     scores = np.where(np.isfinite(found.scores) & (found.scores > 0), found.scores, np.nan)
     if np.all(np.isnan(scores)):
@@ -213,7 +304,7 @@ def landscape(result: Identification | Landscape, output: str | None = None) -> 
     return figure
 
 
-def bode(model: Model | Identification, w: ArrayLike | None = None) -> Any:
+def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any = None) -> Any:
     """Gain and phase of every output from every input, with 95 % bands where the model has a covariance.
 
     Parameters
@@ -222,6 +313,8 @@ def bode(model: Model | Identification, w: ArrayLike | None = None) -> Any:
         A model or an identification.
     w
         Frequencies [rad/s]; by default around the model's own.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
 
     Returns
     -------
@@ -240,7 +333,7 @@ def bode(model: Model | Identification, w: ArrayLike | None = None) -> Any:
         raise ModelError(f"model is {type(found).__name__}; give a model or an identification")
     omega = response_frequencies(found) if w is None else np.asarray(w, dtype=np.float64)
     curves = bode_curves(found, omega)
-    figure, axes = _figure(max(len(curves), 1), 2)
+    figure, axes = _axes(ax, max(len(curves), 1), 2)
     for i, curve in enumerate(curves):
         sides = ((curve.gain, curve.gain_spread, "gain [dB]"), (curve.phase, curve.phase_spread, "phase [degrees]"))
         for axis, (values, spread, label) in zip(axes[i], sides, strict=True):
@@ -250,4 +343,222 @@ def bode(model: Model | Identification, w: ArrayLike | None = None) -> Any:
             axis.set(ylabel=label, xlabel="frequency [rad/s]")
             axis.grid(visible=True, alpha=0.3)
             axis.set_title(_plain(f"{symbol(curve.output)} from {symbol(curve.input)}"), fontsize="small")
+    return figure
+
+
+def _model_of(model: Model | Identification) -> Model:
+    """The model that was meant; refuses what is none."""
+    found = model.model if isinstance(model, Identification) else model
+    if not isinstance(found, Model):
+        raise ModelError(f"model is {type(model).__name__}; give a model or an identification")
+    return found
+
+
+def poles(model: Model | Identification, *, ax: Any = None) -> Any:
+    """Poles in the plane of s^q with the sector in which they make a model grow; s itself for whole orders.
+
+    Parameters
+    ----------
+    model
+        A model or an identification.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ModelError
+        Something that is no model, one with friction or without poles, axes that are none, or no matplotlib.
+    """
+    found = _model_of(model)
+    q, points = pole_points(found)
+    if not points.size:
+        raise ModelError("this model has no poles to draw: it has friction, or it only integrates")
+    figure, axes = _axes(ax, 1, row=4.0)
+    axis = axes[0, 0]
+    reach = 1.18 * float(np.max(np.abs(points)))
+    angle = np.linspace(-q * np.pi / 2, q * np.pi / 2, 61)
+    corner = 4 * reach * np.concatenate([[0.0], np.exp(1j * angle)])
+    axis.fill(corner.real, corner.imag, color=LINES[1][0], alpha=0.16, linewidth=0, label="not stable")
+    axis.plot(points.real, points.imag, "x", color=LINES[2][0], markersize=8, markeredgewidth=2)
+    plane = "s" if q == 1 else f"s^{{{q:.4g}}}"
+    axis.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel=f"real part of ${plane}$", ylabel="imaginary part")
+    axis.set_aspect("equal")
+    axis.axhline(0, color=LINES[0][0], linewidth=0.6)
+    axis.axvline(0, color=LINES[0][0], linewidth=0.6)
+    axis.grid(visible=True, alpha=0.3)
+    axis.legend(loc="upper left", fontsize="small")
+    return figure
+
+
+def step(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
+    """Answer to unit steps from rest, with its 95 % band where the model has a covariance.
+
+    Parameters
+    ----------
+    model
+        A model or an identification.
+    time
+        Regular instants from 0 [s]; by default until the model has settled.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A row for every output, a column for every input.
+
+    Raises
+    ------
+    ModelError
+        Something that is no model, one whose input saturates or has a dead zone, axes that are none, no matplotlib.
+    DataError
+        Instants that are not regular from 0.
+    """
+    return _answered(_model_of(model).step(time), ax)
+
+
+def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax: Any = None) -> Any:
+    """Answer to unit impulses, as the mean over each interval; else as :func:`step`."""
+    return _answered(_model_of(model).impulse(time), ax)
+
+
+def _answered(found: Answer, ax: Any) -> Any:
+    figure, axes = _axes(ax, len(found.outputs), max(len(found.inputs), 1))
+    for i, output in enumerate(found.outputs):
+        for j, signal in enumerate(found.inputs):
+            axis, values = axes[i, j], found.values[i, j]
+            axis.plot(found.time, values, color=LINES[1][0], linewidth=1.2)
+            if found.deviation is not None:
+                half = NORMAL_95 * found.deviation[i, j]
+                axis.fill_between(found.time, values - half, values + half, color=LINES[1][0], alpha=0.25, linewidth=0)
+            axis.set(xlabel="time [s]", ylabel=_unit(output, found.units))
+            axis.set_title(_plain(f"{found.kind} of {symbol(signal)}"), fontsize="small")
+            axis.grid(visible=True, alpha=0.3)
+    return figure
+
+
+def correlation(result: Identification, *, ax: Any = None) -> Any:
+    """Correlations of the estimates of a joint fit, with their numbers.
+
+    Parameters
+    ----------
+    result
+        An identification by output error.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+
+    Raises
+    ------
+    ModelError
+        Something that is no identification, one without a joint covariance, axes that are none, or no matplotlib.
+    """
+    if not isinstance(result, Identification):
+        raise ModelError(f"result is {type(result).__name__}; give an identification")
+    if result.joint is None:
+        raise ModelError(f"method {result.method!r} gives no joint covariance; identify by method='output-error'")
+    names, values = result.joint.names, result.joint.correlation
+    figure, axes = _axes(ax, 1, row=4.0)
+    axis = axes[0, 0]
+    drawn = axis.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")
+    labels = [_plain(symbol(n)) for n in names]
+    axis.set_xticks(range(len(names)), labels)
+    axis.set_yticks(range(len(names)), labels)
+    for i, j in np.ndindex(values.shape):
+        if i != j:
+            ink = "white" if abs(values[i, j]) > 0.6 else "black"
+            axis.text(j, i, f"{values[i, j]:.2f}", ha="center", va="center", fontsize="x-small", color=ink)
+    figure.colorbar(drawn, ax=axis, label="correlation")
+    return figure
+
+
+def residual_series(result: Identification | Comparison, *, ax: Any = None) -> Any:
+    """Residuals of the free run over time, and how often each size occurs.
+
+    Parameters
+    ----------
+    result
+        An identification (on its own runs) or a comparison.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Over time on the left, how often on the right, a row for every output of every run.
+
+    Raises
+    ------
+    ModelError
+        Something that is no result, axes that are none or too many or few, or no matplotlib.
+    """
+    comparison = result.comparison if isinstance(result, Identification) else result
+    if not isinstance(comparison, Comparison):
+        raise ModelError(f"result is {type(result).__name__}; give an identification or a comparison")
+    units = result.model.units if isinstance(result, Identification) else {}
+    pairs = [(k, name) for k in range(len(comparison.per_run)) for name in comparison.output_error]
+    figure, axes = _axes(ax, len(pairs), 2, **({} if ax is not None else {"width_ratios": [2.0, 1.0]}))
+    for (left, right), (k, name) in zip(axes, pairs, strict=True):
+        missed = comparison.measured[name][k] - comparison.simulated[name][k]
+        there = missed[np.isfinite(missed)]
+        left.plot(pulse_times(comparison, k), missed, color=LINES[2][0], linewidth=0.7)
+        left.set(xlabel="time [s]", ylabel=_unit(name, units))
+        left.set_title(_plain(f"residual, {comparison.per_run[k][0]}"), fontsize="small", loc="left")
+        right.hist(there, bins=31, color=LINES[2][0], alpha=0.7)
+        right.set(xlabel=_unit(name, units), ylabel="samples")
+        right.locator_params(axis="x", nbins=3)
+    return figure
+
+
+def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
+    """Fits of the free runs of several models on the same runs, as bars.
+
+    Parameters
+    ----------
+    compared
+        Comparisons by the name of the model.
+    ax
+        Axes to draw into, as many as the figure would have; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A bar for every model and output.
+
+    Raises
+    ------
+    ModelError
+        No model, something that is no comparison, models with other outputs, axes that are none, or no matplotlib.
+    """
+    if not isinstance(compared, Mapping) or not compared:
+        raise ModelError("bars need at least one model; give comparisons by name, such as {'integer': a, 'free': b}")
+    for name, comparison in compared.items():
+        if not isinstance(comparison, Comparison):
+            raise ModelError(f"{name!r} is {type(comparison).__name__}; give a comparison, such as compare returns")
+    outputs = list(next(iter(compared.values())).output_error)
+    for name, comparison in compared.items():
+        if list(comparison.output_error) != outputs:
+            raise ModelError(
+                f"{name!r} has the outputs {', '.join(comparison.output_error)}, the first {', '.join(outputs)}"
+            )
+    figure, axes = _axes(ax, 1, row=max(ROW, 0.4 * len(compared) * len(outputs)))
+    axis, height = axes[0, 0], 0.8 / len(outputs)
+    for i, output in enumerate(outputs):
+        places = np.arange(len(compared)) + (i - (len(outputs) - 1) / 2) * height
+        fits = [c.output_error[output].fit for c in compared.values()]
+        bars = axis.barh(places, np.clip(np.nan_to_num(fits, nan=0.0), 0.0, 100.0), height, color=LINES[1 + i % 5][0],
+                         label=_plain(symbol(output)))  # fmt: skip
+        axis.bar_label(bars, [f"{v:.4g}" for v in fits], fontsize="small", padding=3)
+    axis.set_yticks(range(len(compared)), [_plain(n) for n in compared])
+    axis.invert_yaxis()
+    axis.set(xlabel="fit of the free run [%]", xlim=(0, 112))
+    if len(outputs) > 1:
+        axis.legend(loc="lower right", fontsize="small")
     return figure

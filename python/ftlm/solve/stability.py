@@ -71,7 +71,8 @@ class Stability:
         return f"{verdict} ({how})"
 
 
-def _characteristic(model: Solved, *, coupled: bool) -> list[Polynomial]:
+def characteristic(model: Solved, *, coupled: bool) -> list[Polynomial]:
+    """Characteristic sums of c s^p, one for each set of equations that act together."""
     return [
         determinant([row_of(e, names)[0] for e in model.equations if e.output in names])
         for names in systems(model, coupled=coupled)
@@ -91,7 +92,7 @@ def common_base(powers: Sequence[float]) -> float | None:
     return float(base) if base * 1000 >= 999 * SMALLEST_BASE else None
 
 
-def _roots(polynomial: Polynomial) -> tuple[float, Complex] | None:
+def roots_in_base(polynomial: Polynomial) -> tuple[float, Complex] | None:
     """Base q and the roots in s^q of a commensurate polynomial freed of its lowest power; None where there are none."""
     lowest, highest = min(polynomial), max(polynomial)
     base = common_base([p - lowest for p in polynomial])
@@ -131,8 +132,8 @@ def poles(model: Solved, *, coupling: str = "simulated") -> Complex:
         Orders without a common base, or a degree in it above 100.
     """
     every: list[complex] = []
-    for polynomial in _characteristic(model, coupled=is_coupled(coupling)):
-        roots = _roots(polynomial)
+    for polynomial in characteristic(model, coupled=is_coupled(coupling)):
+        roots = roots_in_base(polynomial)
         if roots is None:
             raise ModelError(
                 "the orders have no common base of 0.01 or more (or a degree above 100 in it), so the model has no "
@@ -177,8 +178,8 @@ def stability(model: Solved, *, coupling: str = "simulated") -> Stability:
     """
     coupled = is_coupled(coupling)
     unstable, on_axis, method, base = 0.0, False, "poles", None
-    for polynomial in _characteristic(model, coupled=coupled):
-        roots = _roots(polynomial)
+    for polynomial in characteristic(model, coupled=coupled):
+        roots = roots_in_base(polynomial)
         if roots is not None:
             base, values = roots
             margin = np.abs(np.angle(values)) - base * math.pi / 2
@@ -199,8 +200,11 @@ def stability(model: Solved, *, coupling: str = "simulated") -> Stability:
     return Stability(good, unstable, max(origin, 0.0), on_axis, method, base if method == "poles" else None)
 
 
-def right_zeros(polynomial: Polynomial) -> tuple[float, bool]:
-    """Number of zeros right of the imaginary axis by the argument principle, and whether one lies on the axis."""
+def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[float, bool]:
+    """Number of zeros right of the imaginary axis by the argument principle, and whether one lies on the axis.
+
+    Or, with another angle [rad], of those whose argument is smaller: on the surface of ln s it may exceed pi.
+    """
     lowest, highest = min(polynomial), max(polynomial)
     if highest - lowest < GRAIN:
         return 0.0, False
@@ -225,7 +229,7 @@ def right_zeros(polynomial: Polynomial) -> tuple[float, bool]:
         exponents = np.outer(powers, logs) + np.log(np.abs(values))[:, None]
         shift = exponents.max(axis=0)
         sizes = np.exp(exponents - shift)
-        turns = np.exp(1j * (powers * math.pi / 2 + np.where(values < 0, math.pi, 0.0)))
+        turns = np.exp(1j * (powers * angle + np.where(values < 0, math.pi, 0.0)))
         total = np.sum(sizes, axis=0)
         return np.asarray(turns @ sizes / total), total
 
@@ -242,7 +246,7 @@ def right_zeros(polynomial: Polynomial) -> tuple[float, bool]:
         points, _ = curve(log_omega)
     near = float(np.min(np.abs(points))) < ON_AXIS
     turned = float(np.sum(np.angle(points[1:] * np.conj(points[:-1]))))
-    count = (highest - lowest) / 2 - turned / math.pi
+    count = (highest - lowest) * angle / math.pi - turned / math.pi
     if near or abs(count - round(count)) > 0.1:
         return math.nan, True
     return float(max(round(count), 0)), False

@@ -1,0 +1,182 @@
+"""The first screen of a result: verdict, model, what it does, how well it fits, and what speaks against it."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import textwrap
+from collections.abc import Sequence
+from dataclasses import replace
+
+from ftlm.base.errors import FtlmError
+from ftlm.data.equations import Equation, numeric
+from ftlm.data.orders import Order
+from ftlm.identification.judged import Judged
+from ftlm.identification.verdict import verdict
+from ftlm.judge.comparison import Comparison, offsets_in_words
+from ftlm.judge.concerns import SHOWN, concerns, left_over
+from ftlm.model.model import Model
+from ftlm.model.typesetting import ORDER_DECIMALS, units_of
+from ftlm.paint.text import unbounded, with_error
+from ftlm.solve.modes import Mode, SteadyState, modes, steady_states
+
+#: Columns of a line in a terminal, and most modes that are listed.
+WIDTH = 110
+MOST_MODES = 6
+
+
+def summary(result: Judged, validation: Comparison | None = None) -> str:
+    """The first screen as text."""
+    judged = verdict(result, validation)
+    lines = [*wrapped(str(judged)), ""]
+    lines += equations_in_words(result.model, result.comparison)
+    lines += ["", *numbers_in_words(result), *behaviour_in_words(result.model), ""]
+    lines += [*fits_in_words(result, validation), *_residuals(result), *_starts(result)]
+    lines += concerns_in_words(result.warnings)
+    return "\n".join(lines)
+
+
+def wrapped(text: str, lead: str = "") -> list[str]:
+    """Lines no longer than a terminal, those after the first set in."""
+    return textwrap.wrap(text, WIDTH, initial_indent=lead, subsequent_indent=" " * (len(lead) or 2),
+                         break_long_words=False, break_on_hyphens=False)  # fmt: skip
+
+
+def equations_in_words(model: Model, comparison: Comparison | None = None) -> list[str]:
+    """Equations with delays, limits, friction, and offsets as they were estimated where there is one run."""
+    structure = model.structure
+    lines = []
+    for item in model.equations:
+        known = _offset(item.output, comparison)
+        tail = structure.offset_in_words if known is None else known
+        lines.append(numeric(_readable(item), structure.acting(".6g")) + tail)
+    return lines
+
+
+def _readable(item: Equation) -> Equation:
+    """The equation with orders of four decimals, and those within that of 0 at 0."""
+    new = copy.copy(item)
+    terms = tuple(replace(t, order=Order(round(t.order.constant, ORDER_DECIMALS) + 0.0)) for t in item.terms)
+    vars(new).update(order=Order(round(item.order.constant, ORDER_DECIMALS)), terms=terms)
+    return new
+
+
+def _offset(output: str, comparison: Comparison | None) -> str | None:
+    """The offset of one run as the last terms of an equation; None where there is none, or where runs differ."""
+    if comparison is None or len(comparison.offsets) != 1 or not comparison.offsets[0].get(output):
+        return None
+    parts = comparison.offsets[0][output]
+    written = [(parts["constant"], ""), *([(parts["ramp"], " t")] if "ramp" in parts else [])]
+    return "".join(f" {'-' if v < 0 else '+'} {abs(v):.4g}{what}" for v, what in written)
+
+
+def numbers_in_words(result: Judged) -> list[str]:
+    """Orders and coefficients with standard errors, units, and the values that a maker states."""
+    errors, units, stated = result.standard_errors, units_of(result.model), result.model.structure.reference
+    values = {**result.orders, **result.joint_values, **result.coefficients}
+    rows = []
+    for name, value in values.items():
+        spread = f"± {unbounded(errors[name])}" if name in errors else ""
+        tail = units.get(name, "")
+        if name in result.profiles:
+            tail = f"{tail}  [{result.profiles[name]}]".strip()
+        if name in stated:
+            tail = f"{tail}  (stated {stated[name]:.6g})".strip()
+        rows.append((name, f"{value:.6g}", spread, tail))
+    if not rows:
+        return []
+    widths = [max(len(row[k]) for row in rows) for k in range(3)]
+    lines = [
+        f"  {n:<{widths[0]}}  {v:>{widths[1]}} {s:<{widths[2]}}  {tail}".rstrip() for n, v, s, tail in rows
+    ]  # fmt: skip
+    note = "± is one standard error; 95 % intervals are ± 1.96 of these"
+    note += ", in brackets by profile likelihood" if result.profiles else ""
+    return [*lines, f"  ({note})"] if errors else lines
+
+
+def behaviour_in_words(model: Model) -> list[str]:
+    """Steady-state gain and modes, as far as the model has them."""
+    if model.structure.has_friction:
+        return ["  no poles, no gain: a body that may stick answers out of proportion"]
+    lines: list[str] = []
+    # Equations that cannot be solved for their outputs together have neither; everything else can be told.
+    with contextlib.suppress(FtlmError):
+        found = modes(model)
+        grows = any(mode.grows for mode in found)
+        word = "mode" if len(found) == 1 else "modes"
+        lines += [f"  {word if k == 0 else '':<7}{mode_in_words(mode)}" for k, mode in enumerate(found[:MOST_MODES])]
+        if len(found) > MOST_MODES:
+            lines.append(f"         and {len(found) - MOST_MODES} faster ones: .model.modes()")
+        if not (grows or model.structure.limits):
+            lines = [f"  {'gain':<7}{gain_in_words(s, model)}" for s in steady_states(model)] + lines
+    return lines
+
+
+def mode_in_words(mode: Mode) -> str:
+    """A mode with its pole."""
+    s = mode.pole
+    where = f"{s.real:.4g} ± {abs(s.imag):.4g}j" if mode.swings else f"{s.real:.4g}"
+    return f"{mode}; pole {where}"
+
+
+def gain_in_words(state: SteadyState, model: Model) -> str:
+    """A steady state, or how it runs on."""
+    pair = f"{state.output} from {state.input}"
+    above, below = (model.units.get(n, "") for n in (state.output, state.input))
+    unit = f" {above}/{below}" if above and below else ""
+    rate = with_error(state.rate, state.error)
+    if state.order > 0:
+        course = "per second" if state.order == 1 else f"t^{state.order:.4g}/Γ({state.order + 1:.4g})"
+        return f"{pair}: none, it integrates: {rate}{unit} {course}"
+    if state.order < 0:
+        return f"{pair}: 0, a step dies away"
+    return f"{pair}: {rate}{unit}"
+
+
+def fits_in_words(result: Judged, validation: Comparison | None) -> list[str]:
+    """Fit of the free run on estimation and on validation, and what the equation error says."""
+    width = max(len(o) for o in result.output_error) + 2
+    lines = [f"{'fit of the free run, %':<24}{'estimation':>12}{'validation':>12}{'RMSE':>12}"]
+    for output, own in result.output_error.items():
+        unit = result.model.units.get(output, "")
+        other = "not tried" if validation is None else f"{validation.output_error[output].fit:.4g}"
+        lines.append(
+            f"  {output:<{max(width, 22)}}{own.fit:>12.4g}{other:>12}{own.rmse:>12.4g}{f' {unit}' if unit else ''}"
+        )
+    return lines
+
+
+def _residuals(result: Judged) -> list[str]:
+    if result.residuals is None:
+        return ["residuals: the runs are too short for tests"]
+    white = ", ".join(f"{o} {'yes' if w else 'no'}" for o, w in result.residuals.white.items())
+    free = ", ".join(f"{o} {w}" for o, w in result.residuals.independence.items())
+    return [f"residuals white: {white}; independent of the inputs: {free} (99 %)"]
+
+
+def _starts(result: Judged) -> list[str]:
+    """Offsets that are no number of the equations above, and runs that start in motion."""
+    comparison = result.comparison
+    shown = {o for o in result.output_error if _offset(o, comparison) is not None}
+    hidden = any(o not in shown for run in comparison.offsets for o in run)
+    lines = offsets_in_words(comparison) if hidden else []
+    moving = [
+        f"{name} ({sum(map(len, terms.values()))})"
+        for (name, _, _), terms in zip(comparison.per_run, comparison.initial, strict=True)
+        if sum(map(len, terms.values())) and not comparison.offsets
+    ]
+    if moving:
+        lines += wrapped(f"in motion at its start, initial terms estimated with it: {', '.join(moving)}")
+    return lines
+
+
+def concerns_in_words(warnings: Sequence[str], how: str = "print(result.details())") -> list[str]:
+    """At most three groups of warnings, the most serious first, with what to do; and where the others are."""
+    found = concerns(warnings)
+    lines = []
+    for concern in found[:SHOWN]:
+        lines += wrapped(f"{concern.warnings[0]}{concern.count}", "! ")
+        if concern.remedy and concern.remedy not in concern.warnings[0]:
+            lines += wrapped(concern.remedy, "  -> ")
+    more = left_over(found)
+    return [*lines, f"  ({more}: {how})"] if more else lines

@@ -1,0 +1,291 @@
+"""Whether an identified model is to be trusted, with one reason, by rules that can be read here."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from markupsafe import Markup
+
+from ftlm.identification.judged import Judged
+from ftlm.judge.comparison import LOST, USELESS, Comparison
+from ftlm.judge.concerns import BAD, CARE, KINDS, Kind, concerns
+from ftlm.judge.residuals import NEGLIGIBLE
+from ftlm.model.model import Model
+from ftlm.paint.text import unbounded
+
+TRUST = "trust"
+NOT_TRIED = "no run that it was not fitted to has been tried"
+#: A coefficient that is known to no more than this share of itself, an order to no more than this: half of what its
+#: 95 % interval spans is then as large as itself, or as the steps of 0.5 in which mechanisms differ.
+VAGUE_SHARE, VAGUE_ORDER = 0.5, 0.25
+_KINDS = {kind.name: kind for kind in KINDS}
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether to trust a model.
+
+    Parameters
+    ----------
+    level
+        ``"trust"``, ``"with care"`` or ``"do not use"``.
+    reason
+        The most serious one, in a sentence.
+    remedy
+        What to do about it.
+    reasons
+        All that speaks against the model, most serious first; the first is ``reason``.
+    """
+
+    level: str
+    reason: str
+    remedy: str = ""
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def trusted(self) -> bool:
+        """Whether nothing speaks against the model."""
+        return self.level == TRUST
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self) | {"reasons": list(self.reasons)}
+
+    @property
+    def sentence(self) -> str:
+        """The reason, and what to do."""
+        return self.reason + (f"; {self.remedy}" if self.remedy else "")
+
+    def __str__(self) -> str:
+        return f"{self.level.upper()}: {self.sentence}"
+
+
+@dataclass(frozen=True)
+class Validation(Comparison):
+    """A comparison with runs that a model was not identified from, and what it makes of the model.
+
+    Parameters
+    ----------
+    output_error, equation_error, per_run, simulated, measured, step, m, initial, warnings, times, sampled, offsets
+        See :class:`ftlm.Comparison`.
+    verdict
+        Whether to trust the model after this.
+    """
+
+    verdict: Verdict | None = None
+
+    def __str__(self) -> str:
+        return f"{self.verdict}\n{super().__str__()}" if self.verdict is not None else super().__str__()
+
+    def _repr_html_(self) -> str:
+        lead = "" if self.verdict is None else str(verdict_html(self.verdict))
+        return lead + super()._repr_html_()
+
+
+def verdict_html(judged: Verdict) -> Markup:
+    """A verdict as a paragraph."""
+    return Markup("<p><strong>{}</strong>: {}.</p>").format(judged.level.capitalize(), judged.sentence)
+
+
+def validated(result: Judged, comparison: Comparison) -> Validation:
+    """A comparison of a result's model with other runs, with the verdict of both."""
+    own = {f.name: getattr(comparison, f.name) for f in fields(Comparison)}
+    return Validation(**own, verdict=verdict(result, comparison))
+
+
+@dataclass(frozen=True)
+class _Against:
+    level: str
+    reason: str
+    remedy: str
+
+
+def verdict(result: Judged, validation: Comparison | None = None) -> Verdict:
+    """Judge a result by what is known of it, by the rules that :meth:`ftlm.Identification.verdict` states.
+
+    Warnings of weight that no rule names count in the order of :data:`ftlm.judge.concerns.KINDS`.
+    """
+    against = _most_serious([*_rules(result, validation)])
+    if against is not None:
+        return against
+    fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
+    return Verdict(TRUST, f"it predicts runs it was not fitted to ({fits}), residuals are noise, every number is known")
+
+
+def _most_serious(found: Sequence[_Against]) -> Verdict | None:
+    """The verdict of what speaks against a model; None where nothing does."""
+    bad = [a for a in found if a.level == BAD] + [a for a in found if a.level == CARE]
+    if not bad:
+        return None
+    return Verdict(bad[0].level, bad[0].reason, bad[0].remedy, tuple(dict.fromkeys(a.reason for a in bad)))
+
+
+def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
+    """Judge a saved model by what its file knows of its identification, and by runs that it is compared with."""
+    known, found = model.estimate, [*_growing(model)]
+    for comparison in validation:
+        found += _useless("the validation run of ", comparison)
+    if known is None:
+        found.append(_Against(CARE, "its file says nothing of how it was identified", "compare it with measured runs"))
+    else:
+        unseen = [n for n, e in known.standard_errors.items() if e is None]
+        if unseen:
+            reason = f"the runs do not tell {_listed(unseen)} apart"
+            found.append(_Against(BAD, reason, _KINDS["unseen"].remedy))
+        before = {n: f for n, f in known.fit.items() if f is not None}
+        for comparison in validation:
+            found += _lost(before, comparison)
+        for concern in concerns(known.warnings):
+            if concern.kind.level in (BAD, CARE) and concern.kind.name not in ("unstable", "unseen"):
+                reason = f"{concern.kind.what}: {_first(concern.warnings[0])}"
+                found.append(_Against(concern.kind.level, reason, concern.kind.remedy))
+        if not known.standard_errors:
+            found.append(_Against(CARE, f"{known.method} gives no standard errors", "use method='output-error'"))
+        seen = all(name in known.runs for c in validation for name, _, _ in c.per_run)
+        if not validation or seen:
+            found.append(_Against(CARE, NOT_TRIED, "give a run that the model has not seen"))
+    against = _most_serious(found)
+    if against is not None:
+        return against
+    fits = ", ".join(f"{o} {f.fit:.3g} %" for c in validation for o, f in c.output_error.items())
+    return Verdict(TRUST, f"it predicts runs it was not fitted to ({fits}), and nothing spoke against its fit")
+
+
+def _rules(result: Judged, validation: Comparison | None) -> Iterator[_Against]:
+    """What speaks against a result, in the order of weight within a level."""
+    kinds = {c.kind.name: c for c in concerns(result.warnings)}
+
+    def of(kind: Kind, reason: str = "", remedy: str = "") -> _Against:
+        return _Against(kind.level, reason or kind.what, remedy or kind.remedy)
+
+    yield from _free_runs(result, validation, kinds.keys())
+    errors, joint = result.standard_errors, result.joint
+    unseen = [n for n, e in errors.items() if not math.isfinite(e)]
+    if unseen:
+        yield of(_KINDS["unseen"], f"the runs do not tell {_listed(unseen)} apart")
+    if "identity" in kinds:
+        yield of(_KINDS["identity"])
+    if validation is not None:
+        yield from _lost(result.fit_percent, validation)
+    yield from _residuals(result)
+    if joint is not None and not joint.converged:
+        kinds.pop("provisional", None)
+        yield of(_KINDS["provisional"], "the fit ended before it stood still")
+    vague = [_vague(result, n) for n in errors if n not in unseen and _is_vague(result, n)]
+    if vague:
+        yield of(_KINDS["vague"], f"the runs hardly tell {_listed(vague)}")
+    hidden = dict.fromkeys(o for run in result.comparison.offsets for o, values in run.items() if not values)
+    if hidden:
+        words = f"the offset of {_listed(list(hidden))} is not told apart from what a run did before its start"
+        yield of(_KINDS["history"], words)
+    # A test of whiteness that fails by rounding alone, or numbers that are vague and not very, are no reasons.
+    judged = ("residuals", "loop", "vague", "unseen", "identity", "useless", "lost", "unstable", "range")
+    for name, concern in kinds.items():
+        if name not in judged and concern.kind.level in (BAD, CARE):
+            yield of(concern.kind, f"{concern.kind.what}: {_first(concern.warnings[0])}")
+    if not errors:
+        yield _Against(
+            CARE, f"{result.method} gives no standard errors, so nothing says how sure its numbers are",
+            "use method='output-error'",
+        )  # fmt: skip
+    if validation is None or not _is_other(validation):
+        yield _Against(CARE, NOT_TRIED, "validate(run), or --validation FILE")
+
+
+def _free_runs(result: Judged, validation: Comparison | None, kinds: object) -> Iterator[_Against]:
+    """What free runs say: whether they stay, and what they explain."""
+    if not all(math.isfinite(f.nr) for f in result.output_error.values()):
+        yield _Against(BAD, _KINDS["range"].what, _KINDS["range"].remedy)
+    yield from _growing(result.model)
+    yield from _useless("", result.comparison)
+    if validation is not None:
+        yield from _useless("the validation run of ", validation)
+
+
+def _growing(model: Model) -> Iterator[_Against]:
+    """Poles with a positive real part; with friction no poles say what a body does."""
+    if model.structure.has_friction:
+        return
+    stable = model.stability(coupling=model.structure.coupling)
+    if stable.unstable_poles > 0:
+        count = int(stable.unstable_poles)
+        poles = f"{count} pole{'s' if count > 1 else ''} with a positive real part"
+        yield _Against(BAD, f"{_KINDS['unstable'].what} ({poles})", _KINDS["unstable"].remedy)
+
+
+def _useless(where: str, comparison: Comparison) -> Iterator[_Against]:
+    """Outputs that the free run explains by less than half."""
+    useless = [o for o, f in comparison.output_error.items() if not f.nr <= USELESS]
+    if useless:
+        shown = ", ".join(f"{o} (fit {comparison.output_error[o].fit:.3g} %)" for o in useless)
+        yield _Against(BAD, f"the free run explains little of {where}{shown}", _KINDS["useless"].remedy)
+
+
+def _lost(before: Mapping[str, float], validation: Comparison) -> Iterator[_Against]:
+    """Outputs whose fit on validation is far below that on estimation."""
+    for output, figures in validation.output_error.items():
+        if output in before and not figures.fit >= before[output] - LOST:
+            words = f"the fit of {output} falls from {before[output]:.3g} to {figures.fit:.3g} % on validation"
+            yield _Against(CARE, words, _KINDS["lost"].remedy)
+
+
+def _residuals(result: Judged) -> Iterator[_Against]:
+    """What residual tests say: a loop, an input that they follow, a colour."""
+    if result.residuals is None:
+        yield _Against(CARE, "the runs are too short for residual tests", "record a longer run")
+        return
+    looped = "reference" in result.settings
+    judged = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE}
+    # A model that is wrong leaves what a periodic input repeats, which looks like a loop: first what it lacks.
+    following = {o: [s for s, t in r.judged.items() if t.failed] for o, r in judged.items()}
+    if any(following.values()):
+        words = ", ".join(f"{o} still follow {_listed(signals)}" for o, signals in following.items() if signals)
+        yield _Against(CARE, f"residuals of {words}: it leaves something out", _KINDS["residuals"].remedy)
+    for output, tests in judged.items():
+        if tests.feedback and not tests.whiteness.passed and not looped:
+            words = f"{_listed(tests.feedback)} answers {output}, a closed loop, and what comes back biases the numbers"
+            yield _Against(CARE, words, _KINDS["loop"].remedy)
+    # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
+    coloured = [] if looped else [o for o, r in judged.items() if not r.whiteness.passed]
+    if coloured:
+        words = f"residuals of {_listed(coloured)} are not white: it leaves something out"
+        yield _Against(CARE, words, _KINDS["residuals"].remedy)
+
+
+def _is_vague(result: Judged, name: str) -> bool:
+    """Whether a number is hardly known, by its profile where there is one."""
+    error = result.standard_errors[name]
+    numbers = {**result.coefficients, **({} if result.joint is None else result.joint.coefficients)}
+    if name in result.orders:
+        return error > VAGUE_ORDER
+    if name not in numbers:
+        # A delay or a limit may well be 0.
+        return False
+    if name in result.profiles:
+        known = result.profiles[name]
+        return known.is_open or 0.0 in known
+    return error > VAGUE_SHARE * abs(numbers[name])
+
+
+def _vague(result: Judged, name: str) -> str:
+    values = {**result.orders, **result.coefficients, **result.joint_values}
+    return f"{name} = {values[name]:.3g} ± {unbounded(result.standard_errors[name], '.2g')}"
+
+
+def _is_other(validation: Comparison) -> bool:
+    """Whether a validation is one: no run of it is one that the model was fitted to."""
+    return not any(c.kind.name == "same" for c in concerns(validation.warnings))
+
+
+def _first(warning: str) -> str:
+    """The first clause of a warning."""
+    return warning.partition(";")[0].partition(" (")[0]
+
+
+def _listed(names: object) -> str:
+    words = list(names) if isinstance(names, (list, tuple)) else [str(names)]
+    shown = words if len(words) <= 3 else [*words[:3], f"{len(words) - 3} more"]
+    return " and ".join([", ".join(shown[:-1]), shown[-1]]) if len(shown) > 1 else shown[0]

@@ -1,0 +1,376 @@
+"""What a model does by itself and in the end: its modes and its steady state, with their uncertainty."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ftlm.base.arrays import Complex, Floats
+from ftlm.base.statistics import NORMAL_95
+from ftlm.data.solved import Solved, check_solved
+from ftlm.paint.text import with_error
+from ftlm.solve.frequency import (
+    GRAIN,
+    Polynomial,
+    check_unlimited,
+    is_coupled,
+    model_numbers,
+    response_inputs,
+    transfer_functions,
+    with_numbers,
+)
+from ftlm.solve.stability import characteristic, roots_in_base
+
+#: A zero this close to the negative axis [rad], or within its own uncertainty of it, relaxes: it swings no more there.
+NEAR_REAL = 0.02 * math.pi
+#: Zeros up to here are a relaxation where no pole is there at all: D^0.5 y = -a y has its own at arg s = 2 pi.
+SHEETS = 2.0 * math.pi
+#: Steps of approximate orders whose polynomials tell where zeros are to be sought.
+BASES = (0.25, 0.2, 0.1, 0.08, 0.05, 0.04, 0.03, 0.025, 0.02)
+LARGEST_SEED_DEGREE = 90
+#: Newton's steps, and the longest of them in ln s.
+NEWTON, LONGEST = 60, 0.5
+#: A zero is one where the terms cancel to this share of their sum; two closer than this in ln s are one.
+CANCELS, SAME = 1e-10, 1e-7
+#: Step of the numerical derivatives, as a share: powers are kept to nine decimals, which is a ten-thousandth of it.
+STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class Mode:
+    """One way in which a model moves by itself.
+
+    Parameters
+    ----------
+    pole
+        Where it is in the plane of s [rad/s]: the upper one of two that are conjugate. Of a relaxation -1/T.
+    frequency
+        Natural frequency abs(pole) [rad/s].
+    damping
+        Damping ratio -cos(arg pole): 1 for a relaxation, negative for what grows.
+    time_constant
+        1/abs(Re pole) of a swing, 1/abs(pole) of a relaxation [s].
+    swings
+        Whether it swings; what relaxes does so exponentially for whole orders, as a power of time for others.
+    frequency_error, damping_error, time_constant_error
+        Standard errors from the covariance of the model; None where it has none.
+    """
+
+    pole: complex
+    frequency: float
+    damping: float
+    time_constant: float
+    swings: bool
+    frequency_error: float | None = None
+    damping_error: float | None = None
+    time_constant_error: float | None = None
+
+    @property
+    def grows(self) -> bool:
+        """Whether it grows instead of dying away."""
+        return self.damping < 0
+
+    def __str__(self) -> str:
+        end = ", grows" if self.grows else ""
+        if not self.swings:
+            return f"time constant {with_error(self.time_constant, self.time_constant_error)} s{end}"
+        hertz = self.frequency / (2 * math.pi)
+        return (
+            f"{with_error(self.frequency, self.frequency_error)} rad/s ({hertz:.3g} Hz), damping "
+            f"{with_error(self.damping, self.damping_error)}{end}"
+        )
+
+
+def modes(model: Solved, *, coupling: str = "simulated") -> tuple[Mode, ...]:
+    """Modes of a model, slowest first: its poles, whatever its orders, as frequency, damping and time constant.
+
+    Parameters
+    ----------
+    model
+        The model.
+    coupling
+        See :func:`ftlm.frequency.frequency_response`.
+
+    Returns
+    -------
+    tuple of Mode
+        Of each pair of conjugate poles one; those at the origin are left out. Standard errors are to first order from
+        the covariance of the fit.
+
+    Raises
+    ------
+    ModelError
+        Another coupling, or friction, with which no poles say what a body does.
+
+    Notes
+    -----
+    Poles are the zeros of D(s), a sum of c s^p, with abs(arg s) < pi. Orders need no common base: Newton's method in
+    ln s starts from the roots of D with rounded orders. A zero on the negative axis, or as close to it as its
+    uncertainty tells, is a relaxation. A model of orders below 1 may have no pole at all, and relaxes as a power of
+    time: then the zeros up to arg s = 2 pi give its time constants, as (c_0/c_p)^(-1/p) does for D^p y = -c_0/c_p y.
+    """
+    check_solved(model)
+    coupled = is_coupled(coupling)
+    found: list[Mode] = []
+    for at, polynomial in enumerate(characteristic(model, coupled=coupled)):
+        sheet = zeros_of(polynomial) or _nearest(polynomial)
+        spreads = _spreads(model, at, np.array(sheet), coupled=coupled)
+        found += [_mode(w, spread) for w, spread in zip(sheet, spreads, strict=True)]
+    return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
+
+
+def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
+    """A zero in ln s with the standard deviations of its parts as a mode."""
+    size, angle = math.exp(w.real), w.imag
+    sure = NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1])
+    if angle >= math.pi - max(sure, SAME) or angle <= SAME:
+        sign = 1.0 if angle <= SAME else -1.0
+        error = None if spread is None else spread[0]
+        scaled = (None, None) if error is None else (size * error, error / size)
+        return Mode(complex(sign * size), size, -sign, 1.0 / size, False, scaled[0], None, scaled[1])
+    slow, damping = abs(size * math.cos(angle)), -math.cos(angle)
+    if abs(damping) <= SAME:
+        slow, damping = 0.0, 0.0
+    pole = size * complex(math.cos(angle), math.sin(angle))
+    constant = 1.0 / slow if slow > 0 else math.inf
+    if spread is None:
+        return Mode(pole, size, damping, constant, True)
+    radial, turn, share = spread
+    return Mode(pole, size, damping, constant, True, size * radial, abs(math.sin(angle)) * turn, constant * share)
+
+
+def _nearest(polynomial: Polynomial) -> list[complex]:
+    """Zeros beyond the negative axis up to two turns, or to the first one."""
+    powers = np.array(list(polynomial))
+    gap = float(np.min(np.diff(np.sort(powers)), initial=math.inf))
+    zeros = zeros_of(polynomial, max(SHEETS, math.pi / gap) + NEAR_REAL)
+    first = min((w.imag for w in zeros), default=0.0)
+    return [w for w in zeros if w.imag <= max(SHEETS, first) + NEAR_REAL]
+
+
+def zeros_of(polynomial: Polynomial, reach: float = math.pi + NEAR_REAL) -> list[complex]:
+    """Zeros of a sum of c s^p as ln s, slowest first, 0 <= Im <= reach; those at the origin are left out."""
+    powers = np.array(list(polynomial))
+    lowest, highest = float(powers.min()), float(powers.max())
+    if highest - lowest < GRAIN:
+        return []
+    exact = roots_in_base(polynomial)
+    if exact is not None:
+        base, roots = exact
+        w = np.log(np.abs(roots)) / base + 1j * np.abs(np.angle(roots)) / base
+        # A conjugate pair is one zero here, and so is each root on the positive axis or on the negative one.
+        kept = w[(np.angle(roots) >= -SAME) & (w.imag <= reach)]
+        if abs(base - 1) < GRAIN:
+            kept = kept[kept.imag <= math.pi + SAME]
+        return sorted(kept.tolist(), key=lambda z: (z.real, z.imag))
+    values = np.array(list(polynomial.values()))
+    found: list[complex] = []
+    seeds = [_balanced(powers, values, reach)]
+    for base in BASES:
+        if (highest - lowest) / base > LARGEST_SEED_DEGREE:
+            continue
+        seeds.append(_seeds(polynomial, base, reach))
+    for z in _descended(np.concatenate(seeds), powers, values):
+        if -SAME <= z.imag <= reach and all(abs(z - other) > SAME for other in found):
+            found.append(complex(z.real, max(z.imag, 0.0)))
+    return sorted(found, key=lambda z: (z.real, z.imag))
+
+
+def _seeds(polynomial: Polynomial, base: float, reach: float) -> Complex:
+    """Zeros of the same sum with orders rounded to a base, as ln s."""
+    rounded: Polynomial = {}
+    for power, value in polynomial.items():
+        near = round(round(power / base) * base, 9)
+        rounded[near] = rounded.get(near, 0.0) + value
+    found = roots_in_base({p: v for p, v in rounded.items() if v != 0.0}) if len(rounded) > 1 else None
+    if found is None or not found[1].size:
+        return np.empty(0, dtype=np.complex128)
+    step, roots = found
+    roots = roots[np.abs(roots) > 0]
+    w = np.log(np.abs(roots)) / step + 1j * np.abs(np.angle(roots)) / step
+    return np.asarray(w[w.imag <= 1.2 * reach], dtype=np.complex128)
+
+
+def _balanced(powers: Floats, values: Floats, reach: float) -> Complex:
+    """Where two terms alone cancel, as ln s: far out, where orders that are close part, nothing else does."""
+    out = []
+    for i, j in itertools.combinations(range(powers.size), 2):
+        apart = powers[j] - powers[i]
+        turn = np.angle(-values[i] / values[j] + 0j)
+        angles = (turn + 2 * math.pi * np.arange(-1, math.ceil(reach * abs(apart) / math.pi) + 1)) / apart
+        size = math.log(abs(values[i] / values[j])) / apart
+        out += [complex(size, a) for a in angles.tolist() if -SAME <= a <= reach]
+    return np.array(out, dtype=np.complex128)
+
+
+def _descended(w: Complex, powers: Floats, values: Floats) -> list[complex]:
+    """Where Newton's method leads from these seeds, of those that reach a zero."""
+    if not w.size:
+        return []
+    for _ in range(NEWTON):
+        terms, _ = _terms(w, powers, values)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            step = np.sum(terms, axis=0) / np.sum(powers[:, None] * terms, axis=0)
+        step = np.where(np.isfinite(step), step, 0.0)
+        w = w - step * np.minimum(1.0, LONGEST / np.maximum(np.abs(step), 1e-300))
+    terms, _ = _terms(w, powers, values)
+    good = np.abs(np.sum(terms, axis=0)) <= CANCELS * np.sum(np.abs(terms), axis=0)
+    return [complex(z) for z in w[good]]
+
+
+def _terms(w: Complex, powers: Floats, values: Floats) -> tuple[Complex, Floats]:
+    """Terms of the sum at each ln s, divided by the size of the largest, and the logarithm of that."""
+    exponents = np.outer(powers, w)
+    largest = np.max(exponents.real + np.log(np.abs(values))[:, None], axis=0)
+    return np.asarray(values[:, None] * np.exp(exponents - largest)), largest
+
+
+def _spreads(model: Solved, at: int, zeros: Complex, *, coupled: bool) -> Sequence[tuple[float, float, float] | None]:
+    """Standard deviations of Re and Im of ln s at each zero, and of ln abs(Re s): d ln s = -dD / (dD/d ln s)."""
+    covariance = None if model.estimate is None else model.estimate.covariance
+    if covariance is None or not zeros.size:
+        return [None] * zeros.size
+    matrix = np.asarray(covariance, dtype=np.float64)
+    values = model_numbers(model)
+    slopes = np.zeros((values.size, zeros.size), dtype=np.complex128)
+
+    def value(numbers: Floats) -> tuple[Complex, Complex]:
+        polynomial = characteristic(with_numbers(model, numbers), coupled=coupled)[at]
+        powers = np.array(list(polynomial))
+        terms, level = _terms(zeros, powers, np.array(list(polynomial.values())))
+        scale = np.exp(level)
+        return np.sum(terms, axis=0) * scale, np.sum(powers[:, None] * terms, axis=0) * scale
+
+    _, slope = value(values)
+    for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
+        step = STEP * max(abs(values[k]), 1e-3)
+        shift = step * np.eye(values.size)[k]
+        (above, _), (below, _) = value(values + shift), value(values - shift)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            slopes[k] = -(above - below) / (2 * step) / slope
+    with np.errstate(invalid="ignore"):
+        along = slopes.real - np.tan(zeros.imag) * slopes.imag
+        parts = (slopes.real, slopes.imag, along)
+        variances = [np.einsum("ik,ij,jk->k", part, matrix, part) for part in parts]
+        spreads = [np.sqrt(np.maximum(v, 0.0)).tolist() for v in variances]
+    return list(zip(*spreads, strict=True))
+
+
+@dataclass(frozen=True)
+class SteadyState:
+    """What an output does in the end under a unit step of an input.
+
+    Parameters
+    ----------
+    output, input
+        Names.
+    gain
+        Where the output comes to rest; 0 where it returns, infinite where it runs on.
+    error
+        Standard error of the rate; None without a covariance.
+    order
+        Order with which it runs on: 0 for none, 1 for an integrator, below 0 where it returns to 0.
+    rate
+        Coefficient of t^order/Gamma(order + 1) in the end; the gain where the order is 0.
+    """
+
+    output: str
+    input: str
+    gain: float
+    error: float | None
+    order: float
+    rate: float
+
+
+def steady_states(model: Solved) -> tuple[SteadyState, ...]:
+    """Steady state of every output under every input that reaches it, the equations together.
+
+    Raises
+    ------
+    ModelError
+        An input that saturates or has a dead zone, or friction.
+    """
+    check_solved(model)
+    check_unlimited(model, "a steady state")
+    pairs = _final(model)
+    covariance = None if model.estimate is None else model.estimate.covariance
+    errors: dict[tuple[str, str], float] = {}
+    if covariance is not None:
+        matrix, values = np.asarray(covariance, dtype=np.float64), model_numbers(model)
+        slopes = {pair: np.zeros(values.size) for pair in pairs}
+        for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
+            step = STEP * max(abs(values[k]), 1e-3)
+            shift = step * np.eye(values.size)[k]
+            above, below = (_final(with_numbers(model, values + side)) for side in (shift, -shift))
+            for pair, slope in slopes.items():
+                slope[k] = (above[pair][1] - below[pair][1]) / (2 * step)
+        errors = {pair: math.sqrt(max(float(v @ matrix @ v), 0.0)) for pair, v in slopes.items()}
+    out = []
+    for (output, signal), (order, rate) in pairs.items():
+        gain = rate if abs(order) < GRAIN else 0.0 if order < 0 else math.copysign(math.inf, rate)
+        out.append(SteadyState(output, signal, gain, errors.get((output, signal)), order, rate))
+    return tuple(out)
+
+
+def _final(model: Solved) -> dict[tuple[str, str], tuple[float, float]]:
+    """Order and coefficient of what is left of every response in the end."""
+    transfer = transfer_functions(model)
+    sensor = model.structure.sensor_filter
+    out = {}
+    for output in transfer.outputs:
+        below, lowest = transfer.denominator[output][-1]
+        for signal in transfer.inputs:
+            if not transfer.numerators[output, signal]:
+                continue
+            above, power = transfer.numerators[output, signal][-1]
+            order, rate = lowest - power, above / below
+            if sensor is not None and (output in sensor.signals) != (signal in sensor.signals):
+                (p, a), (q, b) = (min((o, c) for c, o in part) for part in (sensor.numerator, sensor.denominator))
+                side = 1 if output in sensor.signals else -1
+                order, rate = order + side * (q - p), rate * (a / b) ** side
+            out[output, signal] = (0.0 if abs(order) < GRAIN else order, rate)
+    return out
+
+
+def dcgain(model: Solved) -> Floats:
+    """Steady-state gain of every output from every input that is not modelled.
+
+    Parameters
+    ----------
+    model
+        The model; its equations act together.
+
+    Returns
+    -------
+    ndarray, shape (outputs, inputs)
+        In SI units of output over input: 0 where an input does not reach the output or its effect dies away, infinite
+        where it is integrated. Inputs are in the order of :func:`ftlm.frequency.transfer_functions`.
+
+    Raises
+    ------
+    ModelError
+        An input that saturates or has a dead zone, or friction.
+    """
+    states = steady_states(model)
+    inputs = response_inputs(model, coupled=True)
+    out = np.zeros((len(model.outputs), len(inputs)))
+    for state in states:
+        out[model.outputs.index(state.output), inputs.index(state.input)] = state.gain
+    return out
+
+
+def settling_time(model: Solved) -> float:
+    """Seconds in which a model shows what it does: some time constants of its slowest mode.
+
+    No more than fifty periods of the fastest swing, so that a picture of it shows a swing.
+    """
+    found = modes(model)
+    if not found:
+        return 10.0
+    slowest = max(min(m.time_constant, 20.0 * 2 * math.pi / m.frequency) for m in found)
+    swings = [2 * math.pi / m.frequency for m in found if m.swings]
+    return min(6.0 * slowest, 50.0 * min(swings)) if swings else 6.0 * slowest

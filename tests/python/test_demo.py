@@ -1,0 +1,32 @@
+"""The demonstration, as a newcomer meets it: one screen, and everything else behind -v."""
+
+import pytest
+
+from ftlm.paper.demo import run_demo
+from ftlm.paper.demo_page import demo_details, demo_page, demo_text
+
+
+@pytest.mark.slow
+def test_the_demo_is_one_screen_and_its_page_leads_with_the_verdicts(tmp_path):
+    told, named = [], []
+    demo = run_demo(
+        tmp_path, step=0.35, noise=1e-4, seed=1, threads=None, force=False, say=named.append,
+        progress=lambda *done: told.append(done),
+    )  # fmt: skip
+    lines = demo_text(demo).splitlines()
+    # With what is said beforehand, what was written and the prompt.
+    assert len(lines) + 4 <= 40
+    assert max(map(len, lines)) <= 120
+    assert sum(": TRUST: " in line for line in lines) == 2
+    assert not any(line.startswith("warning") for line in lines)
+    assert sum(line.startswith("! ") for line in lines) <= 3
+    # Nothing is lost behind it.
+    said = [w for results in demo.results.values() for r in results.values() for w in r.warnings]
+    assert all(w in demo_details(demo) for w in said)
+    page = demo_page(demo, tmp_path / "demo.html").read_text("utf-8")
+    assert page.index("Stage 1, output error: trust") < page.index("Stage 2, output error: trust")
+    assert page.index("Stage 2, output error: trust") < page.index("Which model predicts</h2>")
+    # One course over the whole, which never goes back.
+    shares = [done / total for done, total in told]
+    assert shares == sorted(shares)
+    assert len(named) == 13

@@ -1,0 +1,358 @@
+"""The verdict: its rules on records whose fault is known, and the first screen that leads with it."""
+
+import ast
+import json
+import math
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import ftlm
+from ftlm import cli
+from ftlm.fit import history
+from ftlm.fit.joint import fit_output_error
+from ftlm.identification.verdict import saved_verdict
+from ftlm.judge.concerns import KINDS, OTHER, SHOWN, concerns, kind_of
+from ftlm.report import model_page
+from loops import loop
+
+SOURCE = Path(ftlm.__file__).parent
+WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
+PLANT = "D^1.8 y = -0.6 D^0.8 y - 9 y + 4 u"
+T = np.arange(1501) * 0.02
+SQUARE, CHIRP = np.sign(np.sin(2 * np.pi * T / 5 + 1e-9)), np.sin(0.15 * T**1.6)
+
+
+def record(volts, words=PLANT, seed=1, noise=0.01, name="square"):
+    empty = ftlm.Run.from_arrays(step=0.02, inputs={"u": volts}, outputs={"y": 0 * T}, name=name)
+    y = ftlm.Model(ftlm.equation(words)).simulate(empty)["y"]
+    y = y + noise * np.std(y) * np.random.default_rng(seed).standard_normal(T.size)
+    return ftlm.Run.from_arrays(step=0.02, inputs={"u": volts}, outputs={"y": y}, units={"u": "V", "y": "m"}, name=name)
+
+
+@pytest.fixture(scope="module")
+def run():
+    return record(SQUARE)
+
+
+@pytest.fixture(scope="module")
+def other():
+    return record(CHIRP, seed=2, name="chirp")
+
+
+@pytest.fixture(scope="module")
+def found(run):
+    return ftlm.identify(run, ftlm.equation(WORDS))
+
+
+@pytest.fixture(scope="module")
+def checked(found, other):
+    return found.validate(other)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Records whose fault is known
+
+
+def test_a_clean_record_that_predicts_another_one_is_trusted(found, checked):
+    judged = found.verdict(checked)
+    assert (judged.level, judged.reasons, judged.trusted) == ("trust", (), True)
+    assert judged.reason.startswith("it predicts runs it was not fitted to (y 99")
+    assert checked.verdict == judged
+    assert str(checked).startswith("TRUST: ")
+
+
+def test_without_a_validation_nothing_is_trusted(found, run):
+    assert found.verdict().level == "with care"
+    assert found.verdict().reasons == ("no run that it was not fitted to has been tried",)
+    # Its own run validates nothing.
+    assert found.verdict(found.validate(run)).reason == "no run that it was not fitted to has been tried"
+
+
+def test_a_missing_mode_is_with_care(other):
+    words = "D^3 y = -6 D^2 y - 14 D y - 36 y + 24 u"
+    poor = ftlm.identify(record(SQUARE, words), ftlm.equation("D^2 y = a1 D y + a0 y + b0 u"))
+    judged = poor.verdict(poor.validate(record(CHIRP, words, seed=3)))
+    assert judged.level == "with care"
+    assert judged.reason.startswith("residuals of y")
+    assert "leaves something out" in judged.reason
+    assert "a delay" in judged.remedy
+
+
+def test_a_model_that_explains_nothing_is_not_to_be_used():
+    poor = ftlm.identify(record(SQUARE, "D^2 y = -0.2 D y - 900 y + u", noise=1.5), ftlm.equation("D y = b u"))
+    assert poor.verdict().level == "do not use"
+    assert "explains little of y (fit" in poor.verdict().reason
+
+
+def test_a_closed_loop_is_named():
+    poor = ftlm.identify(loop("closed, coloured, biased", 0), ftlm.equation("D^alpha y = a y + b u"))
+    judged = poor.verdict()
+    assert judged.level == "with care"
+    assert judged.reason == "u answers y, a closed loop, and what comes back biases the numbers"
+    assert "reference=" in judged.remedy
+
+
+def test_a_free_run_that_grows_is_not_to_be_used():
+    time = np.arange(400) * 0.02
+    volts = np.sign(np.sin(2 * time))
+    empty = ftlm.Run.from_arrays(step=0.02, inputs={"u": volts}, outputs={"y": 0 * time})
+    y = ftlm.Model(ftlm.equation("D y = 0.3 y + u")).simulate(empty)["y"]
+    y = y + 0.01 * np.random.default_rng(1).standard_normal(y.size)
+    grown = ftlm.Run.from_arrays(step=0.02, inputs={"u": volts}, outputs={"y": y})
+    judged = ftlm.identify(grown, ftlm.equation("D y = a y + b u")).verdict()
+    assert judged.level == "do not use"
+    assert judged.reason == "the free run grows without bound (1 pole with a positive real part)"
+
+
+def test_numbers_that_no_run_tells_apart_are_not_to_be_used(run, monkeypatch):
+    # From a given start: an automatic one finds nothing to invert.
+    start = {"a1": -0.6, "a0": -9.0, "b0": 2.0, "b1": 2.0}
+    monkeypatch.setattr(history, "fit_output_error", partial(fit_output_error, start=start))
+    twice = ftlm.Run.from_arrays(step=0.02, inputs={"u": run["u"], "v": run["u"]}, outputs={"y": run["y"]})
+    judged = ftlm.identify(twice, ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u + b1 v")).verdict()
+    assert judged.level == "do not use"
+    assert judged.reason == "the runs do not tell b0 and b1 apart"
+    assert "richer input" in judged.remedy
+
+
+def test_a_method_without_errors_says_nothing_of_its_numbers(run, other):
+    plain = ftlm.identify(run, ftlm.equation("D^1.8 y = a1 D^0.8 y + a0 y + b0 u"), method="multi-innovation")
+    assert not plain.standard_errors
+    reasons = plain.verdict(plain.validate(other)).reasons
+    assert "multi-innovation gives no standard errors, so nothing says how sure its numbers are" in reasons
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Each rule by itself: one diagnostic of the clean result is made worse
+
+
+def worse(found, **parts):
+    return replace(found, **parts)
+
+
+def test_each_rule_finds_its_own_fault(found, checked):
+    def fit(comparison, percent):
+        bad = replace(comparison.output_error["y"], fit=percent, nr=1 - percent / 100)
+        return replace(comparison, output_error={"y": bad})
+
+    lost = found.verdict(fit(checked, 70.0))
+    assert lost.reason == f"the fit of y falls from {found.fit_percent['y']:.3g} to 70 % on validation"
+    assert lost.level == "with care"
+    gone = found.verdict(fit(checked, 40.0))
+    assert (gone.level, gone.reason) == (
+        "do not use", "the free run explains little of the validation run of y (fit 40 %)"
+    )  # fmt: skip
+    never = worse(found, comparison=replace(found.comparison, output_error={
+        "y": replace(found.output_error["y"], nr=math.inf)
+    })).verdict(checked)  # fmt: skip
+    assert (never.level, never.reason) == ("do not use", "the free run leaves the range of numbers")
+    stuck = worse(found, joint=replace(found.joint, converged=False)).verdict(checked)
+    assert (stuck.level, stuck.reason) == ("with care", "the fit ended before it stood still")
+    short = worse(found, residuals=None).verdict(checked)
+    assert short.reason == "the runs are too short for residual tests"
+
+
+def test_a_number_is_vague_by_its_own_size(found, checked):
+    names, spread = found.joint.names, found.joint.covariance.copy()
+    a1, alpha = names.index("a1"), names.index("alpha")
+    # Half of a1 is the limit: 0.3 of 0.6.
+    for share, vague in ((0.4, False), (0.6, True)):
+        spread[a1, a1] = (share * found.coefficients["a1"]) ** 2
+        judged = worse(found, joint=replace(found.joint, covariance=spread, profiles={})).verdict(checked)
+        assert judged.trusted != vague
+        assert not vague or judged.reason.startswith("the runs hardly tell a1 = -0.6")
+    spread[a1, a1], spread[alpha, alpha] = 0.0, 0.3**2
+    judged = worse(found, joint=replace(found.joint, covariance=spread, profiles={})).verdict(checked)
+    assert judged.reason == f"the runs hardly tell alpha = {found.orders['alpha']:.3g} ± 0.3"
+
+
+def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checked):
+    tests = found.residuals.outputs["y"]
+    red = replace(tests, whiteness=replace(tests.whiteness, passed=False))
+    for nr, trusted in ((0.01, False), (0.0009, True)):
+        part = replace(found.residuals, outputs={"y": replace(red, nr=nr)})
+        assert worse(found, residuals=part).verdict(checked).trusted == trusted
+    part = replace(found.residuals, outputs={"y": replace(tests, inputs={
+        "u": replace(tests.inputs["u"], passed=False, decided=True)
+    })})  # fmt: skip
+    assert worse(found, residuals=part).verdict(checked).reason == (
+        "residuals of y still follow u: it leaves something out"
+    )
+
+
+def test_a_hidden_offset_is_named(found, checked):
+    hidden = worse(found, comparison=replace(found.comparison, offsets=({"y": {}},)))
+    judged = hidden.verdict(checked)
+    assert judged.level == "with care"
+    assert judged.reason == "the offset of y is not told apart from what a run did before its start"
+    assert "offset in the equation of y in square: not told apart" in str(hidden)
+
+
+def test_a_run_in_motion_says_so(found):
+    moving = worse(found, comparison=replace(found.comparison, initial=[{"y": {0.0: 1.0, 1.0: 2.0}}]))
+    assert "in motion at its start, initial terms estimated with it: square (2)" in str(moving)
+    assert "in motion" not in str(found)
+
+
+def test_what_may_not_be_used_comes_before_what_needs_care(found):
+    poor = worse(found, joint=replace(found.joint, converged=False), comparison=replace(
+        found.comparison, output_error={"y": replace(found.output_error["y"], nr=0.8, fit=20.0)}
+    ))  # fmt: skip
+    judged = poor.verdict()
+    assert judged.level == "do not use"
+    assert len(judged.reasons) == 3
+    assert judged.reasons[0] == judged.reason
+    assert "no run" in judged.reasons[-1]
+
+
+@pytest.mark.parametrize("bad", [3, "chirp", [], {}])
+def test_what_is_no_validation_is_refused(found, bad):
+    for ask in (found.verdict, found.summary):
+        with pytest.raises(ftlm.errors.ModelError, match=r"give what validate\(run\) returns"):
+            ask(bad)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Warnings in groups
+
+
+def test_every_mark_stands_in_a_sentence_of_the_program():
+    strings = ""
+    for path in sorted(SOURCE.rglob("*.py")):
+        if path.name == "concerns.py":
+            continue
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.JoinedStr):
+                strings += "".join(p.value if isinstance(p, ast.Constant) else "{}" for p in node.values) + "\n"
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                strings += node.value + "\n"
+    assert [mark for kind in KINDS for mark in kind.marks if mark not in strings] == []
+
+
+def test_warnings_are_grouped_the_most_serious_first():
+    said = [
+        "theta11: residuals are not white (Ljung-Box 3): the model leaves something out",
+        "order alpha = 1.6 is on the edge of its interval; widen it",
+        "theta11: residuals still follow I1 (correlation 0.3)",
+        "the model is not stable: 1 pole: its free run grows without bound, however well it fits",
+        "time read in ms, as the header 'time [ms]' says",
+    ]
+    found = concerns([*said, said[0]])
+    assert [c.kind.name for c in found] == ["unstable", "residuals", "edge", "other"]
+    assert found[1].warnings == (said[0], said[2])
+    assert found[1].count == " (and 1 more alike)"
+    assert kind_of("anything") is OTHER
+    assert sum(len(c.warnings) for c in found) == len(said)
+    assert concerns([]) == ()
+    # What is of no kind stands alone.
+    assert [c.warnings for c in concerns(["this", "that"])] == [("this",), ("that",)]
+
+
+def test_the_first_screen_has_three_groups_and_says_where_the_rest_is(found):
+    many = (
+        *(f"the prior (K0 = {k}) pulls" for k in range(3)),
+        "order x = 1 is on its bound; widen it", "coefficient law: a", "y is quantised in steps", "y: a closed loop",
+    )  # fmt: skip
+    poor = worse(found, warnings=many)
+    text = str(poor)
+    assert sum(line.startswith("! ") for line in text.splitlines()) == SHOWN == 3
+    assert "! y: a closed loop" in text
+    assert "(4 more warnings: print(result.details()))" in text
+    assert all(f"warning: {w}" in poor.details() for w in many)
+    assert poor.warnings == many
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The first screen
+
+
+def test_the_first_screen_has_verdict_model_behaviour_and_both_fits(found, checked):
+    text = found.summary(checked)
+    lines = text.splitlines()
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 120
+    assert lines[0].startswith("TRUST: ")
+    assert lines[2].startswith(f"D^{found.orders['alpha']:.4f} y = ")
+    for word in ("gain   y from u: 0.44", "m/V", "mode ", "damping 0.26", "pole -0.9", "estimation", "validation",
+                 f"s^{-round(found.orders['alpha'], 4):g} m/V"):  # fmt: skip
+        assert word in text, word
+    assert "not tried" in str(found)
+    assert str(found) == found.summary()
+
+
+def test_delay_offset_and_friction_stand_in_the_equation():
+    time = np.arange(1201) * 0.01
+    volts = np.sign(np.sin(2 * time))
+    late = np.sign(np.sin(2 * np.maximum(time - 0.1, 0)))
+    empty = ftlm.Run.from_arrays(step=0.01, inputs={"u": late}, outputs={"y": 0 * time})
+    y = ftlm.Model(ftlm.equation("D y = -2 y + 3 u")).simulate(empty)["y"]
+    y = y + 0.2 + 0.01 * np.random.default_rng(1).standard_normal(y.size)
+    run = ftlm.Run.from_arrays(step=0.01, inputs={"u": volts}, outputs={"y": y}, units={"u": "V", "y": "rad"})
+    structure = ftlm.equation("D y = a y + b u + c").with_delays({"u": (0.0, 0.3)})
+    found = ftlm.identify(run, structure)
+    (equation,) = [line for line in str(found).splitlines() if line.startswith("D^1 y = ")]
+    assert "u(t - 0.0" in equation or "u(t - 0.1" in equation
+    # The offset of this run, as a number: 0.2 rad times 2 a second.
+    assert float(equation.rpartition("+ ")[2]) == pytest.approx(0.4, abs=0.05)
+    assert "delay_u" in str(found)
+    rubs = ftlm.Model(ftlm.equation("D^2 y = -3 D y + 6 u - 0.5*sign(D y)"))
+    assert "- 0.5 sign(D y)" in str(rubs)
+
+
+def test_json_and_page_say_the_same(found, checked, other, tmp_path):
+    document = json.loads(json.dumps(found.verdict(checked).to_dict()))
+    assert document["level"] == "trust"
+    html = found._repr_html_()
+    assert "<strong>With care</strong>: no run that it was not fitted to has been tried" in html
+    assert html.index("With care") < html.index("<math>")
+    assert "<strong>Trust</strong>" in checked._repr_html_()
+    page = found.report(tmp_path / "r.html", validation=other).read_text("utf-8")
+    assert page.index("Trust") < page.index("<math>") < page.index("Residuals</h2>")
+
+
+def test_a_saved_model_is_judged_by_what_its_file_knows(found, other, run, tmp_path):
+    saved = ftlm.load_model(found.model.save(tmp_path / "m.json"))
+    assert saved_verdict(saved, [saved.compare(other)]).level == "trust"
+    for seen in ([], [saved.compare(run)]):
+        assert saved_verdict(saved, seen).reason == "no run that it was not fitted to has been tried"
+    page = model_page(saved, tmp_path / "m.html", validation=other).read_text("utf-8")
+    assert page.index("Trust") < page.index("<math>")
+    bare = replace(saved, estimate=None)
+    assert saved_verdict(bare, []).reason == "its file says nothing of how it was identified"
+    estimate = replace_estimate(saved, standard_errors={**saved.estimate.standard_errors, "b0": None})
+    judged = saved_verdict(estimate, [])
+    assert (judged.level, judged.reason) == ("do not use", "the runs do not tell b0 apart")
+    warned = replace_estimate(saved, warnings=("order alpha = 2 is on its bound; widen it",))
+    assert saved_verdict(warned, [saved.compare(other)]).reason == (
+        "an order or a number is on its bound: order alpha = 2 is on its bound"
+    )
+    better = replace_estimate(saved, fit={"y": 130.0})
+    assert "falls from 130 to" in saved_verdict(better, [saved.compare(other)]).reason
+    grown = ftlm.Model(ftlm.equation("D y = 0.3 y + u"))
+    assert saved_verdict(grown, []).level == "do not use"
+
+
+def replace_estimate(model, **changes):
+    return replace(model, estimate=msgspec.structs.replace(model.estimate, **changes))
+
+
+def test_the_command_line_has_verdict_validation_and_more(run, other, tmp_path):
+    run.to_csv(tmp_path / "run.csv")
+    other.to_csv(tmp_path / "other.csv")
+    words = ["identify", str(tmp_path / "run.csv"), "--structure", "D^1.8 y = a1 D^0.8 y + a0 y + b0 u"]
+    alone = CliRunner().invoke(cli.app, words)
+    assert alone.exit_code == 0, alone.output
+    assert alone.output.startswith("WITH CARE: no run that it was not fitted to has been tried")
+    assert len(alone.output.splitlines()) < 24
+    both = CliRunner().invoke(cli.app, [*words, "--validation", str(tmp_path / "other.csv"), "-v"])
+    assert both.output.startswith("TRUST: it predicts runs it was not fitted to (y ")
+    assert "equation error" in both.output
+    assert "validation on chirp" in both.output
+    document = json.loads(CliRunner().invoke(cli.app, [*words, "--json"]).output)
+    assert document["verdict"]["level"] == "with care"
