@@ -1,6 +1,7 @@
 """The paper's section 5 recomputed: what it consists of, and the numbers its verdicts rest on."""
 
-from ftlm.paper.claims import Claim, implied_spreads, printed_saturation, table_3_coefficients
+from ftlm.paper.claims import Claim, printed_saturation, table_3_coefficients
+from ftlm.paper.printed import implied_spreads
 from ftlm.paper.records import Candidate, Rival, Stage
 from ftlm.paper.reproduction import Reproduction, reproduce
 from ftlm.paper.unseen import Deflection, UnseenOrders, Verdict, orders_on_unseen_runs

@@ -37,6 +37,10 @@ class Section:
         See :class:`ftlm.report.Table` and :func:`ftlm.report.line_chart`.
     small
         Whether two figures stand side by side where there is room.
+    fold
+        What is written on the fold behind which the rest stands; on paper it is open.
+    folded_paragraphs, folded
+        Text and tables behind it.
     """
 
     heading: str
@@ -45,10 +49,13 @@ class Section:
     tables: Sequence[Table] = ()
     figures: Sequence[Figure] = ()
     small: bool = False
+    fold: str = "Numbers"
+    folded_paragraphs: Sequence[str] = ()
+    folded: Sequence[Table] = ()
 
     def __post_init__(self) -> None:
         # A text is a sequence of letters, too; nobody wants a paragraph for each.
-        for name in ("paragraphs", "warnings"):
+        for name in ("paragraphs", "warnings", "folded_paragraphs"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, (getattr(self, name),))
 
