@@ -11,14 +11,14 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.arm.link import flexible_link, link_model
-from ftlm.arm.parameters import INTEGER_ORDERS
+from ftlm.arm.parameters import whole_order
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.fit.genetic import Genetic
 from ftlm.fit.recursion import Trace, multi_innovation_trace
 from ftlm.identification.identify import identify
 from ftlm.identification.result import Identification
-from ftlm.judge.comparison import compare_means
+from ftlm.judge.comparison import Comparison, compare_means
 from ftlm.judge.metrics import finite, metrics
 from ftlm.paper import printed
 from ftlm.paper.arm import ARMS, StageNumber, demo_run
@@ -163,11 +163,6 @@ class Panel:
         return {name: [item.to_dict() for item in items] for name, items in parts}
 
 
-def whole_order(name: str) -> float:
-    """The maker's order of an order's name."""
-    return INTEGER_ORDERS.get(name.rstrip("0123456789"), 2.0)
-
-
 def arrived_at(trace: Trace, end: float) -> float:
     """First step from which an error stays within a share of another one's end; infinite for never."""
     with np.errstate(invalid="ignore"):
@@ -227,10 +222,8 @@ def contest(made: LikeForLike, output: str, arm: str, step: float) -> Contest:
     return Contest(arm, output, made.candidates, step, lattice, made.genetic.errors, made.evolution.errors)
 
 
-def freed_of(
-    stage: StageNumber, square: Run, arm: str, threads: int | None, free: Identification | None = None
-) -> Freed:  # fmt: skip
-    """Whole and free orders of one stage, on one of so many rows; of the free ones a fit may be there already.
+def freed_of(stage: StageNumber, square: Run, arm: str, threads: int | None) -> Freed:
+    """Whole and free orders of one stage, on one of so many rows.
 
     Raises
     ------
@@ -241,14 +234,15 @@ def freed_of(
     own = square.select(list(structure.signals))
     run = thinned(own, EVERY)
     whole = structure.with_orders({n: whole_order(n) for n in structure.order_names})
-    fits = {"whole": identify(run, whole, threads=threads), "free": free or identify(run, structure, threads=threads)}
+    fits = [identify(run, item, threads=threads) for item in (whole, structure)]
     m = default_m([own], power_of_two=True)
-    nr = {
-        label: {o: f.nr for o, f in compare_means(replace(fit.model, m=m), own).output_error.items()}
-        for label, fit in fits.items()
-    }
-    orders = {n: (v, *fits["free"].intervals[n]) for n, v in fits["free"].orders.items()}
-    return Freed(arm, stage, nr["whole"], nr["free"], orders)
+    coarse, fine = (compare_means(replace(fit.model, m=m), own) for fit in fits)
+    return _freed(arm, stage, coarse, fine, fits[1])
+
+
+def _freed(arm: str, stage: int, whole: Comparison, free: Comparison, fit: Identification) -> Freed:
+    nr, free_nr = ({o: f.nr for o, f in c.output_error.items()} for c in (whole, free))
+    return Freed(arm, stage, nr, free_nr, {n: (v, *fit.intervals[n]) for n, v in fit.orders.items()})
 
 
 def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads: int | None) -> Panel:
@@ -268,9 +262,9 @@ def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads:
                     rival.evolution_run.errors,
                 )
             )  # fmt: skip
-        result = stage.candidates["output error"].result
-        if result is not None and result.joint is not None:
-            freed.append(freed_of(stage.number, square, arm, threads, result))
+        whole, free = (stage.candidates[n] for n in ("integer, identified", "output error"))
+        if free.result is not None and free.result.joint is not None:
+            freed.append(_freed(arm, stage.number, whole.estimation, free.estimation, free.result))
     return Panel(tuple(trials), tuple(contests), tuple(freed))
 
 

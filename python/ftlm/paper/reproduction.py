@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from ftlm.arm.link import flexible_link
 from ftlm.base.checks import listed, nearest, whole_number
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import check_folder, write_atomically
@@ -179,14 +180,14 @@ def reproduce(
         Runs without the signals of any stage, or a sine run that lacks some.
     """
     simulated = square is None
+    others, lattice = _others(arms, records), Lattice(step=step)
+    lattice.values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
     if square is None:
         if sine is not None:
             raise ModelError("a sine run is given without a square run; give both, or neither")
         say("recording both stages on the virtual rig, under a square and a sine current")
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
-    others = _others(arms, records)
     numbers = stages_of(square, sine)
-    lattice = Lattice(step=step)
     preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True)
     works = [StageWork(n, square, sine, preset, threads, say, progress) for n in numbers]
     one_by_one = len(works) == 1 or threads == 1

@@ -110,11 +110,10 @@ def model_table(stage: Stage, title: str) -> Table:
                 rows[output].append([as_printed(label.partition(",")[0]), *numbers, row.error, row.rmse, row.nr])
     return by_angle(
         title, ("model", *HEADS, *CRITERIA), rows, groups=(*GROUPS, ("output error (free run)", 3)),
-        note="Free runs are driven as the method drives them: rows of p, least squares, instrumental variables and the "
-        "identified integer model by the current and the measured other angle; the manual's integer model (by explicit "
-        "Euler at the run's step, and exactly) and output error by the current alone. Output error and the identified "
-        "integer model are (14)–(15), whose deflection hangs on the hub's motion and has no current; all other rows "
-        "are the paper's (22)–(25). Errors in rad. –: not in the model, or a coefficient that its own standard error "
+        note="Free runs are driven as the method drives them: rows of p, least squares and instrumental variables "
+        "by the current and the measured other angle; the manual's integer model (by explicit Euler at the run's step, "
+        "and exactly), whole orders identified and output error by the current alone. The last two are (14)–(15), "
+        "whose deflection hangs on the hub's motion and has no current; all other rows are the paper's (22)–(25). Errors in rad. –: not in the model, or a coefficient that its own standard error "
         "exceeds. " + PRINTED_NOTE,
     )  # fmt: skip
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.arm.link import flexible_link, link_model, order_law
-from ftlm.arm.parameters import INTEGER_ORDERS
+from ftlm.arm.parameters import whole_order
 from ftlm.base.errors import ConvergenceError, ModelError
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
@@ -42,6 +42,8 @@ AROUND = 2
 #: Runs with more rows than the first are thinned to at most the second for joint fits, whose cost and whose grid's
 #: refinement grow with the rows; the arm's modes are two decades below the rate that is left.
 MOST_ROWS, JOINT_ROWS = 6000, 2500
+#: Whole orders that are none leave residuals that no row more makes smaller.
+WHOLE_ROWS = 1250
 
 
 @dataclass(frozen=True)
@@ -87,11 +89,9 @@ class StageWork:
         """Everything that section 5 says of a stage."""
         exact = self.manual("integer, exact")
         candidates = {"integer, Euler": self.stepped("integer, Euler", exact), "integer, exact": exact}
-        by_hand = flexible_link(stage=self.number, coupling="measured", laws=("orders",))
-        whole = {n: INTEGER_ORDERS.get(n.rstrip("0123456789"), 2.0) for n in by_hand.order_names}
-        candidates["integer, identified"] = self.joint(
-            "integer, identified", replace(by_hand, initial=self.measured.initial).with_orders(whole),
-            "whole orders, each equation driven by the measured other angle, by output error",
+        candidates["integer, identified"] = self.best(
+            "integer, identified", self.coupled.with_orders({n: whole_order(n) for n in self.coupled.order_names}),
+            "whole orders", WHOLE_ROWS,
         )  # fmt: skip
         candidates |= self.searches()
         candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
@@ -198,9 +198,8 @@ class StageWork:
         coefficients: dict[str, float] = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
-            best = search_orders(
-                self.on, single, lattice, keep=1, threads=self.threads, progress=self.progress, **options
-            )
+            own = replace(lattice, orders={n: v for n, v in lattice.orders.items() if n in single.order_names})
+            best = search_orders(self.on, single, own, keep=1, threads=self.threads, progress=self.progress, **options)
             orders |= best.orders
             coefficients |= best.coefficients
         known = self.measured.with_orders(orders).with_coefficients(coefficients)
@@ -222,11 +221,13 @@ class StageWork:
             lattice=Lattice(step=step, orders=axes), keep=self.preset.keep,
         )  # fmt: skip
 
-    def joint(self, label: str, structure: Structure, words: str) -> Candidate:
+    def joint(self, label: str, structure: Structure, words: str, rows: int | None = None) -> Candidate:
         """Joint output error on the run as it is, or on every so many rows of it."""
         self.say(f"stage {self.number}: {words}")
         run = self.on
-        if run.length > MOST_ROWS:
+        if rows is not None and run.length >= 2 * rows:
+            run = thinned(run, run.length // rows)
+        elif run.length > MOST_ROWS:
             every = -(-run.length // JOINT_ROWS)
             self.notes.append(
                 f"run {run.name} has {run.length} rows: joint fits by output error take one of {every} rows, "
@@ -236,17 +237,20 @@ class StageWork:
             run = thinned(run, every)
         return self.identified(label, run, structure)
 
-    def best(self, label: str, structure: Structure) -> Candidate:
+    def best(
+        self, label: str, structure: Structure, what: str = "all orders and coefficients together",
+        rows: int | None = None,
+    ) -> Candidate:  # fmt: skip
         """Joint output error from the current alone, or driven by the measured other angle where that has no start."""
-        words = f"all orders and coefficients together{' in the published form' * (structure is self.published)}, "
+        words = f"{what}{' in the published form' * (structure is self.published)}, "
         try:
-            return self.joint(label, structure, f"{words}from the current alone, by output error")
+            return self.joint(label, structure, f"{words}from the current alone, by output error", rows)
         except ConvergenceError as error:
             self.notes.append(
                 f"stage {self.number}, {label}: from the current alone, {error}; that row is driven by the measured "
                 "other angle instead"
             )
-        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error")
+        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error", rows)
 
     def traces(self, candidates: Mapping[str, Candidate], prior: float = 1.0) -> dict[str, dict[int, Trace]]:
         """Convergence of every equation with every p, at the orders of the model of that p."""
