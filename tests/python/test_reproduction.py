@@ -16,8 +16,8 @@ from ftlm.judge.comparison import compare_means
 from ftlm.paper import printed
 from ftlm.paper.arm import demo_plant, demo_run, truth_of
 from ftlm.paper.claims import claims, table_3_coefficients
-from ftlm.paper.panel import Panel
 from ftlm.paper.page import reproduction_text
+from ftlm.paper.panel import Panel
 from ftlm.paper.reproduction import stages_of
 from ftlm.paper.rivalry import like_for_like
 from ftlm.paper.thinning import thinned

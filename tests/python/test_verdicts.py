@@ -10,7 +10,7 @@ from ftlm.arm.link import flexible_link
 from ftlm.fit.differential import differential_evolution_search
 from ftlm.paper import printed
 from ftlm.paper.arm import ARMS, MAIN, demo_run
-from ftlm.paper.asprinted import SCAN, as_printed, papers_record
+from ftlm.paper.asprinted import SCAN, as_printed, implied_spreads, papers_record
 from ftlm.paper.panel import arrived_at
 from ftlm.paper.ran import one_angle, papers_current, printed_numbers, ran
 from ftlm.paper.rivalry import like_for_like, seeds_for
@@ -165,7 +165,7 @@ def test_the_scan_s_closed_form_is_the_recursion(tables):
     assert made.reading.prior in SCAN
     run, scales = papers_record()
     for output, scale in scales.items():
-        assert np.std(run[output]) == pytest.approx(printed.implied_spreads()[output][1])
+        assert np.std(run[output]) == pytest.approx(implied_spreads()[output][1])
         assert scale > 0
     m, step = 2048, 10.0 / 2048
     record = ftlm.solve.records.record(run, flexible_link(stage=2, form="published", laws=()), m)

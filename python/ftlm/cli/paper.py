@@ -11,7 +11,7 @@ from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_folder, check_free
 from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show_json
-from ftlm.cli.options import Files, Force, GeneticOptions, Json, LatticeStep, Page, ReadingOptions, Text, Threads
+from ftlm.cli.options import Files, Force, GeneticOptions, Json, LatticeStep, Page, ReadingOptions, Text, Texts, Threads
 from ftlm.paper import reproduction
 from ftlm.paper.demo import run_demo
 from ftlm.paper.demo_page import demo_page, demo_text
@@ -56,6 +56,10 @@ def reproduce(
     reading: ReadingOptions, step: LatticeStep = 0.05,
     noise: Annotated[float, Option(help="Noise on every angle of the virtual rig [rad].")] = 1e-4,
     seed: Annotated[int, Option("--noise-seed", min=0, help="Seed of that noise.")] = 1,
+    arms: Annotated[
+        Texts, Option("--arms", metavar="ARM", help="Simulated arm that verdicts are computed on; several, or all.")
+    ] = None,
+    records: Annotated[int, Option(min=1, help="Records of each, whose noise differs.")] = 3,
     genetic: GeneticOptions, threads: Threads = None, force: Force = False, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Recompute the tables and figures of the paper, on the virtual rig or on measured runs, as one page."""
@@ -67,8 +71,8 @@ def reproduce(
     measured = reading.runs([f for f in (square, sine) if f is not None], apart=True)
     with Progress("", quiet=as_json) as progress:
         result = reproduction.reproduce(
-            *measured, step=step, noise=noise, seed=seed, genetic=genetic.settings(), threads=threads,
-            say=progress.say, progress=progress,
+            *measured, step=step, noise=noise, seed=seed, genetic=genetic.settings(), arms=arms, records=records,
+            threads=threads, say=progress.say, progress=progress,
         )  # fmt: skip
         progress.say("writing the page")
         files = [result.page(out, force=force), *(result.save(save, force=force) if save is not None else [])]

@@ -14,8 +14,8 @@ from ftlm.judge.metrics import metrics
 from ftlm.paint.text import symbol
 from ftlm.paper import printed
 from ftlm.paper.arm import STAGES
+from ftlm.paper.asprinted import implied_spreads
 from ftlm.paper.panel import ALL_P, Trial
-from ftlm.paper.printed import implied_spreads
 from ftlm.paper.recomputed import Recomputed
 from ftlm.paper.records import PRIORS, TRACE_EVERY, WEAK_PRIOR, Stage
 from ftlm.paper.verdicts import Case, Ruling, case, ruled

@@ -69,10 +69,11 @@ def ran_charts(found: Recomputed) -> list[Figure]:
     for output in dict.fromkeys(r.output for r in found.ran if r.output.endswith("1")):
         rows = [r for r in found.ran if r.output == output]
         last = rows[-1]
-        lines = [(f"simulated arm, σ as printed ({last.implied:.2g} rad)", last.arm)]
+        lines = [("simulated arm", last.arm)]
         lines += [(f"printed, p = {r.p}", r.response) for r in rows]
         caption = (
-            f"The printed equations of Table {3 + int(output[-2])} from the current alone. p = {last.p} moves "
+            f"The printed equations of Table {3 + int(output[-2])} from the current alone, and the simulated arm, "
+            f"scaled to the deviation that the printed RMSE / NR implies ({last.implied:.2g} rad). p = {last.p} moves "
             f"{last.too_small:.0f} times less than the angle that it was identified from."
         )
         charts.append(
@@ -138,7 +139,7 @@ def _fits_chart(
     fits = ", ".join(f"{label} {c.output_error[output].fit:.4g} %" for label, c in present)
     caption = f"Fit: {fits.replace('inf', '∞').replace('-', '−')}."
     if output.endswith("2") and any(label.startswith("p = ") for label in models):
-        caption += " Rows of p are (23), which has lost a derivative of the current and bends the link the other way."
+        caption += " Rows of p are (23), from which a derivative of the current is missing."
     title = f"Figure {place}. {symbol(output)}, {'sine' if sine else 'square'} input"
     return [fit_chart(present, output, title, caption, simulated=simulated)]
 

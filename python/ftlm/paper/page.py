@@ -52,7 +52,12 @@ def _verdict_section(found: Recomputed) -> Section:
     """A line for each verdict, and the numbers behind a fold."""
     told = claims(found)
     rows: list[list[Cell]] = [
-        [c.claim, Markup("<strong>{}</strong>").format(c.verdict), figures.share_picture(c.ruling), c.brief]
+        [
+            c.claim,
+            Markup("<strong>{}</strong>").format(c.verdict),
+            figures.share_picture(c.ruling),
+            c.brief.replace(" -", " −"),
+        ]
         for c in told
     ]
     verdict = Markup('<span class="verdict"><strong>{}</strong><span class="note">{}: {}</span></span>')
@@ -97,9 +102,7 @@ def _printed_section(found: Recomputed) -> Section:
         f"Among neighbouring orders the printed ones have the places {ranks}: none is the best.",
     ]
     shown = [tables.printed_reading_table(found, stage) for stage in found.stages.values()]
-    return Section(
-        "As printed: Tables 4 and 5 as the paper computed them", words, fold="Ours beside printed", folded=shown
-    )
+    return Section("As printed (Tables 4 and 5)", words, fold="Ours beside printed", folded=shown)
 
 
 def _stage_section(found: Recomputed, stage: Stage) -> Section:
@@ -111,7 +114,7 @@ def _stage_section(found: Recomputed, stage: Stage) -> Section:
     equations = [equation_html(e, model.structure.delay, model.structure.limits) for e in model.equations]
     warned = grouped_warnings({label: c.result for label, c in stage.candidates.items()})
     return Section(
-        f"As it should be: stage {number} (Table {3 + number}, Figures {3 * number + 1}–{3 * number + 3})",
+        f"As it should be, stage {number} (Table {3 + number})",
         [words, *equations], figures=figures.stage_figures(stage, simulated=found.simulated),
         fold=f"Table {3 + number}, estimates with intervals, fits" + (", warnings" if warned else ""),
         folded_paragraphs=[f"Warning: {w}." for w in warned],

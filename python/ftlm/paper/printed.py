@@ -109,8 +109,3 @@ def last_orders(output: str) -> dict[str, float]:
     """Orders of an angle's row of p = 7 by name, such as alpha1."""
     index = 1 + OUTPUTS.index(output)
     return {f"{n}{index}": v for n, v in FRACTIONAL[output][INNOVATION_LENGTHS[-1]].orders.items()}
-
-
-def implied_spreads() -> dict[str, tuple[float, float]]:
-    """Standard deviations that Table 7 implies by RMSE / NR, of the genetic algorithm's record and of the other."""
-    return {o: (g[1] / g[2], m[1] / m[2]) for o, (g, m) in RIVALS.items()}

@@ -22,8 +22,7 @@ from ftlm.judge.metrics import finite
 from ftlm.model.model import Model
 from ftlm.paper import printed
 from ftlm.paper.arm import StageNumber, demo_run
-from ftlm.paper.asprinted import papers_record
-from ftlm.paper.printed import implied_spreads
+from ftlm.paper.asprinted import implied_spreads, papers_record
 from ftlm.paper.records import PRIORS
 from ftlm.search.orders import search_orders
 from ftlm.solve.stability import Stability, stability

@@ -14,9 +14,8 @@ from ftlm.data.equations import Equation
 from ftlm.paint.table import Table
 from ftlm.paint.text import SUPERSCRIPTS, Cell, Exact, number, symbol, symbol_html
 from ftlm.paper import printed
-from ftlm.paper.asprinted import READINGS
+from ftlm.paper.asprinted import READINGS, implied_spreads
 from ftlm.paper.claims import printed_saturation, table_3_coefficients
-from ftlm.paper.printed import implied_spreads
 from ftlm.paper.recomputed import Recomputed
 from ftlm.paper.records import PAIR, PRIORS, RIVAL_ALPHA, WEAK_PRIOR, Candidate, Stage
 from ftlm.paper.rows import (
@@ -113,8 +112,8 @@ def model_table(stage: Stage, title: str) -> Table:
         note="Free runs are driven as the method drives them: rows of p, least squares and instrumental variables "
         "by the current and the measured other angle; the manual's integer model (by explicit Euler at the run's step, "
         "and exactly), whole orders identified and output error by the current alone. The last two are (14)–(15), "
-        "whose deflection hangs on the hub's motion and has no current; all other rows are the paper's (22)–(25). Errors in rad. –: not in the model, or a coefficient that its own standard error "
-        "exceeds. " + PRINTED_NOTE,
+        "whose deflection hangs on the hub's motion and has no current; all other rows are the paper's (22)–(25). "
+        "Errors in rad. –: not in the model, or a coefficient that its own standard error exceeds. " + PRINTED_NOTE,
     )  # fmt: skip
 
 

@@ -235,7 +235,9 @@ class StageWork:
                 "on the same block pulses of the whole run"
             )
             run = thinned(run, every)
-        return self.identified(label, run, structure)
+        # Of the published form standard errors alone are looked at.
+        intervals = "quadratic" if structure is self.published else "auto"
+        return self.identified(label, run, structure, intervals=intervals)
 
     def best(
         self, label: str, structure: Structure, what: str = "all orders and coefficients together",
