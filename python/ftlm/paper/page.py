@@ -99,7 +99,7 @@ def _printed_section(found: Recomputed) -> Section:
         "orders, multi-innovation, the error of the equation in place of the free run, and choices that the paper does "
         "not name: K₀ for each angle, own terms on the left-hand side, the stock filter on the deflections, which of "
         "(22)–(25) and (26) is meant.",
-        f"Among neighbouring orders the printed ones have the places {ranks}: none is the best.",
+        f"Among neighbouring orders the printed ones have the places {ranks}.",
     ]
     shown = [tables.printed_reading_table(found, stage) for stage in found.stages.values()]
     return Section("As printed (Tables 4 and 5)", words, fold="Ours beside printed", folded=shown)

@@ -330,7 +330,7 @@ def ran_table(found: Recomputed) -> Table:
         back = [r.returned.get(prior, {}).get(a) for prior in PRIORS]
         stated = printed.FRACTIONAL[r.output][r.p].coefficients["a"]
         rows.setdefault(r.output, []).append(
-            [f"p = {r.p}", r.stability.unstable_poles, r.moved, r.alone, Exact(r.implied), r.too_small, stated, *back]
+            [f"p = {r.p}", Exact(r.stability.unstable_poles), r.moved, r.alone, r.implied, r.too_small, stated, *back]
         )
     prior = Markup("<i>K</i><sub>0</sub> = {}")
     return by_angle(
