@@ -81,10 +81,12 @@ def test_tables_4_and_5_follow_from_the_saved_run(saved, table, stage):
         )
         row = written[f"p = {p}"]
         assert found.orders == row["orders"]
-        assert found.coefficients == row["coefficients"]
+        # A whole identification makes the coefficients again, on the same lattice by other sums.
+        assert found.coefficients == pytest.approx(row["coefficients"], rel=1e-9)
         means = compare_means(found.model, run)
         for kind in ("equation_error", "output_error"):
-            assert {n: f.to_dict() for n, f in getattr(means, kind).items()} == row["estimation"][kind]
+            for n, f in getattr(means, kind).items():
+                assert f.to_dict() == pytest.approx(row["estimation"][kind][n], rel=1e-7, abs=1e-6), (p, n)
 
 
 def test_every_model_s_errors_follow_from_its_file_and_the_saved_runs(saved):
