@@ -11,6 +11,7 @@ import typing as _typing
 if _typing.TYPE_CHECKING:
     from ftlm import rig
     from ftlm._core import __version__
+    from ftlm.arm.energies import energies
     from ftlm.arm.link import flexible_link, link_model, order_law
     from ftlm.arm.parameters import PARAMETERS, LinkParameters
     from ftlm.base.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
@@ -62,11 +63,11 @@ __all__ = [
     "OpenedFile", "Order", "OutputResiduals", "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals",
     "RigFault", "Run", "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck",
     "Structure", "Term", "Trace", "Trial", "Validation", "Verdict", "__version__", "block_pulse_matrix", "compare",
-    "equation", "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse",
-    "haar_matrix", "haar_transform", "identify", "identify_many", "information_criteria", "lattice", "link_model",
-    "load", "load_model", "metrics", "multi_innovation_trace", "open_file", "operational_matrix", "order_law",
-    "physical_parameters", "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status", "select",
-    "simulate",
+    "energies", "equation", "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral",
+    "haar_inverse", "haar_matrix", "haar_transform", "identify", "identify_many", "information_criteria", "lattice",
+    "link_model", "load", "load_model", "metrics", "multi_innovation_trace", "open_file", "operational_matrix",
+    "order_law", "physical_parameters", "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status",
+    "select", "simulate",
 ]  # fmt: skip
 
 #: Where each name lives.
@@ -74,6 +75,7 @@ _HOMES = {
     name: home
     for home, names in {
         "_core": "__version__",
+        "arm.energies": "energies",
         "arm.link": "flexible_link link_model order_law",
         "arm.parameters": "LinkParameters PARAMETERS",
         "base.errors": "ConvergenceError DataError FtlmError InternalError ModelError RigFault",

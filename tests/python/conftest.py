@@ -130,5 +130,7 @@ def small_run(small_model):
 
 @pytest.fixture(scope="session")
 def reproduction():
-    """The paper's section 5 on a coarse lattice, with few evaluations of the genetic algorithm."""
-    return ftlm.reproduce(step=0.25, genetic=ftlm.Genetic(seeds=(0, 1), evaluations=800))
+    """The paper's section 5 on a coarse lattice, with few evaluations of the rivals and two arms."""
+    return ftlm.reproduce(
+        step=0.25, genetic=ftlm.Genetic(seeds=(0, 1), evaluations=800), arms=["whole orders"], records=1
+    )

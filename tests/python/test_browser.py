@@ -193,6 +193,7 @@ def test_the_accessibility_check_passes(browser, folder, name, scheme):
         with Opened(
             browser, folder / f"{name}.html", viewport={"width": width, "height": 900}, color_scheme=scheme
         ) as opened:
+            opened.page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
             found = axe.Axe().run(opened.page)
             broken = [(v["id"], [n["html"][:120] for n in v["nodes"]][:3]) for v in found.response["violations"]]
             assert broken == []
@@ -204,6 +205,7 @@ def test_the_accessibility_check_passes(browser, folder, name, scheme):
 def test_no_width_makes_a_page_scroll_sideways(browser, folder, name, width):
     with Opened(browser, folder / f"{name}.html", viewport={"width": width, "height": 900}) as opened:
         page = opened.page
+        page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         narrow, wide = (page.locator(f"svg.chart.{kind}").first for kind in ("narrow", "wide"))
         assert narrow.is_visible() == (width < 620)
@@ -230,7 +232,15 @@ def test_the_paper_s_page_names_what_holds_first(browser, folder):
         page = opened.page
         heads = page.locator("h2").all_inner_texts()
         assert heads[0] == "What holds and what does not"
-        assert page.locator(".verdict strong").count() == 12
+        rows = page.locator("section").first.locator("table").first.locator("tbody tr")
+        assert rows.count() == page.locator(".verdict strong").count() == 17
+        assert "316 times less" in rows.first.inner_text()
+        assert rows.locator("svg.share").count() == 17
+        # Numbers stand behind folds, closed on a screen and open on paper.
+        assert not page.locator(".verdict strong").first.is_visible()
+        page.locator("summary").first.click()
+        assert page.locator(".verdict strong").first.is_visible()
+        assert page.locator(".warnings").count() == 0
         assert page.locator("svg.chart.narrow").first.is_visible()
         # Zooming works here, too.
         page.locator(".zoom.narrow button:visible").first.click()

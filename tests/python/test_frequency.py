@@ -285,3 +285,10 @@ def test_what_is_known_of_a_fit_stays_with_the_saved_model(fits, tmp_path):
         np.testing.assert_array_equal(one, two)
     with pytest.raises(ftlm.ModelError, match="has no covariance"):
         frequency.response_deviation(model("D y = -y + u"), w)
+
+
+def test_coefficients_that_ran_away_have_a_stability_that_cannot_be_told_not_an_overflow():
+    # Whole orders fitted to an arm that has none: a characteristic of 1e200 beside 1, powers 0.5 apart.
+    count, on_axis = right_zeros({0.0: 1e200, 0.5: 1.0})
+    assert np.isnan(count)
+    assert on_axis

@@ -67,3 +67,8 @@ PARAMETERS: dict[str, dict[int, LinkParameters]] = {
 }
 #: The manual's integer orders: alpha = 2, stiffness on the angle, damping and friction on its rate.
 INTEGER_ORDERS = {"gamma": 1.0, "beta": 0.0, "mu": 1.0}
+
+
+def whole_order(name: str) -> float:
+    """The manual's integer order of an order's name, such as gamma1."""
+    return INTEGER_ORDERS.get(name.rstrip("0123456789"), 2.0)

@@ -22,6 +22,7 @@ from ftlm.cli.options import (
     Page,
     ReadingOptions,
     Text,
+    Texts,
     Threads,
     Verbose,
 )
@@ -75,6 +76,10 @@ def reproduce(
     reading: ReadingOptions, step: LatticeStep = 0.05,
     noise: Annotated[float, Option(help="Noise on every angle of the virtual rig [rad].")] = 1e-4,
     seed: Annotated[int, Option("--noise-seed", min=0, help="Seed of that noise.")] = 1,
+    arms: Annotated[
+        Texts, Option("--arms", metavar="ARM", help="Simulated arm that verdicts are computed on; several, or all.")
+    ] = None,
+    records: Annotated[int, Option(min=1, help="Records of each, whose noise differs.")] = 3,
     genetic: GeneticOptions, threads: Threads = None, force: Force = False, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Recompute the tables and figures of the paper, on the virtual rig or on measured runs, as one page."""
@@ -88,8 +93,8 @@ def reproduce(
         whole = REPRODUCE_SECONDS * (0.05 / step) ** 2
         progress.expect("the reproduction", expected(whole, check_threads(threads)))
         result = reproduction.reproduce(
-            *measured, step=step, noise=noise, seed=seed, genetic=genetic.settings(), threads=threads,
-            say=progress.say, progress=progress,
+            *measured, step=step, noise=noise, seed=seed, genetic=genetic.settings(), arms=arms, records=records,
+            threads=threads, say=progress.say, progress=progress,
         )  # fmt: skip
         progress.say("writing the page")
         files = [result.page(out, force=force), *(result.save(save, force=force) if save is not None else [])]

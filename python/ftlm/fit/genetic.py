@@ -113,8 +113,18 @@ class _Rows:
         return rows
 
 
-class _Problem:
-    """Genes and what they are worth."""
+class Problem:
+    """Genes and what they are worth.
+
+    Parameters
+    ----------
+    records, structure, lattice, settings
+        As :func:`genetic_search` has them.
+    norm
+        ``"l1"`` or ``"l2"``.
+    threads
+        Of the free runs.
+    """
 
     def __init__(
         self, records: list[Record], structure: Structure, lattice: Lattice, settings: Genetic, norm: str, threads: int
@@ -247,7 +257,7 @@ def genetic_search(
             "the genetic baseline knows no initial terms and needs runs that start at rest; "
             "slice the runs, or give the structure initial='rest'"
         )
-    problem = _Problem(records, structure, lattice, settings, norm, check_threads(threads))
+    problem = Problem(records, structure, lattice, settings, norm, check_threads(threads))
     wanted = settings.evaluations or problem.size
     if settings.evaluations is None and wanted > MOST_EVALUATIONS:
         raise ModelError(
@@ -272,7 +282,7 @@ def genetic_search(
 
 
 def _evolved(
-    algorithm: Any, problem: _Problem, population: int, seed: int, wanted: int, told: Callable[[int], None]
+    algorithm: Any, problem: Problem, population: int, seed: int, wanted: int, told: Callable[[int], None]
 ) -> _Kept:
     """Run the algorithm from one seed until it has spent its evaluations.
 

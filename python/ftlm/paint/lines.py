@@ -31,7 +31,8 @@ LINES = (
     ("#9b3f83", "#e99ac8", "9 3 2 3"),
     ("#7a6300", "#e6cb4f", "14 4"),
 )
-NEUTRAL = "measured"
+#: What a line begins with that others are compared with.
+NEUTRAL = ("measured", "simulated arm")
 
 
 @dataclass(frozen=True)
@@ -113,8 +114,8 @@ def line_chart(
     x
         Shape (N,).
     lines
-        (name, values of shape (N,)); a lone line may do without a name. A line whose name begins with "measured" is
-        neutral and lies beneath; the others are coloured and dashed in the order given.
+        (name, values of shape (N,)); a lone line may do without a name. A line whose name begins with "measured" or
+        "simulated arm" is neutral and lies beneath; the others are coloured and dashed in the order given.
     title, x_label, y_label
         Text, with units.
     width, height

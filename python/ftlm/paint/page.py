@@ -39,6 +39,10 @@ class Section:
         Whether two figures stand side by side where there is room.
     more
         Further warnings, folded away below the first ones.
+    fold
+        What is written on the fold behind which the rest stands; on paper it is open.
+    folded_paragraphs, folded
+        Text and tables behind it.
     """
 
     heading: str
@@ -48,10 +52,13 @@ class Section:
     figures: Sequence[Figure] = ()
     small: bool = False
     more: Sequence[str] = ()
+    fold: str = "Numbers"
+    folded_paragraphs: Sequence[str] = ()
+    folded: Sequence[Table] = ()
 
     def __post_init__(self) -> None:
         # A text is a sequence of letters, too; nobody wants a paragraph for each.
-        for name in ("paragraphs", "warnings", "more"):
+        for name in ("paragraphs", "warnings", "more", "folded_paragraphs"):
             if isinstance(getattr(self, name), str):
                 object.__setattr__(self, name, (getattr(self, name),))
 

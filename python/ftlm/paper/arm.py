@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -11,7 +12,7 @@ from ftlm.base.errors import ModelError
 from ftlm.data.run import Run
 from ftlm.model.model import Model
 from ftlm.rig.experiment import record
-from ftlm.rig.parameters import ArmParameters, StageParameters
+from ftlm.rig.parameters import SETS, ArmParameters, StageParameters
 
 StageNumber = Literal[1, 2]
 STAGES: tuple[StageNumber, StageNumber] = (1, 2)
@@ -19,6 +20,39 @@ STAGES: tuple[StageNumber, StageNumber] = (1, 2)
 AMPLITUDES = {"square": 0.3, "sine": 0.6}
 #: The demonstration's arm: effective coefficients, fractional damping in the links, nothing that is not linear.
 PARAMETERS = ArmParameters.of("linear")
+#: Its seed unless another is asked for.
+SEED = 1
+
+
+def _whole(stage: StageParameters, *, friction: bool) -> StageParameters:
+    """The maker's integer orders; Coulomb friction as it is, or none."""
+    return replace(stage, gamma=1.0, beta=0.0, mu=1.0, coulomb=stage.coulomb if friction else 0.0)
+
+
+def _whole_arm(*, friction: bool, coupling: float) -> ArmParameters:
+    rubbing = SETS["effective"]
+    # Links of the maker's file have no damping in stage 1.
+    first = replace(_whole(rubbing.stage1, friction=friction), d=0.0)
+    return replace(
+        PARAMETERS, stage1=first, stage2=_whole(rubbing.stage2, friction=friction), coupling=coupling,
+        name="whole orders",
+    )  # fmt: skip
+
+
+#: Arms on which a verdict is computed: the demonstration's, with Coulomb friction in the hubs and stages that push each
+#: other as well, and both with the maker's whole orders. Gauges are exact in all: noise is put on every angle alike.
+ARMS: dict[str, ArmParameters] = {
+    "fractional": PARAMETERS,
+    "fractional, friction": replace(
+        PARAMETERS, stage1=SETS["effective"].stage1, stage2=SETS["effective"].stage2, coupling=1.0
+    ),
+    "whole orders": _whole_arm(friction=False, coupling=0.0),
+    "whole orders, friction": _whole_arm(friction=True, coupling=1.0),
+}
+#: The demonstration's arm among them.
+MAIN = "fractional"
+#: The paper's arm as one can guess it: whole orders, friction, each stage by itself as in its equations.
+PAPERS_ARM = _whole_arm(friction=True, coupling=0.0)
 
 
 def demo_plant(stage: int, *, form: Form = "lagrange") -> Model:
@@ -57,7 +91,10 @@ def truth_of(stage: int) -> dict[str, float]:
     return orders | hub | {f"j{stage}": arm.r - 1.0}
 
 
-def demo_run(shape: str, *, duration: float = 10.0, step: float = 0.002, noise: float = 1e-4, seed: int = 1) -> Run:
+def demo_run(
+    shape: str, *, duration: float = 10.0, step: float = 0.002, noise: float = 1e-4, seed: int = SEED,
+    parameters: ArmParameters = PARAMETERS,
+) -> Run:  # fmt: skip
     """A run of the virtual rig under the paper's inputs: the linear arm, encoders and all, and noise on every angle.
 
     Its links hang on their hubs, (14)-(15), as those of a real arm do; the paper's own (22)-(25) are not this arm.
@@ -73,6 +110,8 @@ def demo_run(shape: str, *, duration: float = 10.0, step: float = 0.002, noise: 
         Standard deviation of the noise on every angle [rad].
     seed
         Of the noise.
+    parameters
+        Of another arm.
 
     Returns
     -------
@@ -90,7 +129,7 @@ def demo_run(shape: str, *, duration: float = 10.0, step: float = 0.002, noise: 
         raise ModelError(f"shape = {shape!r} is not known; use 'square' or 'sine'")
     recorded = record(
         input=shape, amplitude=AMPLITUDES[shape], duration=duration, limit=duration, rate=1.0 / step, seed=seed,
-        parameters=PARAMETERS,
+        parameters=parameters,
     )  # fmt: skip
     rng = np.random.default_rng([seed, list(AMPLITUDES).index(shape)])
     angles = [f"theta{stage}{k}" for stage in (1, 2) for k in (1, 2)]

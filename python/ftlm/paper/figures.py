@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 from markupsafe import Markup
 
+from ftlm.base.arrays import Floats
 from ftlm.fit.recursion import Trace, trace_chart
 from ftlm.judge.charts import error_chart, pulse_times
 from ftlm.judge.comparison import Comparison
@@ -15,34 +18,108 @@ from ftlm.paint.figure import NARROW, Figure, svg
 from ftlm.paint.lines import line_chart
 from ftlm.paint.text import symbol
 from ftlm.paper import printed
-from ftlm.paper.records import Candidate, Derived, Recomputed, Stage
+from ftlm.paper.recomputed import Recomputed
+from ftlm.paper.records import PAIR, Candidate, Derived, Stage
+from ftlm.paper.verdicts import Ruling
 
 #: Points of a line of these charts: there are some fifty on the page, which stays below 2 MB.
 LINE_POINTS = 500
+#: A response is drawn as far as it stays within so many times the largest excursion of what it is compared with, an
+#: error of the recursion as far as it stays within so many times the last one: what flies away hides all others.
+FARTHEST, FARTHEST_ERROR = 4.0, 1000.0
 
 
-def fit_chart(models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "") -> Figure:
-    """Measured angle and the free runs of some models."""
+def compared_with(*, simulated: bool) -> str:
+    """What the line is called that models are compared with."""
+    return "simulated arm" if simulated else "measured"
+
+
+def within(values: Floats, measured: Floats) -> Floats:
+    """A response as far as it stays near what it is compared with; the rest is a gap, which the drawing tells."""
+    middle = float(np.mean(measured))
+    limit = FARTHEST * float(np.max(np.abs(measured - middle)))
+    with np.errstate(invalid="ignore"):
+        return np.where(np.abs(values - middle) <= limit, values, np.nan)
+
+
+def fit_chart(
+    models: Sequence[tuple[str, Comparison]], output: str, title: str, caption: str = "", *, simulated: bool
+) -> Figure:
+    """An angle and the free runs of some models."""
     first = models[0][1]
-    lines = [("measured", first.measured[output][0])] + [(label, c.simulated[output][0]) for label, c in models]
+    measured = first.measured[output][0]
+    lines = [(compared_with(simulated=simulated), measured)]
+    gone = []
+    for label, comparison in models:
+        response = within(comparison.simulated[output][0], measured)
+        left = np.flatnonzero(np.isnan(response))
+        if left.size:
+            gone.append(f"{label} leaves the drawing after {pulse_times(first)[left[0]]:.2g} s")
+        lines.append((label, response))
+    told = " ".join(part for part in (caption, "; ".join(gone) + "." if gone else "") if part)
     return line_chart(
-        pulse_times(first), lines, title=title, x_label="time [s]", y_label=f"{symbol(output)} [rad]",
-        points=LINE_POINTS, caption=caption,
+        pulse_times(first), [line for line in lines if np.isfinite(line[1]).any()], title=title, x_label="time [s]",
+        y_label=f"{symbol(output)} [rad]", points=LINE_POINTS, caption=told,
     )  # fmt: skip
+
+
+def ran_charts(found: Recomputed) -> list[Figure]:
+    """The printed models of the hubs under the paper's current, beside an angle that moves as much as the paper's."""
+    charts = []
+    for output in dict.fromkeys(r.output for r in found.ran if r.output.endswith("1")):
+        rows = [r for r in found.ran if r.output == output]
+        last = rows[-1]
+        lines = [("simulated arm", last.arm)]
+        lines += [(f"printed, p = {r.p}", r.response) for r in rows]
+        caption = (
+            f"The printed equations of Table {3 + int(output[-2])} from the current alone, and the simulated arm, "
+            f"scaled to the deviation that the printed RMSE / NR implies ({last.implied:.2g} rad). p = {last.p} moves "
+            f"{last.too_small:.0f} times less than the angle that it was identified from."
+        )
+        charts.append(
+            line_chart(
+                last.time, lines, title=f"{symbol(output)}: the printed models under the paper's current",
+                x_label="time [s]", y_label=f"{symbol(output)} [rad]", points=LINE_POINTS, caption=caption,
+            )
+        )  # fmt: skip
+    return charts
+
+
+def share_picture(ruling: Ruling) -> Markup:
+    """In how many cases a claim holds: a bar for every level of what decides, filled as far as it holds."""
+    levels = ruling.levels or (("", ruling.cases, ruling.held),)
+    height = 10 * len(levels) - 2
+    words = "; ".join(f"{level + ': ' if level else ''}{held} of {count}" for level, count, held in levels)
+    out = [Markup('<svg class="share" viewBox="0 0 88 {}" role="img" aria-label="holds in {}">').format(height, words)]
+    for k, (_, count, held) in enumerate(levels):
+        filled = 88 * held / max(count, 1)
+        out.append(Markup('<rect class="held" x="0" y="{}" width="{:.1f}" height="8"/>').format(10 * k, filled))
+        out.append(Markup('<rect x=".5" y="{}" width="87" height="7"/>').format(10 * k + 0.5))
+    return Markup("").join([*out, Markup("</svg>")])
 
 
 def convergence_chart(traces: Mapping[int, Trace], title: str, *, log_x: bool = True) -> Figure:
     """Error (45) after every step of the recursion, a line for each p."""
-    return trace_chart([(f"p = {p}", trace) for p, trace in traces.items()], title=title, log_x=log_x)
+    ends = max(float(t.error[-1]) for t in traces.values())
+    drawn = {}
+    for p, trace in traces.items():
+        with np.errstate(invalid="ignore"):
+            near = np.where(trace.error <= FARTHEST_ERROR * ends, trace.error, np.nan)
+        drawn[p] = replace(trace, error=near if np.isfinite(near).any() else trace.error)
+    figure = trace_chart([(f"p = {p}", trace) for p, trace in drawn.items()], title=title, log_x=log_x)
+    gaps = any(np.isnan(t.error).any() for t in drawn.values())
+    words = f"Errors above {FARTHEST_ERROR:g} times the last ones are not drawn."
+    return replace(figure, caption=f"{figure.caption} {words}".strip()) if gaps else figure
 
 
-def derivative_chart(derived: Derived) -> Figure:
-    """The deflection as measured, by (14)-(15), and with the same numbers as published."""
+def derivative_chart(derived: Derived, *, simulated: bool = True) -> Figure:
+    """The deflection as it is, by (14)-(15), and with the same numbers as published."""
     nr, bent = metrics(derived.derived, derived.published).nr, derived.correlations
-    lines = [("measured", derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
+    own = compared_with(simulated=simulated)
+    lines = [(own, derived.measured), ("(14)–(15)", derived.derived), ("(22)–(25)", derived.published)]
     caption = (
         f"The same numbers in both, order of the current 0 where it should be {derived.order:.3g}. NR between the two: "
-        f"{nr:.3g}. Correlation with the current: measured {bent['measured']:.2f}, (14)–(15) {bent['derived']:.2f}, "
+        f"{nr:.3g}. Correlation with the current: {own} {bent['measured']:.2f}, (14)–(15) {bent['derived']:.2f}, "
         f"(22)–(25) {bent['published']:.2f}."
     ).replace(" -", " −")
     return line_chart(
@@ -51,7 +128,9 @@ def derivative_chart(derived: Derived) -> Figure:
     )  # fmt: skip
 
 
-def _fits_chart(models: Mapping[str, Candidate], output: str, place: str, *, sine: bool) -> list[Figure]:
+def _fits_chart(
+    models: Mapping[str, Candidate], output: str, place: str, *, sine: bool, simulated: bool
+) -> list[Figure]:
     """Models on one input with their fits, or nothing without that run."""
     compared = {label: c.validation if sine else c.estimation for label, c in models.items()}
     present = [(label, c) for label, c in compared.items() if c is not None]
@@ -59,8 +138,10 @@ def _fits_chart(models: Mapping[str, Candidate], output: str, place: str, *, sin
         return []
     fits = ", ".join(f"{label} {c.output_error[output].fit:.4g} %" for label, c in present)
     caption = f"Fit: {fits.replace('inf', '∞').replace('-', '−')}."
+    if output.endswith("2") and any(label.startswith("p = ") for label in models):
+        caption += " Rows of p are (23), from which a derivative of the current is missing."
     title = f"Figure {place}. {symbol(output)}, {'sine' if sine else 'square'} input"
-    return [fit_chart(present, output, title, caption)]
+    return [fit_chart(present, output, title, caption, simulated=simulated)]
 
 
 def _beside_integer(stage: Stage) -> dict[str, Candidate]:
@@ -70,7 +151,7 @@ def _beside_integer(stage: Stage) -> dict[str, Candidate]:
     return {shown: stage.candidates[label] for shown, label in labels.items()}
 
 
-def stage_figures(stage: Stage) -> list[Figure]:
+def stage_figures(stage: Stage, *, simulated: bool) -> list[Figure]:
     """Figures 4-6 or 7-9."""
     first = 4 if stage.number == 1 else 7
     errors = [(f"p = {p}", stage.candidates[f"p = {p}"].estimation) for p in printed.INNOVATION_LENGTHS]
@@ -82,7 +163,9 @@ def stage_figures(stage: Stage) -> list[Figure]:
             title = f"Figure {place}(b). {symbol(output)}: error (45) after each step"
             figures.append(convergence_chart(stage.traces[output], title))
     for letter, output in zip("ab", stage.outputs, strict=True):
-        figures += _fits_chart(_beside_integer(stage), output, f"{first + 2}({letter})", sine=False)
+        figures += _fits_chart(
+            _beside_integer(stage), output, f"{first + 2}({letter})", sine=False, simulated=simulated
+        )
     return figures
 
 
@@ -94,17 +177,23 @@ def sine_figures(found: Recomputed) -> list[Figure]:
     """Figure 10."""
     return [
         figure for stage, output in found.angles
-        for figure in _fits_chart(_beside_integer(stage), output, f"10({_letter(output)})", sine=True)
+        for figure in _fits_chart(
+            _beside_integer(stage), output, f"10({_letter(output)})", sine=True, simulated=found.simulated
+        )
     ]  # fmt: skip
+
+
+#: What lines are called.
+RIVAL_NAMES = {PAIR[0]: "p = 7, K₀ = 1", PAIR[1]: "p = 7, weak prior"}
 
 
 def rival_figures(found: Recomputed) -> list[Figure]:
     """Figure 11: on the input that neither has seen, or on the one they were identified from."""
     figures = []
     for output, rival in found.rivals.items():
-        models = {"genetic": rival.genetic, "p = 7": rival.lattice}
+        models = {RIVAL_NAMES.get(n, n): c for n, c in rival.models.items() if n != "differential evolution"}
         unseen = rival.genetic.validation is not None
-        figures += _fits_chart(models, output, f"11({_letter(output)})", sine=unseen)
+        figures += _fits_chart(models, output, f"11({_letter(output)})", sine=unseen, simulated=found.simulated)
     return figures
 
 

@@ -1,26 +1,30 @@
-"""What a recomputed section 5 consists of: models on both runs, rivals, stages."""
+"""What a recomputed section 5 says of one stage: models on both runs, rivals, traces."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.data.lattice import Lattice
-from ftlm.data.run import Run
+from ftlm.fit.genetic import GeneticRun
 from ftlm.fit.recursion import Trace
 from ftlm.identification.result import Identification
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.metrics import Metrics, finite
 from ftlm.model.model import Model
-from ftlm.paper.arm import truth_of
+from ftlm.paint.heat import Landscape
+from ftlm.paper.arm import StageNumber
 
 #: Steps between two points of a convergence curve: what p does, it does in the first steps.
-TRACE_EVERY = 4
+TRACE_EVERY = 2
 #: A prior so weak that the data alone decide.
 WEAK_PRIOR = 1e10
+#: Both ends of K0: the paper's recursion with the identity, and the data alone.
+PRIORS = (1.0, WEAK_PRIOR)
+#: Labels of multi-innovation beside its rivals, by K0.
+PAIR = ("p = 7", "p = 7, weak prior")
 #: Lattice of the genetic comparison: both algorithms' printed highest orders lie in it, and all of it can be evaluated.
 RIVAL_ALPHA = (1.95, 2.0)
 
@@ -69,35 +73,49 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Rival:
-    """The genetic algorithm and multi-innovation on one equation, like for like.
+    """Multi-innovation and its two rivals on one equation, like for like.
 
     Parameters
     ----------
     candidates
-        Of the lattice, and evaluations of every seed.
-    genetic, lattice
-        The two results.
+        Of the lattice, and evaluations of every seed unless others were asked for.
+    step
+        Of the lattice.
+    population
+        Of the genetic algorithm.
+    genetic_run, evolution_run
+        What the genetic algorithm and differential evolution came to, seed by seed, and within which bounds.
+    models
+        The best of each by label: genetic, differential evolution, p = 7 with K0 = 1 and with a weak prior.
     """
 
     candidates: int
-    genetic: Candidate
-    lattice: Candidate
+    step: float
+    population: int
+    genetic_run: GeneticRun
+    evolution_run: GeneticRun
+    models: dict[str, Candidate]
 
     @property
-    def settings(self) -> dict[str, Any]:
-        """What the genetic algorithm worked with."""
-        return {} if self.genetic.result is None else self.genetic.result.settings
+    def genetic(self) -> Candidate:
+        """The genetic algorithm's best seed."""
+        return self.models["genetic"]
 
     @property
-    def errors(self) -> dict[str, float]:
-        """Error (45) that each of its seeds came to."""
-        errors: dict[str, float] = next(iter(self.settings.get("errors", {"": {}}).values()))
-        return errors
+    def lattice(self) -> Candidate:
+        """Multi-innovation with p = 7 and K0 = 1."""
+        return self.models["p = 7"]
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
-        both = {"genetic": self.genetic.to_dict(), "multi-innovation": self.lattice.to_dict()}
-        return {"candidates": self.candidates, **both}
+        runs = {"genetic": self.genetic_run, "differential evolution": self.evolution_run}
+        return {
+            "candidates": self.candidates, "step": self.step, "population": self.population,
+            "models": {n: c.to_dict() for n, c in self.models.items()},
+            "errors": {n: {str(s): finite(e) for s, e in r.errors.items()} for n, r in runs.items()},
+            "evaluations": {n: {str(s): e for s, e in r.evaluations.items()} for n, r in runs.items()},
+            "bounds": {n: list(b) for n, b in self.genetic_run.bounds.items()},
+        }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -145,9 +163,11 @@ class Stage:
         The model whose orders have the smallest equation error on the lattice.
     derived
         What the dropped derivative of the current changes.
+    landscape
+        Cost around the joint fit along the two orders that the run tells apart least; None where there are none.
     """
 
-    number: int
+    number: StageNumber
     candidates: dict[str, Candidate]
     traces: dict[str, dict[int, Trace]]
     weak_traces: dict[str, dict[int, Trace]]
@@ -156,6 +176,7 @@ class Stage:
     near: Candidate
     by_equation: Candidate
     derived: Derived
+    landscape: Landscape | None
 
     @property
     def outputs(self) -> tuple[str, str]:
@@ -181,45 +202,3 @@ class Stage:
                 "correlations": {n: finite(v) for n, v in self.derived.correlations.items()},
             },
         }
-
-
-@dataclass(frozen=True)
-class Recomputed:
-    """Both stages and the runs; its fields are those of :class:`ftlm.Reproduction`."""
-
-    square: Run
-    sine: Run | None
-    simulated: bool
-    stages: dict[int, Stage]
-    lattice: Lattice
-    notes: tuple[str, ...] = field(default=())
-
-    @property
-    def truth(self) -> dict[int, dict[str, float]]:
-        """Orders and coefficients of the simulated arm by stage; empty for measured runs."""
-        return {n: truth_of(n) for n in self.stages} if self.simulated else {}
-
-    @property
-    def runs(self) -> list[Run]:
-        """The square run, and the sine run if there is one."""
-        return [self.square] if self.sine is None else [self.square, self.sine]
-
-    @property
-    def angles(self) -> list[tuple[Stage, str]]:
-        """Every stage with each of its outputs."""
-        return [(stage, output) for stage in self.stages.values() for output in stage.outputs]
-
-    @property
-    def rivals(self) -> dict[str, Rival]:
-        """The genetic comparisons of all stages by output."""
-        return {output: rival for stage in self.stages.values() for output, rival in stage.rivals.items()}
-
-    @property
-    def traces(self) -> dict[str, dict[int, Trace]]:
-        """Convergence of all stages by output and p."""
-        return {output: each for stage in self.stages.values() for output, each in stage.traces.items()}
-
-    @property
-    def weak_traces(self) -> dict[str, dict[int, Trace]]:
-        """The same with the weak prior."""
-        return {output: each for stage in self.stages.values() for output, each in stage.weak_traces.items()}

@@ -11,6 +11,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
+from ftlm.arm.link import flexible_link
+from ftlm.base.checks import listed, nearest, whole_number
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import check_folder, write_atomically
 from ftlm.base.progress import Progress, Stoppable
@@ -18,17 +20,27 @@ from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.fit.genetic import Genetic
 from ftlm.model.model import Model
-from ftlm.paper.arm import STAGES, StageNumber, demo_run
+from ftlm.paper.arm import ARMS, MAIN, STAGES, StageNumber, demo_run
+from ftlm.paper.asprinted import as_printed
 from ftlm.paper.claims import Claim, claims
 from ftlm.paper.page import reproduction_page
-from ftlm.paper.records import TRACE_EVERY, Recomputed, Stage
+from ftlm.paper.panel import panel_of, simulated_panel
+from ftlm.paper.ran import ran
+from ftlm.paper.recomputed import Recomputed
+from ftlm.paper.records import TRACE_EVERY, Stage
 from ftlm.paper.work import Preset, StageWork
 
 #: Rows that an order search keeps; the tables need the best alone.
 KEEP = 1
 #: What is saved whatever the stages hold.
 TABLES = "tables.json"
+#: What verdicts call the runs that were given.
+MEASURED = "as measured"
 ALWAYS_SAVED = ("square.csv", "sine.csv", TABLES)
+#: Processor time of a stage but for its searches, of a stage on one more arm, and of a stage's searches and rivals on a
+#: lattice of step 0.05, whose size grows with the fourth power [s]; measured on two cores that others kept busy, which
+#: doubles it.
+EACH_STAGE, EACH_ARM, SEARCHES = 45.0, 19.0, 108.0
 #: Seconds between two looks for Ctrl-C.
 LOOK = 0.1
 
@@ -48,6 +60,12 @@ class Reproduction(Recomputed):
         Of the order searches.
     notes
         What was left out and why.
+    panel
+        What verdicts are made of: all arms, records and both ends of K0.
+    ran
+        The paper's printed models run under its own current.
+    as_printed
+        Tables 4 and 5 as the paper computed them, by angle.
     """
 
     @property
@@ -90,7 +108,7 @@ class Reproduction(Recomputed):
         for number, stage in self.stages.items():
             models |= {f"stage{number}-{slug(label)}.json": c.model for label, c in stage.candidates.items()}
             for output, rival in stage.rivals.items():
-                models |= {f"{output}-genetic.json": rival.genetic.model, f"{output}-rival.json": rival.lattice.model}
+                models |= {f"{output}-{slug(label)}.json": c.model for label, c in rival.models.items()}
         check_folder(where, [*ALWAYS_SAVED, *models], force=force)
         runs = dict(zip(ALWAYS_SAVED, self.runs, strict=False))
         for name, run in runs.items():
@@ -107,8 +125,11 @@ class Reproduction(Recomputed):
             "runs": [run.name for run in self.runs],
             "simulated": self.simulated,
             "lattice": {"step": self.lattice.step, "alpha": list(self.lattice.alpha)},
-            "claims": [{"claim": c.claim, "holds": c.holds, "evidence": c.evidence} for c in self.claims],
-            "stages": {str(n): s.to_dict() for n, s in self.stages.items()},
+            "claims": [c.to_dict() for c in self.claims],
+            "as printed": {o: a.to_dict() for o, a in self.as_printed.items()},
+            "printed models run": [r.to_dict() for r in self.ran],
+            "as it should be": {str(n): s.to_dict() for n, s in self.stages.items()},
+            "verdicts": self.panel.to_dict(),
             "notes": list(self.notes),
         }
 
@@ -120,8 +141,8 @@ def slug(label: str) -> str:
 
 def reproduce(
     square: Run | None = None, sine: Run | None = None, *, step: float = 0.05, noise: float = 1e-4, seed: int = 1,
-    genetic: Genetic | None = None, threads: int | None = None, say: Callable[[str], None] = lambda _: None,
-    progress: Callable[[int, int], None] | None = None,
+    genetic: Genetic | None = None, arms: Sequence[str] | None = None, records: int = 3, threads: int | None = None,
+    say: Callable[[str], None] = lambda _: None, progress: Callable[[int, int], None] | None = None,
 ) -> Reproduction:  # fmt: skip
     """Recompute section 5 of the paper, on the virtual rig or on runs of one's own.
 
@@ -137,8 +158,14 @@ def reproduce(
     noise, seed
         Of the virtual rig's angles, see :func:`ftlm.demo.demo_run`.
     genetic
-        Settings of the genetic algorithm; by default seeds 0, 1, 2, each with as many evaluations as the lattice that
-        it is compared with has candidates.
+        Seeds and evaluations of the genetic algorithm and of differential evolution; by default ten seeds, or as many
+        as 200 000 evaluations an angle allow, each with as many evaluations as the lattice that they are compared with
+        has candidates.
+    arms
+        Simulated arms that verdicts are computed on besides the first: keys of `ARMS`, by default all. Of a measured
+        run nothing is simulated.
+    records
+        Records of each of them, whose noise differs.
     threads
         Threads of each stage; both stages are computed at the same time unless this is 1.
     say
@@ -157,19 +184,53 @@ def reproduce(
         Runs without the signals of any stage, or a sine run that lacks some.
     """
     simulated = square is None
+    others, lattice = _others(arms, records), Lattice(step=step)
+    lattice.values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
     if square is None:
         if sine is not None:
             raise ModelError("a sine run is given without a square run; give both, or neither")
         say("recording both stages on the virtual rig, under a square and a sine current")
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     numbers = stages_of(square, sine)
-    lattice = Lattice(step=step)
+    say(f"this takes up to {expected(step, len(numbers), len(others) if simulated else 0):.0f} s of processor time")
     preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True)
     works = [StageWork(n, square, sine, preset, threads, say, progress) for n in numbers]
     one_by_one = len(works) == 1 or threads == 1
-    stages = [w.reproduced(genetic) for w in works] if one_by_one else side_by_side(works, genetic)
+    made = [w.reproduced(genetic) for w in works] if one_by_one else side_by_side(works, genetic)
+    stages: dict[int, Stage] = {s.number: s for s in made}
+    say("the paper's printed models under its own current, and its tables as it computed them")
+    ran_models = [row for n in numbers for row in ran(n, threads)]
+    printed_reading = as_printed([o for n in numbers for o in stages[n].outputs])
+    own = MAIN if simulated else MEASURED
+    say("verdicts: both ends of K0")
+    panel = panel_of(made, square, own, seed, threads)
+    if simulated:
+        seeds = [seed + k for k in range(records)]
+        panel = panel.beside(simulated_panel(numbers, own, seeds[1:], noise, threads))
+        for arm in others:
+            say(f"verdicts: the arm “{arm}”")
+            panel = panel.beside(simulated_panel(numbers, arm, seeds, noise, threads, genetic=genetic, step=step))
     notes = dict.fromkeys(note for work in works for note in work.notes)
-    return Reproduction(square, sine, simulated, {s.number: s for s in stages}, lattice, tuple(notes))
+    return Reproduction(
+        square, sine, simulated, stages, lattice, tuple(notes), panel, tuple(ran_models), printed_reading
+    )  # fmt: skip
+
+
+def expected(step: float, stages: int, arms: int) -> float:
+    """Processor time that all of it takes [s], by what it took where it was measured."""
+    return stages * (EACH_STAGE + EACH_ARM * arms + SEARCHES * (0.05 / step) ** 4)
+
+
+def _others(arms: Sequence[str] | None, records: int) -> list[str]:
+    """Arms besides the first."""
+    if isinstance(arms, str):
+        raise ModelError(f"arms = {arms!r} is a text; give a list of names, such as [{arms!r}]")
+    for name in arms or ():
+        if name not in ARMS:
+            raise ModelError(f"arm {name!r} is not known{nearest(name, ARMS)}; use {listed(ARMS)}")
+    if (whole_number(records) or 0) < 1:
+        raise ModelError(f"records = {records!r} is no whole number from 1")
+    return [name for name in (ARMS if arms is None else dict.fromkeys(arms)) if name != MAIN]
 
 
 def side_by_side(works: Sequence[StageWork], genetic: Genetic | None) -> list[Stage]:

@@ -19,7 +19,7 @@ from ftlm.judge.comparison import Comparison
 from ftlm.judge.metrics import finite
 from ftlm.paint.text import symbol
 from ftlm.paper.arm import STAGES, StageNumber
-from ftlm.paper.work import thinned
+from ftlm.paper.thinning import thinned
 
 #: What may be fractional, by the orders that are free then; whole is what they are otherwise.
 WHOLE = "whole orders"

@@ -10,22 +10,28 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.arm.link import flexible_link, link_model, order_law
-from ftlm.arm.parameters import INTEGER_ORDERS
+from ftlm.arm.parameters import whole_order
 from ftlm.base.errors import ConvergenceError, ModelError
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
-from ftlm.fit.genetic import Genetic
+from ftlm.fit.genetic import Genetic, GeneticRun
 from ftlm.fit.recursion import Trace, multi_innovation_trace
 from ftlm.identification.identify import identify
+from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.result import Identification
 from ftlm.judge.charts import pulse_times
 from ftlm.judge.comparison import Comparison, compare_means
 from ftlm.judge.metrics import metrics
 from ftlm.model.model import Model
+from ftlm.paint.heat import Landscape
 from ftlm.paper import printed
 from ftlm.paper.arm import StageNumber
-from ftlm.paper.records import RIVAL_ALPHA, WEAK_PRIOR, Candidate, Derived, Rival, Stage
+from ftlm.paper.records import PAIR, RIVAL_ALPHA, WEAK_PRIOR, Candidate, Derived, Rival, Stage
+from ftlm.paper.rivalry import like_for_like
+from ftlm.paper.thinning import thinned
+from ftlm.search.orders import search_orders
+from ftlm.search.result import SearchResult
 from ftlm.solve.free_run import explicit_euler
 from ftlm.solve.motion import starts_at_rest
 from ftlm.solve.records import default_m, prepare
@@ -36,6 +42,8 @@ AROUND = 2
 #: Runs with more rows than the first are thinned to at most the second for joint fits, whose cost and whose grid's
 #: refinement grow with the rows; the arm's modes are two decades below the rate that is left.
 MOST_ROWS, JOINT_ROWS = 6000, 2500
+#: Whole orders that are none leave residuals that no row more makes smaller.
+WHOLE_ROWS = 1250
 
 
 @dataclass(frozen=True)
@@ -81,11 +89,9 @@ class StageWork:
         """Everything that section 5 says of a stage."""
         exact = self.manual("integer, exact")
         candidates = {"integer, Euler": self.stepped("integer, Euler", exact), "integer, exact": exact}
-        by_hand = flexible_link(stage=self.number, coupling="measured", laws=("orders",))
-        whole = {n: INTEGER_ORDERS.get(n.rstrip("0123456789"), 2.0) for n in by_hand.order_names}
-        candidates["integer, identified"] = self.joint(
-            "integer, identified", replace(by_hand, initial=self.measured.initial).with_orders(whole),
-            "whole orders, each equation driven by the measured other angle, by output error",
+        candidates["integer, identified"] = self.best(
+            "integer, identified", self.coupled.with_orders({n: whole_order(n) for n in self.coupled.order_names}),
+            "whole orders", WHOLE_ROWS,
         )  # fmt: skip
         candidates |= self.searches()
         candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
@@ -110,8 +116,13 @@ class StageWork:
         }
         return Stage(
             self.number, candidates, traces, weak, ends, self.rivals(genetic), self.near(), self.by_equation(),
-            self.derived(candidates["output error"].model),
+            self.derived(candidates["output error"].model), self.landscape(candidates["output error"].result),
         )  # fmt: skip
+
+    def landscape(self, result: Identification | None) -> Landscape | None:
+        """Around the joint fit, along the two orders that the run tells apart least."""
+        self.say(f"stage {self.number}: the landscape of its orders")
+        return None if result is None or result.joint is None else output_error_landscape(result)
 
     def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
         """Both errors of a model on both runs, and its free run from the currents alone."""
@@ -165,17 +176,36 @@ class StageWork:
 
     def searches(self) -> dict[str, Candidate]:
         """Multi-innovation with the paper's p, and least squares, on the whole lattice."""
-        methods: dict[str, dict[str, Any]] = {
-            f"p = {p}": {"method": "multi-innovation", "innovation_length": p} for p in printed.INNOVATION_LENGTHS
+        kinds: dict[str, dict[str, Any]] = {
+            f"p = {p}": {"coefficients": "multi-innovation", "innovation_length": p} for p in printed.INNOVATION_LENGTHS
         }
-        methods["least squares"] = {"method": "least-squares"}
+        kinds["least squares"] = {"coefficients": "least-squares"}
         found = {}
-        for label, options in methods.items():
+        for label, options in kinds.items():
             self.say(f"stage {self.number}: searching the orders of both equations, {label}")
+            if self.preset.alike:
+                found[label] = self.searched(label, self.preset.lattice, **options)
+                continue
+            method = {"method": options["coefficients"], **{n: v for n, v in options.items() if n != "coefficients"}}
             found[label] = self.identified(
-                label, self.on, self.measured, lattice=self.preset.lattice, keep=self.preset.keep, **options
+                label, self.on, self.measured, lattice=self.preset.lattice, keep=self.preset.keep, **method
             )
         return found
+
+    def searched(self, label: str, lattice: Lattice, **options: Any) -> Candidate:
+        """The best orders of both equations, each by itself, without all that a whole identification says of them."""
+        orders: dict[str, float] = {}
+        coefficients: dict[str, float] = {}
+        for output in self.measured.outputs:
+            single = self.measured.equation(output)
+            own = replace(lattice, orders={n: v for n, v in lattice.orders.items() if n in single.order_names})
+            best = search_orders(self.on, single, own, keep=1, threads=self.threads, progress=self.progress, **options)
+            orders |= best.orders
+            coefficients |= best.coefficients
+        known = self.measured.with_orders(orders).with_coefficients(coefficients)
+        units = {n: u for n, u in self.on.units.items() if n in known.signals}
+        about = {"origin": label, "run": self.on.name}
+        return self.candidate(label, Model(known, orders=orders, units=units, about=about))
 
     def instrumental(self, start: Candidate) -> Candidate:
         """Instrumental variables on the part of the lattice around the orders of another model."""
@@ -191,11 +221,13 @@ class StageWork:
             lattice=Lattice(step=step, orders=axes), keep=self.preset.keep,
         )  # fmt: skip
 
-    def joint(self, label: str, structure: Structure, words: str) -> Candidate:
+    def joint(self, label: str, structure: Structure, words: str, rows: int | None = None) -> Candidate:
         """Joint output error on the run as it is, or on every so many rows of it."""
         self.say(f"stage {self.number}: {words}")
         run = self.on
-        if run.length > MOST_ROWS:
+        if rows is not None and run.length >= 2 * rows:
+            run = thinned(run, run.length // rows)
+        elif run.length > MOST_ROWS:
             every = -(-run.length // JOINT_ROWS)
             self.notes.append(
                 f"run {run.name} has {run.length} rows: joint fits by output error take one of {every} rows, "
@@ -203,19 +235,24 @@ class StageWork:
                 "on the same block pulses of the whole run"
             )
             run = thinned(run, every)
-        return self.identified(label, run, structure)
+        # Of the published form standard errors alone are looked at.
+        intervals = "quadratic" if structure is self.published else "auto"
+        return self.identified(label, run, structure, intervals=intervals)
 
-    def best(self, label: str, structure: Structure) -> Candidate:
+    def best(
+        self, label: str, structure: Structure, what: str = "all orders and coefficients together",
+        rows: int | None = None,
+    ) -> Candidate:  # fmt: skip
         """Joint output error from the current alone, or driven by the measured other angle where that has no start."""
-        words = f"all orders and coefficients together{' in the published form' * (structure is self.published)}, "
+        words = f"{what}{' in the published form' * (structure is self.published)}, "
         try:
-            return self.joint(label, structure, f"{words}from the current alone, by output error")
+            return self.joint(label, structure, f"{words}from the current alone, by output error", rows)
         except ConvergenceError as error:
             self.notes.append(
                 f"stage {self.number}, {label}: from the current alone, {error}; that row is driven by the measured "
                 "other angle instead"
             )
-        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error")
+        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error", rows)
 
     def traces(self, candidates: Mapping[str, Candidate], prior: float = 1.0) -> dict[str, dict[int, Trace]]:
         """Convergence of every equation with every p, at the orders of the model of that p."""
@@ -232,25 +269,33 @@ class StageWork:
         )
 
     def rivals(self, genetic: Genetic | None) -> dict[str, Rival]:
-        """Genetic algorithm and lattice on one equation each: same record, same number of candidates."""
+        """Genetic algorithm, differential evolution and lattice on one equation each, like for like."""
         lattice = Lattice(step=self.preset.lattice.step, alpha=RIVAL_ALPHA)
         found = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
-            self.say(f"{output}: a genetic algorithm with as many evaluations as the lattice has candidates")
-            paper = self.identified(
-                "p = 7", self.on, single, method="multi-innovation", lattice=lattice, keep=self.preset.keep
-            )
-            count = 0 if paper.result is None else paper.result.searches[output].candidates
-            settings = genetic or Genetic()
-            if not settings.evaluations:
-                settings = replace(settings, evaluations=max(count, 2 * settings.population))
+            self.say(f"{output}: two rivals with as many evaluations as the lattice has candidates")
             try:
-                rival = self.identified("genetic", self.on, single, method="genetic", lattice=lattice, genetic=settings)
+                made = like_for_like(
+                    self.on, single, lattice, genetic, threads=self.threads, progress=self.progress
+                )  # fmt: skip
             except ModelError as error:
                 self.notes.append(f"Tables 6 and 7 and Figure 11 are left out: {error}")
                 return {}
-            found[output] = Rival(count, rival, paper)
+
+            def model(
+                orders: Mapping[str, float], coefficients: Mapping[str, float], item: Structure = single
+            ) -> Model:
+                return Model(item.with_orders(orders).with_coefficients(coefficients), orders=dict(orders))
+
+            ends: dict[str, GeneticRun | SearchResult] = {
+                "genetic": made.genetic, "differential evolution": made.evolution,
+                **dict(zip(PAIR, made.lattice.values(), strict=True)),
+            }  # fmt: skip
+            candidates = {n: self.candidate(n, _known(single, end.orders, end.coefficients)) for n, end in ends.items()}
+            found[output] = Rival(
+                made.candidates, lattice.step, made.settings.population, made.genetic, made.evolution, candidates
+            )
         return found
 
     def near(self) -> Candidate:
@@ -258,14 +303,15 @@ class StageWork:
         orders: dict[str, float] = {}
         for output in self.measured.outputs:
             orders |= printed.last_orders(output)
-        return self.identified("printed orders", self.on, self.measured.with_orders(orders), method="least-squares")
+        axes = Lattice(step=self.preset.lattice.step, orders={n: [v] for n, v in orders.items()})
+        return self.searched("printed orders", axes, coefficients="least-squares")
 
     def by_equation(self) -> Candidate:
         """Least squares at the orders whose equation error is smallest."""
         self.say(f"stage {self.number}: searching the orders with the smallest equation error")
-        return self.identified(
-            "smallest equation error", self.on, self.measured, method="least-squares", criterion="equation-error",
-            norm="l2", lattice=self.preset.lattice,
+        return self.searched(
+            "smallest equation error", self.preset.lattice, coefficients="least-squares", criterion="equation-error",
+            norm="l2",
         )  # fmt: skip
 
     def derived(self, model: Model) -> Derived:
@@ -291,15 +337,6 @@ class StageWork:
         )  # fmt: skip
 
 
-def thinned(run: Run, every: int) -> Run:
-    """Every so manieth row of a run, held inputs by their means until the next one, which act alike."""
-    rows = run.length // every
-    data = {}
-    for name in run.signals:
-        samples = run[name][: rows * every].reshape(rows, every)
-        held = name in run.inputs and run.intersample[name] == "zoh"
-        data[name] = samples.mean(axis=1) if held else samples[:, 0]
-    return Run.from_arrays(
-        step=run.step * every, inputs={n: data[n] for n in run.inputs}, outputs={n: data[n] for n in run.outputs},
-        units=dict(run.units), intersample=dict(run.intersample), name=run.name,
-    )  # fmt: skip
+def _known(item: Structure, orders: Mapping[str, float], coefficients: Mapping[str, float]) -> Model:
+    """A model of one equation whose numbers are known."""
+    return Model(item.with_orders(orders).with_coefficients(coefficients), orders=dict(orders))

@@ -23,6 +23,8 @@ DECIDED = 1e-3
 #: Largest turn between two points of the Nyquist curve [rad], and most points.
 LARGEST_TURN = 0.2
 MOST_POINTS = 200_000
+#: Logarithm of the frequency that stands for those beyond the range of numbers.
+FARTHEST_LOG = 600.0
 #: A Nyquist curve that comes this close to 0, in units of its own terms, has a pole on the axis as far as one can tell.
 ON_AXIS = 1e-9
 
@@ -216,7 +218,10 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
         sizes = np.abs(values) * omega ** (powers - at)
         return float((np.sum(sizes) - abs(polynomial[at])) / abs(polynomial[at]))
 
-    centre = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
+    try:
+        centre = abs(polynomial[lowest] / polynomial[highest]) ** (1 / (highest - lowest))
+    except OverflowError:  # coefficients that ran away, over powers close to one another
+        centre = math.exp(FARTHEST_LOG)
     low, high = centre, centre
     while shares(lowest, low) > DECIDED and low > 1e-300:
         low /= 10

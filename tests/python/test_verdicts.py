@@ -1,0 +1,273 @@
+"""What verdicts are made of: the rule, the rivals, printed models run, the tables as the paper computed them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm.arm.link import flexible_link
+from ftlm.fit.differential import differential_evolution_search
+from ftlm.paper import printed
+from ftlm.paper.arm import ARMS, MAIN, demo_run
+from ftlm.paper.asprinted import SCAN, as_printed, implied_spreads, papers_record
+from ftlm.paper.panel import arrived_at
+from ftlm.paper.ran import one_angle, papers_current, printed_numbers, ran
+from ftlm.paper.rivalry import like_for_like, seeds_for
+from ftlm.paper.verdicts import case, ruled
+from ftlm.solve.operators import block_pulse_matrix
+from ftlm.solve.records import prepare
+
+# ----------------------------------------------------------------------------------------------------------------------
+# The rule
+
+
+def cases(rule, *, arms=("one", "two"), angles=("a", "b")):
+    return [
+        case(rule(prior, arm, angle), K0=prior, the_arm=arm, the_angle=angle)
+        for prior in ("1", "weak") for arm in arms for angle in angles
+    ]  # fmt: skip
+
+
+def test_where_all_cases_agree_the_verdict_is_theirs():
+    assert str(ruled(cases(lambda *_: True))) == "holds"
+    assert str(ruled(cases(lambda *_: False))) == "does not hold"
+    assert str(ruled([])) == "cannot be told"
+
+
+def test_a_verdict_turns_with_what_changes_it_while_all_else_stays():
+    weak = ruled(cases(lambda prior, *_: prior == "weak"))
+    assert (str(weak), weak.cases, weak.held) == ("turns with K0", 8, 4)
+    assert weak.levels == (("1", 4, 0), ("weak", 4, 4))
+    both = ruled(cases(lambda prior, arm, angle: prior == "weak" and angle == "a"))
+    assert set(both.factors) == {"K0", "the angle"}
+    assert str(ruled(cases(lambda prior, arm, angle: (prior == "weak") != (angle == "a")))) in (
+        "turns with K0 and the angle", "turns with the angle and K0",
+    )  # fmt: skip
+
+
+def test_what_turns_with_the_arm_cannot_be_told_of_the_machine_from_a_simulated_one():
+    def of_arm(prior, arm, angle):
+        return arm == "one" and angle == "a"
+
+    assert str(ruled(cases(of_arm), of_the_machine=True)) == "cannot be told from a simulated truth"
+    assert ruled(cases(of_arm)).word == "turns with"
+    # What the arm does not change can be told of any.
+    assert str(ruled(cases(lambda prior, *_: prior == "1"), of_the_machine=True)) == "turns with K0"
+    assert str(ruled(cases(of_arm, arms=("one",)), of_the_machine=True)) == "turns with the angle"
+
+
+def test_an_error_arrives_where_it_stays():
+    def trace(*errors):
+        return ftlm.Trace(np.arange(1, len(errors) + 1) * 2, {}, np.array(errors), 3)
+
+    assert arrived_at(trace(9.0, 1.0, 3.0, 1.01, 1.0), 1.0) == 8
+    assert arrived_at(trace(np.inf, 1.0, 1.0), 1.0) == 4
+    assert arrived_at(trace(0.5, 0.5), 1.0) == 2
+    assert arrived_at(trace(1.0, 1.0, 1.5), 1.0) == np.inf
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Printed models run
+
+
+@pytest.fixture(scope="module")
+def first_stage():
+    return {(r.output, r.p): r for r in ran(1, threads=1)}
+
+
+def dense_response(stage, p, m):
+    """Both printed equations by dense operational matrices: y = sum c F^(alpha - nu) s, solved at once."""
+    orders, coefficients = printed_numbers(stage, p)
+    run = papers_current(stage)
+    # A pulse has the mean of what is held in it.
+    held = run[f"I{stage}"][:5000]
+    whole = np.concatenate([[0.0], np.cumsum(held)])
+    u = np.diff(np.interp(np.linspace(0, held.size, m + 1), np.arange(held.size + 1), whole)) * m / held.size
+    h, d = 2 * stage - 1, 2 * stage
+
+    def integral(eta):
+        # Row vectors of coefficients times F: columns here.
+        return block_pulse_matrix(eta, m, 10.0).T
+
+    def blocks(n, own_letters):
+        alpha, found = orders[f"alpha{n}"], {"own": np.zeros((m, m)), "other": np.zeros((m, m))}
+        for letter, name in (("a", "beta"), ("b", "gamma"), ("d", "mu")):
+            part = coefficients[f"{letter}{n}"] * integral(alpha - orders[f"{name}{n}"])
+            found["own" if letter in own_letters else "other"] += part
+        return found, coefficients[f"g{n}"] * integral(alpha) @ u
+
+    hub, drive = blocks(h, "b")
+    link, driven = blocks(d, "ad")
+    system = np.block([[np.eye(m) - hub["own"], -hub["other"]], [-link["other"], np.eye(m) - link["own"]]])
+    return np.linalg.solve(system, np.concatenate([drive, driven])).reshape(2, m)
+
+
+def test_printed_models_move_hundreds_of_times_less_than_the_paper_s_arm(first_stage):
+    row = first_stage["theta11", 7]
+    assert row.implied == pytest.approx(0.0180 / 0.1974)
+    assert row.moved == pytest.approx(0.00029, abs=5e-6)
+    assert 315 < row.too_small < 317
+    assert min(r.too_small for r in first_stage.values()) > 5
+    hub, link = dense_response(1, 7, 512)
+    assert np.std(hub) == pytest.approx(row.moved, rel=0.01)
+    assert np.std(link) == pytest.approx(first_stage["theta12", 7].moved, rel=0.01)
+    # None is stable, either.
+    assert all(r.stability.unstable_poles >= 1 for r in first_stage.values())
+
+
+def test_the_one_angle_reading_moves_as_little(first_stage):
+    model = one_angle("theta11", 7)
+    assert [t.signal for t in model.equations[0].terms] == ["theta11"] * 3 + ["I1"]
+    assert first_stage["theta11", 7].alone == pytest.approx(0.000297, abs=2e-6)
+
+
+def test_a_printed_model_does_not_give_back_its_coefficients(first_stage):
+    for (output, p), row in first_stage.items():
+        a = f"a{output[-1]}"
+        stated = printed.FRACTIONAL[output][p].coefficients["a"]
+        # With K0 = 1 a response this small is nothing beside the prior.
+        assert abs(row.returned[1.0][a]) < 1e-3 * abs(stated)
+        assert abs(row.returned[1e10][a] / stated - 1) > 0.02
+    last = first_stage["theta11", 7].orders
+    assert all(found["beta1"] != 1.85 or found["gamma1"] != 1.9 for found in last.values())
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# As printed
+
+
+@pytest.fixture(scope="module")
+def tables():
+    return as_printed()
+
+
+def test_tables_4_and_5_come_near_as_equation_errors(tables):
+    for output, made in tables.items():
+        table = printed.FRACTIONAL[output]
+        assert made.away < 1.15, output
+        # With the identity for K0 only the hubs come near.
+        assert (made.away_at_one > 3) is output.endswith("2"), output
+        for p, row in made.rows.items():
+            assert np.sign(row.coefficients["a"]) == np.sign(table[p].coefficients["a"])
+            assert row.equation.error / table[p].error == pytest.approx(1.0, abs=0.25), (output, p)
+        assert "a" in made.alike
+        assert made.rank > 50, output
+    assert [o for o, t in tables.items() if not t.near] == ["theta11"]
+    # Even the printed d, which falls and then rises again.
+    d = [r.coefficients["d"] for r in tables["theta22"].rows.values()]
+    assert "d" in tables["theta22"].alike
+    assert d[1] < d[0] < d[2] < d[3]
+
+
+def test_the_scan_s_closed_form_is_the_recursion(tables):
+    made = tables["theta21"]
+    assert made.reading.prior in SCAN
+    run, scales = papers_record()
+    for output, scale in scales.items():
+        assert np.std(run[output]) == pytest.approx(implied_spreads()[output][1])
+        assert scale > 0
+    m, step = 2048, 10.0 / 2048
+    record = ftlm.solve.records.record(run, flexible_link(stage=2, form="published", laws=()), m)
+    own, other, u = record.of("theta21"), record.of("theta22"), record.of("I2")
+    assert made.reading.terms == "own angle in a"
+    parts = [(own, 0.15), (other, 0.1), (other, 0.2), (u, 2.0)]
+    columns = [ftlm.haar_transform(ftlm.fractional_integral(s, eta, step=step)) for s, eta in parts]
+    rows, wanted = np.stack(columns, axis=1), ftlm.haar_transform(own)
+    p, x, gain = 3, np.zeros(4), np.eye(4) / made.reading.prior
+    for k in range(m):
+        newest = slice(max(0, k - p + 1), k + 1)
+        q = rows[newest]
+        gain = gain + q.T @ q
+        x = x + np.linalg.solve(gain, q.T @ (wanted[newest] - q @ x))
+    ours = [made.rows[p].coefficients[c] for c in "abdg"]
+    assert ours == pytest.approx([-x[0], x[1], x[2], x[3]], rel=1e-6)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Rivals
+
+
+@pytest.fixture(scope="module")
+def hub():
+    structure = flexible_link(stage=2, form="published", coupling="measured", laws=())
+    return demo_run("square").select(list(structure.signals)), structure.equation("theta21")
+
+
+def test_rivals_have_one_budget_and_bounds_that_do_not_know_the_maker_s_values(hub):
+    run, single = hub
+    lattice = ftlm.Lattice(step=0.25, alpha=(1.95, 2.0))
+    settings = ftlm.Genetic(seeds=(0,), evaluations=400)
+    made = like_for_like(run, single, lattice, settings, threads=1)
+    assert made.candidates == 224
+    # The maker's 2271 is not the middle of anything.
+    other = like_for_like(run, replace(single, reference={"a3": 1.0, "b3": 1.0}), lattice, settings, threads=1)
+    assert made.genetic.bounds == made.evolution.bounds == other.genetic.bounds
+    assert made.genetic.errors == other.genetic.errors
+    assert 400 <= made.genetic.evaluations[0] <= 600
+    assert 400 <= made.evolution.evaluations[0] < 400 + 15 * 8
+    # With the data alone to decide the lattice is better than both, with K0 = 1 it is worse.
+    strong, weak = (search.score for search in made.lattice.values())
+    assert weak < min(made.genetic.errors[0], made.evolution.errors[0]) < strong
+
+
+def test_differential_evolution_finds_what_is_there_and_the_same_again():
+    t = np.arange(513) * 0.02
+    u = np.where(np.arange(513) % 160 < 90, 1.0, -0.6)
+    truth = ftlm.Model(ftlm.equation("D^1.6 y = -3 D^0.6 y - 8 y + 5 u"))
+    run = truth.simulate(ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": 0 * t}))
+    single = ftlm.equation("D^alpha y = a1 D^nu y + a0 y + b0 u")
+    lattice = ftlm.Lattice(step=0.1, alpha=(1.5, 1.7))
+    bounds = {"a1": (-10, 0), "a0": (-20, 0), "b0": (0, 10)}
+    settings = ftlm.Genetic(seeds=(3,), evaluations=6000, bounds=bounds)
+    records = prepare([run], single, None, power_of_two=True)
+    told = []
+    found = differential_evolution_search(
+        records, single, lattice, settings, threads=1, progress=lambda done, of: told.append((done, of))
+    )
+    assert found.orders["alpha"] == pytest.approx(1.6, abs=0.05)
+    assert found.coefficients["b0"] == pytest.approx(5, rel=0.1)
+    assert told[-1][0] == told[-1][1] == found.evaluations[3]
+    assert differential_evolution_search(records, single, lattice, settings, threads=2) == found
+    moving = prepare([run.slice(1.0, 9.0)], replace(single, initial="caputo"), None, power_of_two=True)
+    with pytest.raises(ftlm.ModelError, match="slice the runs to start at rest"):
+        differential_evolution_search(moving, single, lattice, settings)
+
+
+def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():
+    assert seeds_for(224) == tuple(range(10))
+    assert seeds_for(61_620) == (0, 1, 2)
+    assert len(seeds_for(30_000)) == 6
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Arms
+
+
+def test_arms_differ_in_what_they_are_called_for():
+    whole = ARMS["whole orders"]
+    assert [whole.stage1.orders(1)[n] for n in ("gamma1", "beta2", "mu2")] == [1.0, 0.0, 1.0]
+    assert whole.stage1.coulomb == ARMS[MAIN].stage1.coulomb == 0.0
+    assert ARMS["whole orders, friction"].stage2.coulomb > 0
+    assert ARMS["whole orders, friction"].coupling == ARMS["fractional, friction"].coupling == 1.0
+    # The maker's model is the one arm: explicit Euler at 2 ms is what is left.
+    run = demo_run("square", parameters=whole, noise=0.0).select(["I1", "theta11", "theta12"])
+    exact = ftlm.link_model(stage=1).simulate(run)
+    assert np.std(run["theta12"] - exact["theta12"]) < 2e-3 * np.std(run["theta12"])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ({"arms": ["whole"]}, "arm 'whole' is not known"),
+        ({"arms": "whole orders"}, "is a text; give a list of names"),
+        ({"records": 0}, "records = 0 is no whole number from 1"),
+        ({"records": 2.5}, "records = 2.5 is no whole number from 1"),
+        ({"step": 0.0}, "step"),
+    ],
+)
+def test_what_cannot_be_asked_for_is_said_first(words, message):
+    said = []
+    with pytest.raises(ftlm.ModelError, match=message):
+        ftlm.reproduce(say=said.append, **words)
+    assert len(said) <= 1
