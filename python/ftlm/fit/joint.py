@@ -20,6 +20,7 @@ from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss
 from ftlm.data.structures import Initial, Structure
+from ftlm.fit.clock import Clock
 from ftlm.fit.extrapolation import feasible
 from ftlm.fit.friction import race_with_friction
 from ftlm.fit.grid import FINEST, Attempt, Grid
@@ -282,29 +283,33 @@ class Optimum:
 def refined(best: Attempt, grid: Grid, loss: Loss = "squares") -> Optimum:
     """Halve the step until that moves the estimate by little of its standard error."""
     estimate, settled = best.values, False
+    clock = Clock.of(grid.problem, grid.runs)
     while not settled and grid.every < FINEST:
         # On a finer grid residuals may shrink to their noise, so weights follow anew.
         finer, grid = with_settled_weights(best, grid.finer, loss)
-        errors = np.sqrt(np.diag(covariance(finer, grid)))
+        errors = clock.errors(finer.values, covariance(finer, grid))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
         # Of a flat valley in which neither stood still, or of two fits that a wall stopped, they tell nothing.
         still = finer.converged and best.converged
         limit = finer.values
         if still:
-            limit = feasible(grid.problem, limit, limit + (limit - best.values) / 3.0)
-        moved = np.abs(limit - estimate), np.abs(finer.values - best.values)
+            fine, coarse = clock.told(finer.values), clock.told(best.values)
+            limit = clock.untold(feasible(grid.problem, fine, fine + (fine - coarse) / 3.0))
+        ways = (limit, estimate), (finer.values, best.values)
+        moved = [np.abs(clock.told(one) - clock.told(other)) for one, other in ways]
         settled = any(bool(np.all(way <= REFINED * errors)) for way in moved)
         best, estimate = finer, limit
-    return Optimum(best, grid, nearer(best, grid, estimate), settled)
+    return Optimum(best, grid, nearer(best, grid, estimate, clock), settled)
 
 
-def nearer(best: Attempt, grid: Grid, limit: Floats) -> Floats:
+def nearer(best: Attempt, grid: Grid, limit: Floats, clock: Clock) -> Floats:
     """What is nearer to the truth on half the step, the limit that two grids tell or the optimum of the finer one.
 
     Along the bottom of a flat and curved valley, where numbers cannot be told apart, a straight line leads out of it.
     """
     columns = np.asarray(best.outcome["jacobian"]).T
-    if float(np.sum((columns @ (limit - best.values)) ** 2)) <= REFINED**2:
+    way = clock.step(best.values, clock.told(limit) - clock.told(best.values))
+    if float(np.sum((columns @ way) ** 2)) <= REFINED**2:
         # Both leave the same.
         return limit
     orders, coefficients, inputs = grid.problem.split(limit.tolist())
