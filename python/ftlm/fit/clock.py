@@ -72,4 +72,5 @@ class Clock:
         known = np.where(np.outer(seen, seen), covariance, 0.0)
         variances = np.einsum("ij,jk,ik->i", turned, known, turned)
         variances[(turned[:, ~seen] != 0.0).any(axis=1)] = np.inf
-        return np.sqrt(np.maximum(variances, 0.0))
+        errors: Floats = np.sqrt(np.maximum(variances, 0.0))
+        return errors

@@ -17,6 +17,7 @@ from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
 from ftlm.selection.candidates import Change, Inside, Variant, signature, worded
 from ftlm.selection.screen import Screened, screened
+from ftlm.selection.store import Store
 from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, numbers_of, refined, spread
 
 Item = TypeVar("Item")
@@ -56,12 +57,15 @@ class Work:
         Called with (candidates fitted, candidates known of so far).
     clock
         Seconds that pass.
+    store
+        What is already known of it, and what is kept of each step.
     """
 
     folds: Folds
     threads: int
     progress: Callable[[int, int], None] | None = None
     clock: Callable[[], float] = time.perf_counter
+    store: Store | None = None
     done: int = 0
     known: int = 0
     trials: list[Trial] = field(default_factory=list)
@@ -92,29 +96,46 @@ class Work:
         """A fitted candidate on what it never saw."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
-        try:
-            return judged(name, structure, self.folds, joint, fine=fine)
-        except FtlmError as error:
-            return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
+
+        def compute() -> Trial:
+            try:
+                return judged(name, structure, self.folds, joint, fine=fine)
+            except FtlmError as error:
+                return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
+
+        return compute() if self.store is None else self.store.judgement(name, structure, joint, fine, compute)
 
     def refined(self, trial: Trial) -> Trial:
         """A candidate whose numbers do not depend on the step of the grid."""
         if trial.fine:
             return trial
+        joint = self.fitted(trial.structure, [trial.values])
         try:
-            return refined(trial, self.folds)
+            # On a finer grid it may have no finite free run: it stays what it was judged as.
+            return trial if isinstance(joint, FtlmError) else refined(trial, self.folds, joint)
         except FtlmError:
-            # On a finer grid it has no finite free run: it stays what it was judged as.
             return trial
 
     def fitted(
         self, structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
     ) -> JointFit | FtlmError:
         """A fit on all runs, or why there is none."""
-        try:
-            return fit(self.folds.runs, structure, starts, refine=refine)
-        except FtlmError as error:
-            return error
+
+        def compute() -> JointFit | FtlmError:
+            try:
+                return fit(self.folds.runs, structure, starts, refine=refine)
+            except FtlmError as error:
+                return error
+
+        return compute() if self.store is None else self.store.fit(structure, starts, refine, compute)
+
+    def screened(self, inside: Inside) -> list[Screened]:
+        """Every subset of what drives, best first."""
+
+        def compute() -> list[Screened]:
+            return screened(inside, self.folds, self)
+
+        return compute() if self.store is None else self.store.subsets(inside.structure, compute)
 
 
 @dataclass(frozen=True)
@@ -149,7 +170,7 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
     from everything at whole orders, one thing less at a time. Where so many signals drive that subsets can be screened,
     growth begins with the best of them all; where no term may be left out, everything free is a root beside.
     """
-    subsets = screened(inside, work.folds, work)
+    subsets = work.screened(inside)
     found = _from_subsets(inside, work, subsets)
     if found:
         # What was screened is not fitted again because it is one thing more, or less, than something.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -17,6 +18,7 @@ from ftlm.selection.automatic import automatic
 from ftlm.selection.candidates import Inside, named, signature
 from ftlm.selection.growth import SAME, Work, grown, listed
 from ftlm.selection.result import Selection
+from ftlm.selection.store import Request, Store
 from ftlm.selection.trial import Folds, Trial, criterion, spread
 from ftlm.solve.records import prepare
 
@@ -38,6 +40,7 @@ def select(
     validation: str | Run | Sequence[Run] | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
+    store: str | os.PathLike[str] | None = None,
 ) -> Selection:
     """Choose the terms and orders that earn their place on runs that they were not fitted to.
 
@@ -64,6 +67,9 @@ def select(
         Candidates at a time, by default all cores; the result does not depend on it.
     progress
         Called with (candidates fitted, candidates known of so far).
+    store
+        File that keeps every fit as it ends: the same call with the same file goes on where it was stopped, with
+        Ctrl-C or by the machine, and comes to the same bits.
 
     Returns
     -------
@@ -73,7 +79,8 @@ def select(
     Raises
     ------
     DataError
-        Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing.
+        Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing; a store
+        of another selection, in use, damaged, or that cannot be written.
     ModelError
         No candidates, two that are the same but for the names of their numbers, more than 10 000, no validation run,
         words that are not known, one run where several are needed, a validation run that is fitted to.
@@ -93,7 +100,6 @@ def select(
     workers = Settings.check(coefficients="least-squares", threads=threads).threads
     several = [runs] if isinstance(runs, Run) else list(runs)
     folds = Folds.of(runs, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
-    work = Work(folds, workers, progress)
     if not isinstance(candidates, (str, Structure)) and len(candidates) > MOST:
         raise ModelError(
             f"{len(candidates)} candidates are more than {MOST}; give one structure instead, whose inside is grown "
@@ -107,11 +113,21 @@ def select(
     for structure in (*searched, *every.values()):
         # Refused here, once, and not as a failure of every candidate.
         prepare(folds.runs, replace(structure.as_given(), offset="none"), None, power_of_two=False, gaps=True)
+    if store is None:
+        return _found(Work(folds, workers, progress), searched, every)
+    judges = [f.judged for f in folds.parts if not any(f.judged is r for r in folds.runs)]
+    asked = Request.of(folds.runs, [searched, every], judges, folds.words)
+    with Store(store, asked) as kept:
+        return _found(Work(folds, workers, progress, store=kept), searched, every)
+
+
+def _found(work: Work, searched: Sequence[Structure], every: Mapping[str, Structure]) -> Selection:
+    """What structures grown inside some, and those of a list, come to."""
     for structure in searched:
         grown(Inside(structure), work)
     if every:
         listed(every, work)
-    return _chosen(work, folds)
+    return _chosen(work, work.folds)
 
 
 def _chosen(work: Work, folds: Folds) -> Selection:

@@ -292,9 +292,8 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fi
     )  # fmt: skip
 
 
-def refined(trial: Trial, folds: Folds) -> Trial:
-    """A candidate fitted on all runs on grids so fine that its numbers no longer depend on them."""
-    joint = fit(folds.runs, trial.structure, [trial.values])
+def refined(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
+    """A candidate with a fit on all runs on grids so fine that its numbers no longer depend on them."""
     estimation = compare(model_of(trial.structure, joint, folds.runs), list(folds.runs)).fit_percent
     return replace(
         trial, joint=joint, estimation=dict(estimation), errors=joint.standard_errors, idle=idle(joint), fine=True,
