@@ -10,6 +10,7 @@ import pytest
 from scipy import signal
 from typer.testing import CliRunner
 
+import friction
 import ftlm
 from ftlm.base.threads import stop
 from ftlm.cli.app import app
@@ -85,6 +86,50 @@ def test_a_dead_time_is_found_where_there_is_one(runs):
     assert without.winner.structure.free_delays == {}
 
 
+def cart(seed, strength, rows=200, step=0.02):
+    """A spring-mounted body on dry friction by slow stepping, in noise of half a percent."""
+    rng = np.random.default_rng([17, seed])
+    u = np.repeat(rng.uniform(-1.0, 1.0, rows // 10 + 1), 10)[:rows]
+    position, _ = friction.naive_run(np.repeat(3.0 * u, 10), step / 10, 2.0, [(-1.0, 1.0), (-4.0, 0.0)], strength)
+    # What the oracle has at an instant the force before it did.
+    y = np.append(0.0, position)[::10][:rows]
+    y = y + 0.005 * np.std(y) * rng.standard_normal(rows)
+    return ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": y}, name=f"cart {seed}")
+
+
+@pytest.mark.parametrize("strength", [0.6, 0.0])
+def test_friction_is_chosen_where_there_is_some(strength):
+    asked = ftlm.equation("D^2 y = -d D y - k y + g u - fc*sign(D y)")
+    found = ftlm.select([cart(seed, strength) for seed in (0, 1)], asked, threads=1)
+    words = "D^2 y = -d D^1 y - k y + g u"
+    assert found.winner.name == words + (" - fc sign(D y)" if strength else "")
+    assert {words, f"{words} - fc sign(D y)"} <= {t.name for t in found.trials}
+    low, high = found.best.intervals["k"]
+    assert low - 0.05 < 4.0 < high + 0.05
+    if strength:
+        assert found.best.coefficients["fc"] == pytest.approx(strength, rel=0.02)
+
+
+def test_frictions_that_may_be_left_out():
+    inside = Inside(ftlm.equation("D^2 y = g u - fc*sign(D y) - fs*exp(-(D y/vs)^2)*sign(D y)"))
+    assert inside.frictions == {"friction of y": None, "friction of y near rest": "friction of y"}
+    assert str(inside.sliding) == "D^2 y = g u"
+    (first,) = [c.variant for c in inside.skeletons()]
+    coulomb = next(c for c in inside.larger(first))
+    assert [c.words for c in inside.larger(first)] == ["friction of y"]
+    assert str(inside.build(coulomb.variant)) == "D^2 y = g u - fc sign(D y)"
+    (whole,) = list(inside.larger(coulomb.variant))
+    assert inside.build(whole.variant) == inside.structure
+    # Without the one it stands on, what falls with speed goes, too.
+    fewer = {c.words: str(inside.build(c.variant)) for c in inside.smaller(whole.variant)}
+    assert fewer["without friction of y"] == "D^2 y = g u"
+    assert fewer["without friction of y near rest"] == "D^2 y = g u - fc sign(D y)"
+    # Of a size that is known it is no choice.
+    known = Inside(ftlm.equation("D^2 y = g u - 0.5*sign(D y)"))
+    assert known.frictions == {}
+    assert known.sliding == known.structure
+
+
 def test_a_list_is_ranked_by_prediction_and_failures_have_a_reason(runs):
     found = ftlm.select(
         runs,
@@ -154,6 +199,13 @@ def test_everything_inside_a_structure_is_one():
         assert str(inside.build(first)) in back
     # A second own term at order 0 would be the same as the first.
     assert not inside.possible(Variant(frozenset({"d", "a", "b0"}), (("mu", 2.0),), offset=False))
+
+
+def test_what_only_drives_has_a_skeleton(runs):
+    inside = Inside(ftlm.equation("D^2 y = b0 u + b1 D u"))
+    assert [str(inside.build(c.variant)) for c in inside.skeletons()] == ["D^2 y = b0 u", "D^2 y = b1 D^1 u"]
+    found = ftlm.select(runs, ftlm.equation("D^2 y = b u"), threads=1)
+    assert found.winner.name == "D^2 y = b u"
 
 
 def test_masked_runs_keep_what_was_read(runs):

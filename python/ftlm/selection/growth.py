@@ -150,13 +150,17 @@ class Fitted:
 def starts_from(
     structure: Structure, values: Mapping[str, float], whole: Mapping[str, float]
 ) -> list[dict[str, float]]:
-    """Where a structure starts that has what `values` knows, orders that were `whole`, and coefficients that were 0."""
+    """Where a structure starts that has what `values` knows, orders that were `whole`, and coefficients that were 0.
+
+    Friction that `values` does not know is in none of them.
+    """
     problem = FreeProblem.of(structure)
     usual: dict[str, list[float]] = {}
     for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
         at = whole.get(name, 0.5 * (low + high))
         usual[name] = [min(max(at + shift, low), high) for shift in SHIFTS]
-    usual |= {n: [0.0] for n in problem.coefficients}
+    rubs = {n for e in structure.equations if e.friction is not None for n in e.friction.names}
+    usual |= {n: [0.0] for n in problem.coefficients if n not in rubs}
     usual |= {i.name: [i.bounds[0] + s * (i.bounds[1] - i.bounds[0]) for s in SHARES] for i in problem.inputs}
     places = {n: [values[n]] if n in values else places for n, places in usual.items()}
     return [dict(zip(places, point, strict=True)) for point in itertools.product(*places.values())]

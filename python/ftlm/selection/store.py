@@ -190,8 +190,21 @@ class SubsetFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     whole: tuple[tuple[str, float], ...]
     offset: bool
     inputs: tuple[str, ...]
+    rubs: tuple[str, ...]
     start: dict[str, float]
     score: float
+
+    @classmethod
+    def of(cls, one: Screened) -> SubsetFile:
+        """Write one."""
+        v = one.change.variant
+        kept, inputs, rubs = (tuple(sorted(names)) for names in (v.kept, v.inputs, v.rubs))
+        return cls(one.change.words, kept, v.whole, v.offset, inputs, rubs, dict(one.start), one.score)
+
+    def screened(self) -> Screened:
+        """Give it back."""
+        variant = Variant(frozenset(self.kept), self.whole, self.offset, frozenset(self.inputs), frozenset(self.rubs))
+        return Screened(Change(self.words, variant), self.start, self.score)
 
 
 class SubsetsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="subsets"):
@@ -202,22 +215,11 @@ class SubsetsFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="
     @classmethod
     def of(cls, subsets: Sequence[Screened]) -> SubsetsFile:
         """Write them."""
-        return cls(tuple(
-            SubsetFile(
-                s.change.words, tuple(sorted(v.kept)), v.whole, v.offset, tuple(sorted(v.inputs)), dict(s.start),
-                s.score,
-            )
-            for s in subsets for v in [s.change.variant]
-        ))  # fmt: skip
+        return cls(tuple(SubsetFile.of(s) for s in subsets))
 
     def subsets(self) -> list[Screened]:
         """Give them back."""
-        return [
-            Screened(
-                Change(s.words, Variant(frozenset(s.kept), s.whole, s.offset, frozenset(s.inputs))), s.start, s.score
-            )
-            for s in self.each
-        ]
+        return [s.screened() for s in self.each]
 
 
 Answer = Refused | FitFile | JudgementFile | SubsetsFile

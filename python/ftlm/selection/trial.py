@@ -242,10 +242,17 @@ def decided(structure: Structure, runs: Sequence[Run]) -> Structure:
 def fit(
     runs: Sequence[Run], structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
 ) -> JointFit:
-    """The lowest of the fits from some starts, or from an automatic start where there are none."""
+    """The lowest of the fits from some starts, or from an automatic start where there are none.
+
+    Friction that no start knows may have no descent from 0 to where it is: automatic starts stand beside the given
+    ones, in which it is 0.
+    """
     asked = decided(structure, runs)
-    if not starts:
-        return fit_output_error(runs, asked, refine=refine)
+    problem = FreeProblem.of(asked)
+    if not starts or any(n not in s for s in starts for n in problem.names):
+        # Where friction is 0 the speed at which it falls may be any.
+        nothing = {n: 0.0 if low == 0 else 1.0 for n, (low, _) in zip(problem.names, problem.all_bounds, strict=True)}
+        return fit_output_error(runs, asked, refine=refine, known=[{**nothing, **s} for s in starts])
     ends: list[JointFit] = []
     last: FtlmError | None = None
     for start in starts:
