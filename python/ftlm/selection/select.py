@@ -13,9 +13,10 @@ from ftlm.base.errors import ConvergenceError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Structure
+from ftlm.fit.problem import FreeProblem
 from ftlm.identification.identify import identify
 from ftlm.selection.automatic import automatic
-from ftlm.selection.candidates import Inside, named, signature
+from ftlm.selection.candidates import Inside, named, signature, worded
 from ftlm.selection.growth import SAME, Work, grown, listed
 from ftlm.selection.result import Selection
 from ftlm.selection.store import Request, Store
@@ -100,6 +101,11 @@ def select(
     workers = Settings.check(coefficients="least-squares", threads=threads).threads
     several = [runs] if isinstance(runs, Run) else list(runs)
     folds = Folds.of(runs, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
+    if not isinstance(candidates, (str, Structure, Sequence, Mapping)):
+        raise ModelError(
+            f"candidates is {type(candidates).__name__}; use ftlm.equation(…), a list or a dictionary of structures, "
+            "or 'auto'"
+        )
     if not isinstance(candidates, (str, Structure)) and len(candidates) > MOST:
         raise ModelError(
             f"{len(candidates)} candidates are more than {MOST}; give one structure instead, whose inside is grown "
@@ -110,6 +116,11 @@ def select(
         raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
     searched = automatic(folds.runs) if isinstance(candidates, str) else []
     searched += [candidates] if isinstance(candidates, Structure) else []
+    idle = [worded(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
+    if idle:
+        raise ModelError(
+            f"{idle[0]} has nothing to estimate; name a coefficient or an order, or use model.compare(runs)"
+        )
     for structure in (*searched, *every.values()):
         # Refused here, once, and not as a failure of every candidate.
         prepare(folds.runs, replace(structure.as_given(), offset="none"), None, power_of_two=False, gaps=True)
@@ -176,15 +187,15 @@ def _as_good(trial: Trial, best: Trial) -> bool:
 
     The best is the luckiest of many: a single standard error would refuse a true structure for it in one case of ten.
     Where one block alone says what the others cannot, leaving it out costs the truth far more than 5 %: very strong
-    evidence on all samples lets it stand beside.
+    evidence on all samples lets it stand beside. So it does, within 5 %, where folds are too few to tell a scatter.
     """
     apart = np.array(trial.scores) - np.array(best.scores)
+    far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - STRONG
     if apart.size < FOLDS:
-        return trial.score - best.score <= SAME
+        return far <= SAME or (far <= MOST_ALIKE and likely)
     scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
     quantile = STUDENT_95[min(apart.size - FOLDS, len(STUDENT_95) - 1)]
-    told = trial.score - best.score <= quantile * scatter and _bic(trial) <= _bic(best) - STRONG
-    return told or trial.score - best.score <= max(SAME, min(quantile * scatter, MOST_ALIKE))
+    return (far <= quantile * scatter and likely) or far <= max(SAME, min(quantile * scatter, MOST_ALIKE))
 
 
 def _winner(near: Sequence[Trial]) -> Trial:

@@ -288,8 +288,12 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fi
     validation: dict[str, dict[str, float]] = {}
     for fold in folds.parts:
         runs = fold.seen(structure.outputs)
-        own = joint if runs is folds.runs else fit(runs, structure, [start])
-        validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
+        try:
+            own = joint if runs is folds.runs else fit(runs, structure, [start])
+            validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
+        except FtlmError as error:
+            # What is wrong is wrong with what is left, not with the runs as they were given.
+            raise type(error)(f"without {fold.name}: {error}") from error
     fits = [max(v, LOST) if math.isfinite(v) else LOST for part in validation.values() for v in part.values()]
     scores = tuple(math.log(max(1.0 - v / 100.0, 1e-12)) for v in fits)
     return Trial(
