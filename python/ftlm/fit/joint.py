@@ -176,13 +176,14 @@ class JointFit:
 def fit_output_error(
     runs: Sequence[Run], structure: Structure, *, threads: int = 1, start: Mapping[str, float] | None = None,
     refine: bool = True, progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
-    known: Sequence[Mapping[str, float]] = (),
+    known: Sequence[Mapping[str, float]] = (), near: JointFit | None = None,
 ) -> JointFit:  # fmt: skip
     """Fit all equations of a structure on all runs by output error, from an automatic start.
 
     A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
-    everything free by name, and is the only one; known ones stand beside the automatic ones. Without `refine` the grid
-    is not refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
+    everything free by name, and is the only one; known ones stand beside the automatic ones. `near` is a fit of the same
+    structure to nearly the same runs, to go on from on its grid and with its weights. Without `refine` the grid is not
+    refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
     all samples, not between starts.
 
     Raises
@@ -200,17 +201,19 @@ def fit_output_error(
             "longer runs, or fix orders or coefficients"
         )
     sizes = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in outputs}
+    if near is not None:
+        attempt = given(problem, dict(zip(near.names, near.values.tolist(), strict=True)))
+        grid = Grid(problem, runs, [1.0 / max(near.noise[o], 1e-300) for o in outputs], near.refinement)
+        return ended(*with_settled_weights(attempt, grid, loss), [], loss, refine=refine)
     noise = {o: first_noise(runs, structure, o, sizes[o]) for o in outputs}
     # Starts are compared with every output weighing alike: noise decides where the optimum is, not how to get near it.
     alike = Grid(problem, runs, [1.0 / (COARSE_SHARE * sizes[o]) for o in outputs])
     weighed = Grid(problem, runs, [1.0 / noise[o] for o in outputs])
-    starts: list[tuple[float, str]] = []
     reached: list[Attempt] = []
     if start is None:
         floor = float(np.mean([(noise[o] / (COARSE_SHARE * sizes[o])) ** 2 for o in outputs]))
         runners = race_with_friction if structure.has_friction else race
         reached = runners(alike, floor, threads, progress)
-        starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
         contenders = finalists(reached) if reached else []
         contenders += [given(problem, values) for values in known]
     else:
@@ -223,11 +226,16 @@ def fit_output_error(
     while weighed.every < FINEST and weighed.matters(contenders[0]):
         weighed = weighed.finer
     best = weighed.descend(winner(contenders, replace(alike, every=weighed.every)), LAST_LAP)
-    best, weighed = with_settled_weights(best, weighed, loss)
-    best, weighed, growth = steadied(best, weighed, reached)
+    return ended(*with_settled_weights(best, weighed, loss), reached, loss, refine=refine)
+
+
+def ended(best: Attempt, grid: Grid, reached: Sequence[Attempt], loss: Loss, *, refine: bool) -> JointFit:
+    """What a fit comes to whose weights have settled: one that dies away where it may, on grids fine enough."""
+    best, grid, growth = steadied(best, grid, reached)
     if growth is not None and not growth.kept:
-        best, weighed = with_settled_weights(best, weighed, loss)
-    optimum = refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True)
+        best, grid = with_settled_weights(best, grid, loss)
+    optimum = refined(best, grid, loss) if refine else Optimum(best, grid, best.values, settled=True)
+    starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
     return replace(joint_fit(optimum, starts), growth=growth)
 
 
@@ -252,7 +260,7 @@ def winner(contenders: Sequence[Attempt], near: Grid) -> Attempt:
             # No finite free run on this grid; the others have one.
             if attempt is contenders[-1] and not ends:
                 raise
-    return near.lowest(near.finer.ranked(ends)[0], LAST_LAP)
+    return near.lowest(near.finer.ranked(ends)[0] if len(ends) > 1 else ends[0], LAST_LAP)
 
 
 def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -> tuple[Attempt, Grid]:

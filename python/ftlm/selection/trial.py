@@ -240,14 +240,19 @@ def decided(structure: Structure, runs: Sequence[Run]) -> Structure:
 
 
 def fit(
-    runs: Sequence[Run], structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
-) -> JointFit:
+    runs: Sequence[Run], structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True,
+    near: JointFit | None = None,
+) -> JointFit:  # fmt: skip
     """The lowest of the fits from some starts, or from an automatic start where there are none.
+
+    Where there is a fit of this structure to nearly these runs, it goes on from there.
 
     Friction that no start knows may have no descent from 0 to where it is: automatic starts stand beside the given
     ones, in which it is 0.
     """
     asked = decided(structure, runs)
+    if near is not None:
+        return fit_output_error(runs, asked, refine=refine, near=near)
     problem = FreeProblem.of(asked)
     if not starts or any(n not in s for s in starts for n in problem.names):
         # Where friction is 0 the speed at which it falls may be any.
@@ -289,7 +294,7 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fi
     for fold in folds.parts:
         runs = fold.seen(structure.outputs)
         try:
-            own = joint if runs is folds.runs else fit(runs, structure, [start])
+            own = joint if runs is folds.runs else fit(runs, structure, [], near=joint)
             validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
         except FtlmError as error:
             # What is wrong is wrong with what is left, not with the runs as they were given.
