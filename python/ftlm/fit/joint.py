@@ -181,9 +181,9 @@ def fit_output_error(
     """Fit all equations of a structure on all runs by output error, from an automatic start.
 
     A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
-    everything free by name, and is the only one; known ones stand beside the automatic ones. `near` is a fit of the same
-    structure to nearly the same runs, to go on from on its grid and with its weights. Without `refine` the grid is not
-    refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
+    everything free by name, and is the only one; known ones stand beside the automatic ones; `near` is a fit of the
+    same structure to nearly the same runs, to go on from on its grid and with its weights. Without `refine` the grid is
+    not refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
     all samples, not between starts.
 
     Raises
