@@ -127,11 +127,11 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
     shutil.copy(path, place)
     before = place.read_bytes()
     for words, other in {
-        "other candidates": lambda: ftlm.select(runs, [SECOND], store=place),
-        "other runs": lambda: ftlm.select([runs[0], motor(3, rows=200)], [SECOND, FIRST], store=place),
-        "another validation": lambda: ftlm.select(runs, [SECOND, FIRST], validation="blocks", store=place),
+        "of other candidates": lambda: ftlm.select(runs, [SECOND], store=place),
+        "of other runs": lambda: ftlm.select([runs[0], motor(3, rows=200)], [SECOND, FIRST], store=place),
+        "by another validation": lambda: ftlm.select(runs, [SECOND, FIRST], validation="blocks", store=place),
     }.items():
-        with pytest.raises(ftlm.DataError, match=rf"another selection \(asked is one of {words}\); choose"):
+        with pytest.raises(ftlm.DataError, match=f"holds a selection {words}; choose another file"):
             other()
     judged = ftlm.select(runs[0], [FIRST], validation=runs[1], store=tmp_path / "judged.ftlm")
     assert judged.winner.failed is None
@@ -155,8 +155,12 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
         ftlm.select(runs, [FIRST], store=tmp_path)
     with pytest.raises(ftlm.DataError, match="cannot be opened: No such file"):
         ftlm.select(runs, [FIRST], store=tmp_path / "no" / "such.ftlm")
-    with pytest.raises(ftlm.DataError, match="is no ftlm search store"):
+    with pytest.raises(
+        ftlm.DataError, match="is the store of a selection, not of a search; go on with it by the call that began it"
+    ):
         ftlm.resume_search(place)
+    with pytest.raises(ftlm.DataError, match=r"^.*other\.ftlm is the store of a selection, not of a search"):
+        ftlm.search_status(place)
     forged = tmp_path / "forged.ftlm"
     with Store(forged, request) as kept:
         kept._log.append([ENCODER.encode(request)])

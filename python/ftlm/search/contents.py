@@ -117,6 +117,8 @@ def read_store(path: str | os.PathLike[str]) -> Contents:
         with os.fdopen(handle, "rb") as stream:
             check(path, handle, SEARCH)
             data = stream.read()
+    except DataError:
+        raise
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else None
         raise DataError(f"store {path} cannot be read: {why or error}; check the path") from error

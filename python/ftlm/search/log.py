@@ -24,8 +24,8 @@ class Kind:
     magic: bytes
 
 
-#: The store of an order search.
-SEARCH = Kind("search", frames.MAGIC)
+#: The stores of an order search and of a selection.
+SEARCH, SELECTION = KINDS = (Kind("search", frames.MAGIC), Kind("selection", b"ftlm selection store 1\n"))
 
 
 def check(path: str | os.PathLike[str], handle: int, kind: Kind) -> None:
@@ -33,7 +33,13 @@ def check(path: str | os.PathLike[str], handle: int, kind: Kind) -> None:
     status = os.fstat(handle)
     if not stat.S_ISREG(status.st_mode):
         raise DataError(f"store {path} is no regular file; choose another file")
-    if not kind.magic.startswith(os.read(handle, len(kind.magic))):
+    begins = os.read(handle, max(len(k.magic) for k in KINDS))
+    other = next((k.name for k in KINDS if k != kind and begins.startswith(k.magic)), None)
+    if other is not None:
+        raise DataError(
+            f"{path} is the store of a {other}, not of a {kind.name}; go on with it by the call that began it"
+        )
+    if not kind.magic.startswith(begins[: len(kind.magic)]):
         raise DataError(f"{path} is no ftlm {kind.name} store; give a file written with store= (--store)")
     if status.st_size > LARGEST:
         raise DataError(

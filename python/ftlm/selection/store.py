@@ -25,13 +25,12 @@ from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.joint import JointFit
 from ftlm.fit.steady import Growth
 from ftlm.search import frames
-from ftlm.search.log import Kind, Log
+from ftlm.search.log import SELECTION, Log
 from ftlm.selection.candidates import Change, Variant
 from ftlm.selection.screen import Screened
 from ftlm.selection.trial import Trial
 
 Made = TypeVar("Made")
-SELECTION = Kind("selection", b"ftlm selection store 1\n")
 #: Number of how a candidate is fitted and judged; answers of different ones must not be joined.
 ALGORITHM = 1
 #: Errors that a candidate may end with; any other is none of its own.
@@ -73,7 +72,7 @@ class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="sele
 
     def difference(self, other: Request) -> str | None:
         """Say what sets another request apart, or None."""
-        words = {"runs": "other runs", "candidates": "other candidates", "validation": "another validation"}
+        words = {"runs": "of other runs", "candidates": "of other candidates", "validation": "by another validation"}
         return next((said for n, said in words.items() if getattr(self, n) != getattr(other, n)), None)
 
 
@@ -289,7 +288,7 @@ class Store:
         path = self._log.path
         difference = asked.difference(held)
         if difference is not None:
-            raise DataError(f"store {path} holds another selection (asked is one of {difference}); choose another file")
+            raise DataError(f"store {path} holds a selection {difference}; choose another file")
         if (asked.algorithm, asked.version) != (held.algorithm, held.version):
             raise DataError(
                 f"store {path} is of ftlm {held.version}, algorithm {held.algorithm}, and this is {asked.version}, "
