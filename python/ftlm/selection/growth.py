@@ -400,7 +400,8 @@ def listed(candidates: Mapping[str, Structure], work: Work) -> list[Trial]:
         return work.judge(name, structure, work.fitted(structure, []), fine=True)
 
     items = list(candidates.items())
-    if len(items) > MANY:
+    # What a store gives back takes no time, and tells none.
+    if len(items) > MANY and not (work.store is not None and len(work.store)):
         begun = work.clock()
         work.trials += work.each(one, items[: work.threads])
         took = work.clock() - begun
