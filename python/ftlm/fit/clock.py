@@ -13,6 +13,9 @@ from ftlm.data.run import Run
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.records import affine
 
+#: ln of the largest power of the unit that counts; the core's, too.
+LARGEST = 300.0
+
 
 @dataclass(frozen=True)
 class Clock:
@@ -50,7 +53,7 @@ class Clock:
 
     def _factors(self, values: Floats) -> Floats:
         # Only orders have weights, and they are the same in any unit.
-        powers: Floats = np.exp(self.unit * (self.constants + self.weights @ values))
+        powers: Floats = np.exp(np.clip(self.unit * (self.constants + self.weights @ values), -LARGEST, LARGEST))
         return powers
 
     def told(self, values: Floats) -> Floats:

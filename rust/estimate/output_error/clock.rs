@@ -7,6 +7,9 @@
 use super::experiment::Experiment;
 use super::model::{Coordinate, FreeModel};
 
+/// ln of the largest power of the unit that counts.
+const LARGEST: f64 = 300.0;
+
 /// ln of the unit of time, and of each coefficient that stands alone before a term the weights of the free orders in α − ν,
 /// behind its constant; none of others, which keep their number.
 pub(super) struct Clock {
@@ -27,13 +30,15 @@ impl Clock {
     pub(super) fn factor(&self, coefficient: usize, orders: &[f64]) -> f64 {
         self.powers[coefficient].as_ref().map_or(1.0, |(constant, weights)| {
             let power = constant + weights.iter().zip(orders).map(|(w, o)| w * o).sum::<f64>();
-            libm::exp(power * self.unit)
+            // Of units beyond all measure no number is left.
+            libm::exp((power * self.unit).clamp(-LARGEST, LARGEST))
         })
     }
 
     /// Share of itself by which a coefficient falls with one more of a free order, its number in the unit kept.
     pub(super) fn fall(&self, coefficient: usize, order: usize) -> f64 {
-        self.powers[coefficient].as_ref().map_or(0.0, |(_, weights)| weights[order] * self.unit)
+        let weight = |(_, weights): &(f64, Vec<f64>)| weights.get(order).copied().unwrap_or(0.0);
+        self.powers[coefficient].as_ref().map_or(0.0, weight) * self.unit
     }
 }
 
