@@ -75,14 +75,14 @@ def test_any_number_of_threads_gives_the_same_bits(runs, chosen):
     assert again.fitted == chosen.fitted
 
 
-def test_a_dead_time_is_found_where_there_is_one(runs):
-    late = [motor(0, late=4), motor(1, late=4)]
+def test_a_dead_time_is_found_where_there_is_one():
+    late = [motor(0, rows=200, late=4), motor(1, rows=200, late=4)]
     structure = ftlm.equation("D^2 y = d D y + a y + b u", delay={"u": (0.0, 0.3)})
     with_delay = ftlm.select(late, structure, threads=2)
     assert with_delay.winner.structure.free_delays == {"u": (0.0, 0.3)}
     assert with_delay.best.delays["u"] == pytest.approx(0.08, abs=2e-3)
     assert "delay of u free" in with_delay.winner.name
-    without = ftlm.select(runs, structure, threads=2)
+    without = ftlm.select([motor(0, rows=200), motor(1, rows=200)], structure, threads=2)
     assert without.winner.structure.free_delays == {}
 
 
