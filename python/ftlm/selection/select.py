@@ -47,12 +47,12 @@ def select(
 
     A structure is grown: from the simplest one inside it (whole orders, the output's own terms, one thing that drives),
     a term, a free order, a delay, friction or an offset more at a time, each fitted by output error from the last
-    optimum, the two most promising by Schwarz's criterion judged by free runs on what they were not fitted to; where two
-    steps in a row predict no better, it is pruned, one thing less at a time. A list is judged whole, from automatic
+    optimum, the two most promising by Schwarz's criterion judged by free runs on what they were not fitted to. Where
+    two steps in a row predict no better, it is pruned, one thing less at a time. A list is judged whole, from automatic
     starts. Chosen is, among those that predict as well as the best (what is left over is within 1 %, or, up to 5 %,
-    three or more folds do not tell the difference from 0 at 95 %, or samples all together are strong evidence), the one with the least Schwarz criterion, samples
-    counted as the colour of the residuals lets them; of those alike in that the one with the fewest numbers, of the
-    lowest order, best determined.
+    three or more folds do not tell the difference from 0 at 95 %, or all samples are very strong evidence), the one
+    with the least Schwarz criterion, samples counted as the colour of the residuals lets them; of those alike in that
+    the one with the fewest numbers, of the lowest order, best determined.
 
     Parameters
     ----------
