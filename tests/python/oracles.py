@@ -8,7 +8,7 @@ D^alpha y = sum of c D^nu s, and a term enters divided by D^alpha, as c I^(alpha
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from math import gamma
 
@@ -242,3 +242,23 @@ def fit_percent(measured: np.ndarray, model: np.ndarray) -> float:
     """Fit in per cent: 100 for a perfect model, 0 for one no better than the mean."""
     measured, model = np.asarray(measured, float), np.asarray(model, float)
     return float(100 * (1 - np.linalg.norm(measured - model) / np.linalg.norm(measured - measured.mean())))
+
+
+def held_response(
+    transfer: Callable[[np.ndarray], np.ndarray], u: np.ndarray, step: float, aliases: int = 30
+) -> np.ndarray:
+    """Samples of the response to an input that is held from each sample to the next, by the inverse z-transform.
+
+    The z-transform of a sampled response is the sum of the Laplace transform's aliases (Poisson); it is inverted by a
+    discrete Fourier transform along a circle so far out that what wraps around is gone. `transfer` takes points in the
+    complex plane, and may give a row an output.
+    """
+    rows = len(u)
+    count = 2 * rows
+    damp = 23.0 / (count * step)
+    s = damp + 2j * np.pi * np.arange(count // 2 + 1) / (count * step)
+    places = [s + 2j * np.pi * m / step for m in range(-aliases, aliases + 1)]
+    pulse = sum(transfer(at) / at for at in places) * (1 - np.exp(-s * step)) / step
+    decay = np.exp(-damp * step * np.arange(count))
+    spectrum = np.fft.rfft(np.pad(u, (0, rows)) * decay)
+    return (np.fft.irfft(pulse * spectrum, count) / decay)[..., :rows]

@@ -17,7 +17,7 @@ from ftlm import _core, rig
 from ftlm.base import output
 from ftlm.base.output import write_atomically
 from ftlm.cli import app
-from ftlm.search import contents
+from ftlm.search import log
 from ftlm.search.contents import read_store
 
 
@@ -111,7 +111,7 @@ def test_a_store_that_is_no_file_is_refused_at_once(tmp_path, writing):
 def test_a_sparse_file_of_gigabytes_is_refused_before_it_is_read(tmp_path, start):
     path = tmp_path / "store"
     path.write_bytes(start)
-    os.truncate(path, contents.LARGEST + 1)
+    os.truncate(path, log.LARGEST + 1)
     with pytest.raises(ftlm.DataError, match="is no ftlm search store" if not start else "more than the"):
         read_store(path)
     with pytest.raises(ftlm.DataError, match="is no ftlm search store" if not start else "more than the"):

@@ -12,6 +12,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 from scipy import integrate as quadrature
+from scipy import signal
 
 import oracles
 
@@ -534,3 +535,21 @@ def test_printed_errors_are_sums_over_the_pulses():
     for rows in PRINTED_RIVALS.values():
         for error, rmse, _ in rows:
             assert 0.5 < float(error) / PRINTED_POINTS / float(rmse) <= 1
+
+
+def test_the_response_to_a_held_input_is_that_of_lsim_and_of_the_inverse_transform():
+    rng = np.random.default_rng(6)
+    u, step = rng.standard_normal(300), 0.02
+    whole = signal.cont2discrete(signal.tf2ss([3.0, 40.0], [1.0, 2.0, 40.0]), step, "zoh")
+    found = oracles.held_response(lambda s: (3.0 * s + 40.0) / (s**2 + 2.0 * s + 40.0), u, step, aliases=2000)
+    np.testing.assert_allclose(found, signal.dlsim(whole, u)[1][:, 0], atol=2e-5)
+
+    def plant(s):
+        return 1.25 / (s**2.2 + 0.625 * s**0.9 + 1.25)
+
+    steps = oracles.held_response(plant, np.ones(201), 0.05)
+    for place in (20, 200):
+        exact = mp.invertlaplace(lambda s: plant(s) / s, place * 0.05, method="talbot")
+        assert steps[place] == pytest.approx(float(exact), abs=1e-8)
+    both = oracles.held_response(lambda s: np.stack([plant(s), 2.0 * plant(s)]), np.ones(201), 0.05)
+    np.testing.assert_allclose(both, [steps, 2.0 * steps], atol=1e-14)

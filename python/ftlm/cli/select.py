@@ -11,6 +11,7 @@ from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
 from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show
+from ftlm.cli.identify import resumable
 from ftlm.cli.options import CandidateTexts, Files, Force, Json, Out, ReadingOptions, StructureOptions, Text, Threads
 from ftlm.data.structures import Structure
 from ftlm.selection import select as choice
@@ -26,7 +27,11 @@ def select(
             help="Judge each run, or each quarter of every run, by the others; or by a run that nothing is fitted to.",
         ),
     ] = None,
-    threads: Threads = None, out: Out = None,
+    threads: Threads = None,
+    store: Annotated[
+        Text, Option(metavar="FILE", help="Keep every fit there; the same command goes on with it.")
+    ] = None,
+    out: Out = None,
     report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
     force: Force = False, as_json: Json = False,
 ) -> None:  # fmt: skip
@@ -49,8 +54,8 @@ def select(
     # The slice is of the runs that are fitted to.
     of_its_own = validation not in (None, "runs", "blocks")
     judges = replace(reading, sliced=None).runs([str(validation)]) if of_its_own else validation
-    with Progress("fitting candidates", quiet=as_json) as progress:
-        found = choice.select(runs, candidates, validation=judges, threads=threads, progress=progress)
+    with resumable(store, "the same command"), Progress("fitting candidates", quiet=as_json) as progress:
+        found = choice.select(runs, candidates, validation=judges, threads=threads, progress=progress, store=store)
     if out is not None:
         found.best.model.save(out, force=force)
     if report is not None:

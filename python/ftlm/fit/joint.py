@@ -21,6 +21,7 @@ from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss
 from ftlm.data.structures import Initial, Structure
+from ftlm.fit.clock import Clock
 from ftlm.fit.extrapolation import feasible
 from ftlm.fit.friction import race_with_friction
 from ftlm.fit.grid import FINEST, Attempt, Grid
@@ -176,13 +177,14 @@ class JointFit:
 def fit_output_error(
     runs: Sequence[Run], structure: Structure, *, threads: int = 1, start: Mapping[str, float] | None = None,
     refine: bool = True, progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
-    known: Sequence[Mapping[str, float]] = (),
+    known: Sequence[Mapping[str, float]] = (), near: JointFit | None = None,
 ) -> JointFit:  # fmt: skip
     """Fit all equations of a structure on all runs by output error, from an automatic start.
 
     A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
-    everything free by name, and is the only one; known ones stand beside the automatic ones. Without `refine` the grid
-    is not refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
+    everything free by name, and is the only one; known ones stand beside the automatic ones; `near` is a fit of the
+    same structure to nearly the same runs, to go on from on its grid and with its weights. Without `refine` the grid is
+    not refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
     all samples, not between starts.
 
     Raises
@@ -200,18 +202,20 @@ def fit_output_error(
             "longer runs, or fix orders or coefficients"
         )
     sizes = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in outputs}
+    if near is not None:
+        attempt = given(problem, dict(zip(near.names, near.values.tolist(), strict=True)))
+        grid = Grid(problem, runs, [1.0 / max(near.noise[o], 1e-300) for o in outputs], near.refinement)
+        return ended(*with_settled_weights(attempt, grid, loss), [], loss, refine=refine)
     noise = {o: first_noise(runs, structure, o, sizes[o]) for o in outputs}
     # Starts are compared with every output weighing alike: noise decides where the optimum is, not how to get near it.
     alike = Grid(problem, runs, [1.0 / (COARSE_SHARE * sizes[o]) for o in outputs])
     weighed = Grid(problem, runs, [1.0 / noise[o] for o in outputs])
     course = Course(progress)
-    starts: list[tuple[float, str]] = []
     reached: list[Attempt] = []
     if start is None:
         floor = float(np.mean([(noise[o] / (COARSE_SHARE * sizes[o])) ** 2 for o in outputs]))
         runners = race_with_friction if structure.has_friction else race
         reached = runners(alike, floor, threads, course.until(0.5, 0.3))
-        starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
         contenders = finalists(reached) if reached else []
         contenders += [given(problem, values) for values in known]
     else:
@@ -228,11 +232,18 @@ def fit_output_error(
     course.at(0.65)
     best, weighed = with_settled_weights(best, weighed, loss)
     course.at(0.75)
-    best, weighed, growth = steadied(best, weighed, reached)
-    if growth is not None and not growth.kept:
-        best, weighed = with_settled_weights(best, weighed, loss)
-    optimum = refined(best, weighed, loss) if refine else Optimum(best, weighed, best.values, settled=True)
+    fit = ended(best, weighed, reached, loss, refine=refine)
     course.at(1.0)
+    return fit
+
+
+def ended(best: Attempt, grid: Grid, reached: Sequence[Attempt], loss: Loss, *, refine: bool) -> JointFit:
+    """What a fit comes to whose weights have settled: one that dies away where it may, on grids fine enough."""
+    best, grid, growth = steadied(best, grid, reached)
+    if growth is not None and not growth.kept:
+        best, grid = with_settled_weights(best, grid, loss)
+    optimum = refined(best, grid, loss) if refine else Optimum(best, grid, best.values, settled=True)
+    starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
     return replace(joint_fit(optimum, starts), growth=growth)
 
 
@@ -257,7 +268,7 @@ def winner(contenders: Sequence[Attempt], near: Grid) -> Attempt:
             # No finite free run on this grid; the others have one.
             if attempt is contenders[-1] and not ends:
                 raise
-    return near.lowest(near.finer.ranked(ends)[0], LAST_LAP)
+    return near.lowest(near.finer.ranked(ends)[0] if len(ends) > 1 else ends[0], LAST_LAP)
 
 
 def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -> tuple[Attempt, Grid]:
@@ -288,29 +299,33 @@ class Optimum:
 def refined(best: Attempt, grid: Grid, loss: Loss = "squares") -> Optimum:
     """Halve the step until that moves the estimate by little of its standard error."""
     estimate, settled = best.values, False
+    clock = Clock.of(grid.problem, grid.runs)
     while not settled and grid.every < FINEST:
         # On a finer grid residuals may shrink to their noise, so weights follow anew.
         finer, grid = with_settled_weights(best, grid.finer, loss)
-        errors = np.sqrt(np.diag(covariance(finer, grid)))
+        errors = clock.errors(finer.values, covariance(finer, grid))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
         # Of a flat valley in which neither stood still, or of two fits that a wall stopped, they tell nothing.
         still = finer.converged and best.converged
         limit = finer.values
         if still:
-            limit = feasible(grid.problem, limit, limit + (limit - best.values) / 3.0)
-        moved = np.abs(limit - estimate), np.abs(finer.values - best.values)
+            fine, coarse = clock.told(finer.values), clock.told(best.values)
+            limit = clock.untold(feasible(grid.problem, fine, fine + (fine - coarse) / 3.0))
+        ways = (limit, estimate), (finer.values, best.values)
+        moved = [np.abs(clock.told(one) - clock.told(other)) for one, other in ways]
         settled = any(bool(np.all(way <= REFINED * errors)) for way in moved)
         best, estimate = finer, limit
-    return Optimum(best, grid, nearer(best, grid, estimate), settled)
+    return Optimum(best, grid, nearer(best, grid, estimate, clock), settled)
 
 
-def nearer(best: Attempt, grid: Grid, limit: Floats) -> Floats:
+def nearer(best: Attempt, grid: Grid, limit: Floats, clock: Clock) -> Floats:
     """What is nearer to the truth on half the step, the limit that two grids tell or the optimum of the finer one.
 
     Along the bottom of a flat and curved valley, where numbers cannot be told apart, a straight line leads out of it.
     """
     columns = np.asarray(best.outcome["jacobian"]).T
-    if float(np.sum((columns @ (limit - best.values)) ** 2)) <= REFINED**2:
+    way = clock.step(best.values, clock.told(limit) - clock.told(best.values))
+    if float(np.sum((columns @ way) ** 2)) <= REFINED**2:
         # Both leave the same.
         return limit
     orders, coefficients, inputs = grid.problem.split(limit.tolist())

@@ -5,16 +5,13 @@ from __future__ import annotations
 import bisect
 import math
 import os
-import stat
 from dataclasses import dataclass, field
 
 import msgspec
 
 from ftlm.base.errors import DataError, ModelError
 from ftlm.search import frames
-
-#: Most bytes of a store: a layout of the largest search under a law takes under a tenth.
-LARGEST = 4 << 30
+from ftlm.search.log import SEARCH, check
 
 
 @dataclass
@@ -118,27 +115,14 @@ def read_store(path: str | os.PathLike[str]) -> Contents:
         # A pipe that nobody writes to would keep the open waiting.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
         with os.fdopen(handle, "rb") as stream:
-            check_store(path, handle)
+            check(path, handle, SEARCH)
             data = stream.read()
+    except DataError:
+        raise
     except (OSError, ValueError) as error:
         why = error.strerror if isinstance(error, OSError) else None
         raise DataError(f"store {path} cannot be read: {why or error}; check the path") from error
     return contents_of(path, memoryview(data))
-
-
-def check_store(path: str | os.PathLike[str], handle: int) -> None:
-    """Refuse what is no file, or none of ours, or too large to be one, before its gigabytes are read."""
-    status = os.fstat(handle)
-    if not stat.S_ISREG(status.st_mode):
-        raise DataError(f"store {path} is no regular file; choose another file")
-    if not frames.MAGIC.startswith(os.read(handle, len(frames.MAGIC))):
-        raise DataError(f"{path} is no ftlm search store; give a file written with store= (--store)")
-    if status.st_size > LARGEST:
-        raise DataError(
-            f"{path} has {status.st_size} bytes, more than the {LARGEST} of the largest store; start the search again "
-            "in another file"
-        )
-    os.lseek(handle, 0, os.SEEK_SET)
 
 
 def contents_of(path: str | os.PathLike[str], data: memoryview) -> Contents:

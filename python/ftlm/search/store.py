@@ -19,10 +19,9 @@ is what a power cut leaves: it is dropped. Any other frame that is not whole is 
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import cast
@@ -34,7 +33,8 @@ from ftlm._core import __version__
 from ftlm.base.errors import DataError
 from ftlm.base.output import write_atomically
 from ftlm.search import frames
-from ftlm.search.contents import check_store, contents_of
+from ftlm.search.contents import contents_of
+from ftlm.search.log import SEARCH, Log
 
 #: Longest time [s] between two writes, each flushed to disk: with the time between checkpoints, under a second is lost.
 INTERVAL = 0.3
@@ -57,66 +57,29 @@ class Store:
         #: By search and first round: what is not written yet, and the failures written last.
         self._waiting: dict[tuple[int, int], frames.Begun] = {}
         self._failures: dict[tuple[int, int], frames.Failures | None] = {}
-        # A pipe that nobody reads would keep the open waiting.
-        flags = (
-            os.O_RDWR
-            | getattr(os, "O_NONBLOCK", 0)
-            | (os.O_CREAT if requests is not None else 0)
-            | getattr(os, "O_BINARY", 0)
-        )
+        self._log = Log(path, SEARCH, create=requests is not None)
         try:
-            self._handle = os.open(self.path, flags | getattr(os, "O_CLOEXEC", 0), 0o666)
-        except (OSError, ValueError) as error:
-            why = error.strerror if isinstance(error, OSError) else None
-            raise DataError(f"store {self.path} cannot be opened: {why or error}; choose another file") from error
-        try:
-            check_store(self.path, self._handle)
-            self._lock()
             self._begin(requests, salvage=salvage)
         except BaseException:
-            os.close(self._handle)
+            self._log.close()
             raise
 
-    def _lock(self) -> None:
-        try:
-            if os.name == "nt":
-                import msvcrt  # noqa: PLC0415
-
-                os.lseek(self._handle, 1 << 40, os.SEEK_SET)
-                msvcrt.locking(self._handle, msvcrt.LK_NBLCK, 1)  # type: ignore[attr-defined,unused-ignore]
-            else:
-                import fcntl  # noqa: PLC0415
-
-                fcntl.flock(self._handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise DataError(
-                f"store {self.path} is in use by another search; wait for it, stop it, or choose another file"
-            ) from error
-
     def _begin(self, requests: Sequence[frames.Request] | None, *, salvage: bool) -> None:
-        os.lseek(self._handle, 0, os.SEEK_SET)
-        data = b"".join(iter(lambda: os.read(self._handle, 1 << 20), b""))
-        if requests is not None and _unbegun(data):
-            payload = frames.ENCODER.encode(frames.Requests(frames.ALGORITHM, __version__, tuple(requests)))
+        data = self._log.read()
+        if requests is not None and self._log.unbegun(data):
             # A payload read back must be the one asked for: what would not survive is found before any work.
-            frame, digest = frames.framed(payload, len(frames.MAGIC), bytes(frames.DIGEST))
-            self._end = 0
-            self._write(frames.MAGIC + frame)
-            self._digest = digest
-            self._sync_folder()
-            data = frames.MAGIC + frame
+            payload = frames.ENCODER.encode(frames.Requests(frames.ALGORITHM, __version__, tuple(requests)))
+            data = self._log.begin(payload)
         self.contents = held = contents_of(self.path, memoryview(data))
         if requests is not None:
             self._check_same(requests, held.requests)
-        self._end, self._digest = held.end, held.digest
+        self._log.end, self._log.digest = held.end, held.digest
         if held.damage is not None:
             self._salvage(data, salvage=salvage)
         elif held.torn:
             self.notes.append(f"{held.torn} bytes of an unfinished write at byte {held.end} were dropped")
         if held.end < len(data):
-            with self._writing():
-                os.ftruncate(self._handle, self._end)
-                os.fsync(self._handle)
+            self._log.cut()
 
     def _check_same(self, asked: Sequence[frames.Request], held: Sequence[frames.Request]) -> None:
         if [r.name for r in asked] != [r.name for r in held]:
@@ -141,39 +104,6 @@ class Store:
         self.notes.append(f"{lost} damaged bytes from byte {self.contents.end} on were dropped; {copy} keeps them")
         self.contents.damage = None
 
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Leave the store as it was where writing fails, and say so."""
-        try:
-            yield
-        except OSError as error:
-            # Where even that fails the next reader drops the torn frame.
-            with contextlib.suppress(OSError):
-                os.ftruncate(self._handle, self._end)
-            raise DataError(
-                f"store {self.path} cannot be written: {error.strerror or error}; what it holds is whole: make room, "
-                "or move it to another folder, and resume it"
-            ) from error
-
-    def _sync_folder(self) -> None:
-        with contextlib.suppress(OSError):  # some file systems do not sync folders, and Windows opens none
-            folder = os.open(self.path.parent, os.O_RDONLY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
-
-    def _write(self, data: bytes) -> None:
-        """Append and flush to disk."""
-        with self._writing():
-            os.lseek(self._handle, self._end, os.SEEK_SET)
-            left = memoryview(data)
-            while left:
-                left = left[os.write(self._handle, left) :]
-            os.fsync(self._handle)
-        self._end += len(data)
-        self._last = time.monotonic()
-
     def outdated(self) -> DataError:
         """Say why a search that another version began does not go on."""
         held = self.contents
@@ -188,14 +118,8 @@ class Store:
         if held.algorithm not in (frames.ALGORITHM, *frames.CONTINUED):
             # A finished search is only read, whatever made it.
             raise self.outdated()
-        data, digest, offset = [], self._digest, self._end
-        for frame in added:
-            payload = frames.ENCODER.encode(frame)
-            piece, digest = frames.framed(payload, offset, digest)
-            data.append(piece)
-            offset += len(piece)
-        self._write(b"".join(data))
-        self._digest = digest
+        self._log.append([frames.ENCODER.encode(frame) for frame in added])
+        self._last = time.monotonic()
         for frame in added:
             self.contents.sections[frame.search].take(frame)
 
@@ -238,7 +162,7 @@ class Store:
         try:
             self.flush()
         finally:
-            os.close(self._handle)
+            self._log.close()
 
     def __enter__(self) -> Store:
         return self
@@ -250,10 +174,3 @@ class Store:
             # Writing failed: what waits would fail too, and hide why.
             self._waiting.clear()
         self.close()
-
-
-def _unbegun(data: bytes) -> bool:
-    """Whether a file is empty or what is left of a store whose first frame was never finished."""
-    if not data.startswith(frames.MAGIC):
-        return frames.MAGIC.startswith(data)
-    return frames.next_frame(memoryview(data), len(frames.MAGIC), bytes(frames.DIGEST)) == "torn"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from msgspec import UNSET
 
 from ftlm.base.errors import ModelError
-from ftlm.data.equations import Term
+from ftlm.data.equations import Equation, Term
 from ftlm.data.limits import input_name
 from ftlm.data.structures import Structure, narrowed
 from ftlm.fit.problem import FreeProblem
@@ -31,12 +31,15 @@ class Variant:
         Whether each run has an unknown constant.
     inputs
         Free delays and limits of inputs that it has; the others do not delay, do not limit.
+    rubs
+        Frictions that it has, as :attr:`Inside.frictions` calls them.
     """
 
     kept: frozenset[str]
     whole: tuple[tuple[str, float], ...]
     offset: bool
     inputs: frozenset[str] = frozenset()
+    rubs: frozenset[str] = frozenset()
 
     def held(self) -> dict[str, float]:
         """Whole orders by name."""
@@ -61,7 +64,8 @@ class Inside:
     """A structure and everything inside it.
 
     Terms with a free coefficient of their own may be left out where the structure is one equation without laws; orders
-    that stand alone may be whole; an offset that is allowed, free delays and free limits may be left out.
+    that stand alone may be whole; an offset that is allowed, free delays and limits, and friction of free size may be
+    left out.
     """
 
     structure: Structure
@@ -79,13 +83,44 @@ class Inside:
         """Whether an offset is one of the choices."""
         return self.structure.offset in ("auto", "constant")
 
+    @property
+    def frictions(self) -> dict[str, str | None]:
+        """Frictions that may be left out, each with the one that it needs: what falls with speed needs Coulomb's."""
+        out: dict[str, str | None] = {}
+        for item in self.structure.equations:
+            rubs = item.friction
+            if rubs is None:
+                continue
+            own = f"friction of {item.output}"
+            if isinstance(rubs.coefficient, str):
+                out[own] = None
+            if rubs.stribeck is not None and isinstance(rubs.stribeck.coefficient, str):
+                out[f"{own} near rest"] = own if own in out else None
+        return out
+
+    def _rubbing(self, item: Equation, rubs: frozenset[str]) -> Equation:
+        """An equation with no friction but some, and what may not be left out."""
+        found, own, choices = item.friction, f"friction of {item.output}", self.frictions
+        if found is None:
+            return item
+        if own in choices and own not in rubs:
+            return replace(item, coulomb=UNSET)
+        near = f"{own} near rest"
+        return replace(item, coulomb=replace(found, more=UNSET)) if near in choices and near not in rubs else item
+
+    @property
+    def sliding(self) -> Structure:
+        """The structure without the frictions that may be left out."""
+        equations = tuple(self._rubbing(e, frozenset()) for e in self.structure.equations)
+        return replace(self.structure, equations=equations)
+
     def build(self, variant: Variant) -> Structure:
         """The structure of a variant."""
         structure, droppable = self.structure, set(self.droppable)
         equations = []
         for item in structure.equations:
             terms = tuple(t for t in item.terms if t.coefficient not in droppable or t.coefficient in variant.kept)
-            equations.append(replace(item, terms=terms))
+            equations.append(self._rubbing(replace(item, terms=terms), variant.rubs))
         names = {n for e in equations for n in e.order_names}
         signals = tuple(dict.fromkeys(n for e in equations for n in (e.output, *e.signals)))
         left = {i.name for i in structure.free_inputs} - variant.inputs
@@ -140,11 +175,8 @@ class Inside:
             drives = [
                 t for t in self.structure.equations[0].terms if t.coefficient in self.droppable and not self._owns(t)
             ]
-            if not drives:
-                yield Change(self._named(base), base)
-                continue
             known = any(not self._owns(t) and t.fixed is not None for t in self.structure.equations[0].terms)
-            if known:
+            if not drives or known:
                 yield Change(self._named(base), base)
                 continue
             for term in drives:
@@ -197,7 +229,9 @@ class Inside:
         names = [*self.structure.coefficient_names]
         kept += [n for n in names if n not in droppable]
         variant = Variant(frozenset(kept), tuple(sorted(whole.items())), self.structure.offset == "constant")
-        return variant if self.possible(variant) else None
+        # Without own terms there is no equation before something drives it.
+        alone = any(self._owns(t) for item in self.structure.equations for t in item.terms)
+        return variant if self.possible(variant) or not alone else None
 
     def _adding(self, variant: Variant, term: Term) -> Iterator[Change]:
         """A term more, its order at each of its whole values."""
@@ -248,6 +282,9 @@ class Inside:
         for number in self.structure.free_inputs:
             if number.name not in variant.inputs:
                 yield Change(f"{number.name} free", replace(variant, inputs=variant.inputs | {number.name}))
+        for name, below in self.frictions.items():
+            if name not in variant.rubs and (below is None or below in variant.rubs):
+                yield Change(name, replace(variant, rubs=variant.rubs | {name}))
 
     def smaller(self, variant: Variant) -> Iterator[Change]:
         """Every variant with one thing less."""
@@ -269,6 +306,9 @@ class Inside:
             yield Change("without an offset", replace(variant, offset=False))
         for name in sorted(variant.inputs):
             yield Change(f"without {name}", replace(variant, inputs=variant.inputs - {name}))
+        for name in sorted(variant.rubs):
+            above = {n for n, below in self.frictions.items() if below == name}
+            yield Change(f"without {name}", replace(variant, rubs=variant.rubs - {name} - above))
 
 
 def worded(structure: Structure) -> str:
@@ -286,7 +326,8 @@ def signature(structure: Structure) -> str:
             for t in item.terms
         )
         parts.append(f"{item.output} {'free' if item.order.is_single else item.order} {terms}")
-    rest = (structure.offset, structure.initial, structure.coupling, structure.has_friction)
+    rubs = [(e.output, e.friction.stribeck is not None) for e in structure.equations if e.friction is not None]
+    rest = (structure.offset, structure.initial, structure.coupling, rubs)
     return f"{parts} {rest} {[i.name for i in structure.free_inputs]}"
 
 

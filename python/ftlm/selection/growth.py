@@ -17,6 +17,7 @@ from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
 from ftlm.selection.candidates import Change, Inside, Variant, signature, worded
 from ftlm.selection.screen import Screened, screened
+from ftlm.selection.store import Store
 from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, numbers_of, refined, spread
 
 Item = TypeVar("Item")
@@ -56,12 +57,15 @@ class Work:
         Called with (candidates fitted, candidates known of so far).
     clock
         Seconds that pass.
+    store
+        What is already known of it, and what is kept of each step.
     """
 
     folds: Folds
     threads: int
     progress: Callable[[int, int], None] | None = None
     clock: Callable[[], float] = time.perf_counter
+    store: Store | None = None
     done: int = 0
     known: int = 0
     trials: list[Trial] = field(default_factory=list)
@@ -92,29 +96,46 @@ class Work:
         """A fitted candidate on what it never saw."""
         if isinstance(joint, FtlmError):
             return Trial(name, structure, len(FreeProblem.of(structure).names), failed=str(joint))
-        try:
-            return judged(name, structure, self.folds, joint, fine=fine)
-        except FtlmError as error:
-            return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
+
+        def compute() -> Trial:
+            try:
+                return judged(name, structure, self.folds, joint, fine=fine)
+            except FtlmError as error:
+                return Trial(name, structure, numbers_of(structure, joint, self.folds), failed=str(error))
+
+        return compute() if self.store is None else self.store.judgement(name, structure, joint, fine, compute)
 
     def refined(self, trial: Trial) -> Trial:
         """A candidate whose numbers do not depend on the step of the grid."""
         if trial.fine:
             return trial
+        joint = self.fitted(trial.structure, [trial.values])
         try:
-            return refined(trial, self.folds)
+            # On a finer grid it may have no finite free run: it stays what it was judged as.
+            return trial if isinstance(joint, FtlmError) else refined(trial, self.folds, joint)
         except FtlmError:
-            # On a finer grid it has no finite free run: it stays what it was judged as.
             return trial
 
     def fitted(
         self, structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
     ) -> JointFit | FtlmError:
         """A fit on all runs, or why there is none."""
-        try:
-            return fit(self.folds.runs, structure, starts, refine=refine)
-        except FtlmError as error:
-            return error
+
+        def compute() -> JointFit | FtlmError:
+            try:
+                return fit(self.folds.runs, structure, starts, refine=refine)
+            except FtlmError as error:
+                return error
+
+        return compute() if self.store is None else self.store.fit(structure, starts, refine, compute)
+
+    def screened(self, inside: Inside) -> list[Screened]:
+        """Every subset of what drives, best first."""
+
+        def compute() -> list[Screened]:
+            return screened(inside, self.folds, self)
+
+        return compute() if self.store is None else self.store.subsets(inside.structure, compute)
 
 
 @dataclass(frozen=True)
@@ -129,13 +150,17 @@ class Fitted:
 def starts_from(
     structure: Structure, values: Mapping[str, float], whole: Mapping[str, float]
 ) -> list[dict[str, float]]:
-    """Where a structure starts that has what `values` knows, orders that were `whole`, and coefficients that were 0."""
+    """Where a structure starts that has what `values` knows, orders that were `whole`, and coefficients that were 0.
+
+    Friction that `values` does not know is in none of them.
+    """
     problem = FreeProblem.of(structure)
     usual: dict[str, list[float]] = {}
     for name, (low, high) in zip(problem.orders, problem.bounds, strict=True):
         at = whole.get(name, 0.5 * (low + high))
         usual[name] = [min(max(at + shift, low), high) for shift in SHIFTS]
-    usual |= {n: [0.0] for n in problem.coefficients}
+    rubs = {n for e in structure.equations if e.friction is not None for n in e.friction.names}
+    usual |= {n: [0.0] for n in problem.coefficients if n not in rubs}
     usual |= {i.name: [i.bounds[0] + s * (i.bounds[1] - i.bounds[0]) for s in SHARES] for i in problem.inputs}
     places = {n: [values[n]] if n in values else places for n, places in usual.items()}
     return [dict(zip(places, point, strict=True)) for point in itertools.product(*places.values())]
@@ -149,7 +174,7 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
     from everything at whole orders, one thing less at a time. Where so many signals drive that subsets can be screened,
     growth begins with the best of them all; where no term may be left out, everything free is a root beside.
     """
-    subsets = screened(inside, work.folds, work)
+    subsets = work.screened(inside)
     found = _from_subsets(inside, work, subsets)
     if found:
         # What was screened is not fitted again because it is one thing more, or less, than something.
@@ -375,7 +400,8 @@ def listed(candidates: Mapping[str, Structure], work: Work) -> list[Trial]:
         return work.judge(name, structure, work.fitted(structure, []), fine=True)
 
     items = list(candidates.items())
-    if len(items) > MANY:
+    # What a store gives back takes no time, and tells none.
+    if len(items) > MANY and not (work.store is not None and len(work.store)):
         begun = work.clock()
         work.trials += work.each(one, items[: work.threads])
         took = work.clock() - begun

@@ -142,6 +142,8 @@ def screened(inside: Inside, folds: Folds, pool: Pool) -> list[Screened]:
 
     Several runs, or a run that judges, are needed: the blocks of one run share the terms that it starts with.
     """
+    # Subsets are compared as bodies that slide; friction that may be left out is added to the best.
+    inside = Inside(inside.sliding)
     structure = inside.structure
     drives = [t for t in structure.equations[0].terms if t.signal != structure.equations[0].output]
     if (

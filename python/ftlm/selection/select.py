@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
@@ -12,11 +13,13 @@ from ftlm.base.errors import ConvergenceError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Structure
+from ftlm.fit.problem import FreeProblem
 from ftlm.identification.identify import identify
 from ftlm.selection.automatic import automatic
-from ftlm.selection.candidates import Inside, named, signature
+from ftlm.selection.candidates import Inside, named, signature, worded
 from ftlm.selection.growth import SAME, Work, grown, listed
 from ftlm.selection.result import Selection
+from ftlm.selection.store import Request, Store
 from ftlm.selection.trial import Folds, Trial, criterion, spread
 from ftlm.solve.records import prepare
 
@@ -38,17 +41,18 @@ def select(
     validation: str | Run | Sequence[Run] | None = None,
     threads: int | None = None,
     progress: Callable[[int, int], None] | None = None,
+    store: str | os.PathLike[str] | None = None,
 ) -> Selection:
     """Choose the terms and orders that earn their place on runs that they were not fitted to.
 
     A structure is grown: from the simplest one inside it (whole orders, the output's own terms, one thing that drives),
-    a term, a free order or an offset more at a time, each fitted by output error from the last optimum, the two most
-    promising by Schwarz's criterion judged by free runs on what they were not fitted to; where two steps in a row
-    predict no better, it is pruned, one thing less at a time. A list of candidates is judged whole, each from automatic
+    a term, a free order, a delay, friction or an offset more at a time, each fitted by output error from the last
+    optimum, the two most promising by Schwarz's criterion judged by free runs on what they were not fitted to. Where
+    two steps in a row predict no better, it is pruned, one thing less at a time. A list is judged whole, from automatic
     starts. Chosen is, among those that predict as well as the best (what is left over is within 1 %, or, up to 5 %,
-    three or more folds do not tell the difference from 0 at 95 %), the one with the least Schwarz criterion, samples
-    counted as the colour of the residuals lets them; of those alike in that the one with the fewest numbers, of the
-    lowest order, best determined.
+    three or more folds do not tell the difference from 0 at 95 %, or all samples are very strong evidence), the one
+    with the least Schwarz criterion, samples counted as the colour of the residuals lets them; of those alike in that
+    the one with the fewest numbers, of the lowest order, best determined.
 
     Parameters
     ----------
@@ -64,6 +68,9 @@ def select(
         Candidates at a time, by default all cores; the result does not depend on it.
     progress
         Called with (candidates fitted, candidates known of so far).
+    store
+        File that keeps every fit as it ends: the same call with the same file goes on where it was stopped, with
+        Ctrl-C or by the machine, and comes to the same bits.
 
     Returns
     -------
@@ -73,7 +80,8 @@ def select(
     Raises
     ------
     DataError
-        Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing.
+        Runs that do not fit together or the structure, that are too short to be cut, or that excite nothing; a store
+        of another selection, in use, damaged, or that cannot be written.
     ModelError
         No candidates, two that are the same but for the names of their numbers, more than 10 000, no validation run,
         words that are not known, one run where several are needed, a validation run that is fitted to.
@@ -93,7 +101,11 @@ def select(
     workers = Settings.check(coefficients="least-squares", threads=threads).threads
     several = [runs] if isinstance(runs, Run) else list(runs)
     folds = Folds.of(runs, validation if validation is not None else "runs" if len(several) > 1 else "blocks")
-    work = Work(folds, workers, progress)
+    if not isinstance(candidates, (str, Structure, Sequence, Mapping)):
+        raise ModelError(
+            f"candidates is {type(candidates).__name__}; use ftlm.equation(…), a list or a dictionary of structures, "
+            "or 'auto'"
+        )
     if not isinstance(candidates, (str, Structure)) and len(candidates) > MOST:
         raise ModelError(
             f"{len(candidates)} candidates are more than {MOST}; give one structure instead, whose inside is grown "
@@ -104,14 +116,29 @@ def select(
         raise ModelError(f"candidates = {candidates!r}; use 'auto', ftlm.equation(…), or a list of structures")
     searched = automatic(folds.runs) if isinstance(candidates, str) else []
     searched += [candidates] if isinstance(candidates, Structure) else []
+    idle = [worded(s) for s in (*searched, *every.values()) if not FreeProblem.of(s).names]
+    if idle:
+        raise ModelError(
+            f"{idle[0]} has nothing to estimate; name a coefficient or an order, or use model.compare(runs)"
+        )
     for structure in (*searched, *every.values()):
         # Refused here, once, and not as a failure of every candidate.
         prepare(folds.runs, replace(structure.as_given(), offset="none"), None, power_of_two=False, gaps=True)
+    if store is None:
+        return _found(Work(folds, workers, progress), searched, every)
+    judges = [f.judged for f in folds.parts if not any(f.judged is r for r in folds.runs)]
+    asked = Request.of(folds.runs, [searched, every], judges, folds.words)
+    with Store(store, asked) as kept:
+        return _found(Work(folds, workers, progress, store=kept), searched, every)
+
+
+def _found(work: Work, searched: Sequence[Structure], every: Mapping[str, Structure]) -> Selection:
+    """What structures grown inside some, and those of a list, come to."""
     for structure in searched:
         grown(Inside(structure), work)
     if every:
         listed(every, work)
-    return _chosen(work, folds)
+    return _chosen(work, work.folds)
 
 
 def _chosen(work: Work, folds: Folds) -> Selection:
@@ -160,15 +187,15 @@ def _as_good(trial: Trial, best: Trial) -> bool:
 
     The best is the luckiest of many: a single standard error would refuse a true structure for it in one case of ten.
     Where one block alone says what the others cannot, leaving it out costs the truth far more than 5 %: very strong
-    evidence on all samples lets it stand beside.
+    evidence on all samples lets it stand beside. So it does, within 5 %, where folds are too few to tell a scatter.
     """
     apart = np.array(trial.scores) - np.array(best.scores)
+    far, likely = trial.score - best.score, _bic(trial) <= _bic(best) - STRONG
     if apart.size < FOLDS:
-        return trial.score - best.score <= SAME
+        return far <= SAME or (far <= MOST_ALIKE and likely)
     scatter = float(np.std(apart, ddof=1)) / math.sqrt(apart.size)
     quantile = STUDENT_95[min(apart.size - FOLDS, len(STUDENT_95) - 1)]
-    told = trial.score - best.score <= quantile * scatter and _bic(trial) <= _bic(best) - STRONG
-    return told or trial.score - best.score <= max(SAME, min(quantile * scatter, MOST_ALIKE))
+    return (far <= quantile * scatter and likely) or far <= max(SAME, min(quantile * scatter, MOST_ALIKE))
 
 
 def _winner(near: Sequence[Trial]) -> Trial:

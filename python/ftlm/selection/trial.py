@@ -240,12 +240,24 @@ def decided(structure: Structure, runs: Sequence[Run]) -> Structure:
 
 
 def fit(
-    runs: Sequence[Run], structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True
-) -> JointFit:
-    """The lowest of the fits from some starts, or from an automatic start where there are none."""
+    runs: Sequence[Run], structure: Structure, starts: Sequence[Mapping[str, float]], *, refine: bool = True,
+    near: JointFit | None = None,
+) -> JointFit:  # fmt: skip
+    """The lowest of the fits from some starts, or from an automatic start where there are none.
+
+    Where there is a fit of this structure to nearly these runs, it goes on from there.
+
+    Friction that no start knows may have no descent from 0 to where it is: automatic starts stand beside the given
+    ones, in which it is 0.
+    """
     asked = decided(structure, runs)
-    if not starts:
-        return fit_output_error(runs, asked, refine=refine)
+    if near is not None:
+        return fit_output_error(runs, asked, refine=refine, near=near)
+    problem = FreeProblem.of(asked)
+    if not starts or any(n not in s for s in starts for n in problem.names):
+        # Where friction is 0 the speed at which it falls may be any.
+        nothing = {n: 0.0 if low == 0 else 1.0 for n, (low, _) in zip(problem.names, problem.all_bounds, strict=True)}
+        return fit_output_error(runs, asked, refine=refine, known=[{**nothing, **s} for s in starts])
     ends: list[JointFit] = []
     last: FtlmError | None = None
     for start in starts:
@@ -281,8 +293,12 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fi
     validation: dict[str, dict[str, float]] = {}
     for fold in folds.parts:
         runs = fold.seen(structure.outputs)
-        own = joint if runs is folds.runs else fit(runs, structure, [start])
-        validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
+        try:
+            own = joint if runs is folds.runs else fit(runs, structure, [], near=joint)
+            validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
+        except FtlmError as error:
+            # What is wrong is wrong with what is left, not with the runs as they were given.
+            raise type(error)(f"without {fold.name}: {error}") from error
     fits = [max(v, LOST) if math.isfinite(v) else LOST for part in validation.values() for v in part.values()]
     scores = tuple(math.log(max(1.0 - v / 100.0, 1e-12)) for v in fits)
     return Trial(
@@ -292,9 +308,8 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fi
     )  # fmt: skip
 
 
-def refined(trial: Trial, folds: Folds) -> Trial:
-    """A candidate fitted on all runs on grids so fine that its numbers no longer depend on them."""
-    joint = fit(folds.runs, trial.structure, [trial.values])
+def refined(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
+    """A candidate with a fit on all runs on grids so fine that its numbers no longer depend on them."""
     estimation = compare(model_of(trial.structure, joint, folds.runs), list(folds.runs)).fit_percent
     return replace(
         trial, joint=joint, estimation=dict(estimation), errors=joint.standard_errors, idle=idle(joint), fine=True,

@@ -1,5 +1,6 @@
 //! The fit: a model, its experiments and a start become a least-squares problem, and its minimum a result.
 
+use super::clock::Clock;
 use super::experiment::Experiment;
 use super::free_run::Evaluation;
 use super::input::FreeInput;
@@ -36,8 +37,10 @@ pub struct Fit {
 struct OutputError<'a> {
     model: &'a FreeModel,
     experiments: &'a [Experiment],
-    /// Where the coefficients start.
-    start: &'a [f64],
+    /// Where the coefficients start, in the unit of time of the clock.
+    start: Vec<f64>,
+    /// The unit of time in which coefficients are moved.
+    clock: Clock,
     /// Whether a free run that grows is no place to go.
     steady: bool,
     /// Coefficients that are solved for at every point.
@@ -75,14 +78,25 @@ impl Problem for OutputError<'_> {
     }
 
     fn moved(&self, point: &Point, steps: &[f64]) -> (Point, f64) {
-        stepped(self.model, point, steps)
+        stepped(self.model, &self.clock, point, steps)
     }
 
     fn stretch(&self, point: &Point, parameter: usize) -> f64 {
-        parameter
-            .checked_sub(point.orders.len())
-            .filter(|j| *j < point.coefficients.len())
-            .map_or(1.0, |j| self.model.coordinates[j].stretch(point.coefficients[j]))
+        parameter.checked_sub(point.orders.len()).filter(|j| *j < point.coefficients.len()).map_or(1.0, |j| {
+            let factor = self.clock.factor(j, &point.orders);
+            self.model.coordinates[j].stretch(factor * point.coefficients[j]) / factor
+        })
+    }
+
+    /// With an order move the coefficients whose numbers stay in the unit of time.
+    fn carried(&self, point: &Point, parameter: usize) -> Vec<(usize, f64)> {
+        if parameter >= point.orders.len() {
+            return Vec::new();
+        }
+        (point.coefficients.iter().enumerate())
+            .map(|(j, c)| (point.orders.len() + j, -c * self.clock.fall(j, parameter)))
+            .filter(|(_, slope)| *slope != 0.0)
+            .collect()
     }
 
     /// Distance of orders and of inputs' numbers from their bounds; coefficients have none but 0 where they keep a sign.
@@ -93,7 +107,8 @@ impl Problem for OutputError<'_> {
             (None, Some(input)) => (point.inputs[input], self.model.inputs[input].bounds),
             (None, None) => {
                 let j = parameter - point.orders.len();
-                let down = self.model.coordinates[j].room(point.coefficients[j], self.start[j]);
+                let value = self.clock.factor(j, &point.orders) * point.coefficients[j];
+                let down = self.model.coordinates[j].room(value, self.start[j]);
                 return (down, f64::INFINITY);
             }
         };
@@ -117,8 +132,8 @@ impl Problem for OutputError<'_> {
 }
 
 /// A point moved by steps in its coordinates, within bounds, and how far: orders as they are, coefficients as a share
-/// of themselves, numbers of inputs as a share of their interval.
-fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
+/// of themselves in the clock's unit, numbers of inputs as a share of their interval.
+fn stepped(model: &FreeModel, clock: &Clock, point: &Point, deltas: &[f64]) -> (Point, f64) {
     let mut next = point.clone();
     let mut moved: f64 = 0.0;
     let (orders, rest) = deltas.split_at(point.orders.len());
@@ -128,10 +143,11 @@ fn stepped(model: &FreeModel, point: &Point, deltas: &[f64]) -> (Point, f64) {
         *order = (before + delta).clamp(low, high);
         moved = moved.max((*order - before).abs());
     }
-    for ((value, &coordinate), &delta) in next.coefficients.iter_mut().zip(&model.coordinates).zip(coefficients) {
-        let before = *value;
-        *value = coordinate.shifted(before, delta);
-        moved = moved.max((*value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
+    for (j, (&coordinate, &delta)) in model.coordinates.iter().zip(coefficients).enumerate() {
+        let before = clock.factor(j, &point.orders) * point.coefficients[j];
+        let value = coordinate.shifted(before, delta);
+        next.coefficients[j] = value / clock.factor(j, &next.orders);
+        moved = moved.max((value - before).abs() / before.abs().max(f64::MIN_POSITIVE));
     }
     for ((value, FreeInput { bounds: (low, high), .. }), delta) in next.inputs.iter_mut().zip(&model.inputs).zip(inputs)
     {
@@ -225,7 +241,9 @@ pub fn fit_until(
     // Solved for, they need no coordinate that keeps a sign.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
     let shelves = RefCell::new(experiments.iter().map(|_| Shelf::default()).collect());
-    let problem = OutputError { model: &model, experiments, start: &start.coefficients, steady, linear, shelves, stop };
+    let clock = Clock::of(&model, experiments);
+    let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
+    let problem = OutputError { model: &model, experiments, start, clock, steady, linear, shelves, stop };
     let found = minimise(&problem, point, settings)?;
     Ok(Fit {
         point: found.point,

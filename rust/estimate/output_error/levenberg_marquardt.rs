@@ -67,6 +67,11 @@ pub trait Problem {
         1.0
     }
 
+    /// Other parameters that move with a parameter's coordinate, and how much.
+    fn carried(&self, _point: &Self::Point, _parameter: usize) -> Vec<(usize, f64)> {
+        Vec::new()
+    }
+
     /// How far a parameter may move down and up in its coordinate before it stands on a bound.
     fn room(&self, _point: &Self::Point, _parameter: usize) -> (f64, f64) {
         (f64::INFINITY, f64::INFINITY)
@@ -167,9 +172,14 @@ impl Linear {
         let mut scales = Vec::with_capacity(jacobian.len());
         for &i in &order {
             let factor = problem.stretch(point, i);
-            let norm = jacobian[i].iter().map(|v| (v * factor) * (v * factor)).sum::<f64>().sqrt();
-            let scale = if norm > 0.0 { factor / norm } else { 0.0 };
-            columns.push(jacobian[i].iter().map(|v| v * scale).collect::<Vec<f64>>());
+            let mut column: Vec<f64> = jacobian[i].iter().map(|v| v * factor).collect();
+            for (other, slope) in problem.carried(point, i) {
+                column.iter_mut().zip(&jacobian[other]).for_each(|(v, w)| *v += slope * w);
+            }
+            let norm = column.iter().map(|v| v * v).sum::<f64>().sqrt();
+            let scale = if norm > 0.0 { 1.0 / norm } else { 0.0 };
+            column.iter_mut().for_each(|v| *v *= scale);
+            columns.push(column);
             scales.push(norm);
         }
         let gradient: Vec<f64> = columns.iter().map(|c| c.iter().zip(residuals).map(|(j, e)| j * e).sum()).collect();

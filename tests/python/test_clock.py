@@ -1,0 +1,96 @@
+"""The unit of time does not matter: a flat fit ends at the same numbers in seconds, milliseconds and minutes."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+import ftlm
+from ftlm.fit.clock import Clock
+from ftlm.fit.grid import Attempt, Grid, descend
+from ftlm.fit.problem import FreeProblem
+
+#: Of a lag of first order two orders and an own term too many: along the bottom of a valley nothing tells them.
+FLAT = "D^alpha y = d D^mu y + a y + b u"
+UNITS = {"s": 1.0, "ms": 1e3, "min": 1.0 / 60.0}
+
+
+def lag(seed, scale):
+    """A lag of first order by SciPy, in 5 % of noise, its time in another unit."""
+    rows = 240
+    rng = np.random.default_rng([31, seed])
+    u = np.repeat(rng.choice([-1.0, 1.0], rows // 20 + 1), 20)[:rows]
+    system = signal.cont2discrete(signal.tf2ss([3.0], [1.0, 3.0]), 0.02, "zoh")
+    y = signal.dlsim(system, u)[1][:, 0]
+    y = y + 0.05 * np.std(y) * rng.standard_normal(rows)
+    return ftlm.Run.from_arrays(step=0.02 * scale, inputs={"u": u}, outputs={"y": y}, name="lag")
+
+
+def in_seconds(values, scale):
+    """Coefficients told in seconds: the power of time that each is follows from the orders."""
+    alpha, mu = values["alpha"], values["mu"]
+    powers = {"d": alpha - mu, "a": alpha, "b": alpha}
+    return {n: values[n] * scale**power for n, power in powers.items()}
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_a_flat_fit_does_not_depend_on_the_unit_of_time(seed):
+    found = {
+        unit: ftlm.identify(lag(seed, scale), ftlm.equation(FLAT), threads=1, intervals="quadratic").joint
+        for unit, scale in UNITS.items()
+    }
+    seconds = found["s"]
+    values = dict(zip(seconds.names, seconds.values, strict=True))
+    # Told to no more than this: the same numbers in any unit are no accident of a well-determined fit.
+    assert seconds.standard_errors["alpha"] > 0.01
+    for unit, scale in UNITS.items():
+        other = found[unit]
+        assert other.orders == pytest.approx(seconds.orders, abs=1e-6)
+        told = in_seconds(dict(zip(other.names, other.values, strict=True)), scale)
+        assert told == pytest.approx(in_seconds(values, 1.0), rel=1e-4)
+        assert other.noise == pytest.approx(seconds.noise, rel=1e-8)
+        assert other.refinement == seconds.refinement
+        assert other.standard_errors["alpha"] == pytest.approx(seconds.standard_errors["alpha"], rel=1e-3)
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_descent_takes_the_same_steps_in_any_unit(plain):
+    """Far from the optimum, and stopped on the way: the path is the same, not the end alone."""
+    problem = FreeProblem.of(ftlm.equation(FLAT, initial="rest"))
+    start = {"alpha": 1.4, "mu": 0.8, "d": -1.0, "a": -9.0, "b": 9.0}
+    ended = []
+    for scale in UNITS.values():
+        here = start | {n: v for n, v in in_seconds(start, 1.0 / scale).items()}
+        grid = Grid(problem, [lag(1, scale)], [20.0])
+        attempt = Attempt([here[n] for n in problem.orders], [here[n] for n in problem.coefficients], "", {})
+        ended.append(descend(problem, grid.experiments, attempt, evaluations=6, plain=plain))
+    for other in ended[1:]:
+        assert other.orders == pytest.approx(ended[0].orders, abs=1e-7)
+        assert other.outcome["cost"] == pytest.approx(ended[0].outcome["cost"], rel=1e-9)
+
+
+def test_the_clock_tells_numbers_steps_and_errors():
+    problem = FreeProblem.of(ftlm.equation("D^alpha y = d D^mu y + a y + b0 D^gamma u + b1 u", delay={"u": (0.0, 0.3)}))
+    clock = Clock.of(problem, [lag(0, 60.0)])
+    scale = np.exp(clock.unit)
+    assert scale == pytest.approx(60.0 * np.exp(Clock.of(problem, [lag(0, 1.0)]).unit))
+    values = dict(alpha=1.9, mu=0.7, gamma=0.4, d=-2.0, a=-30.0, b0=4.0, b1=0.0, delay_u=0.1)
+    powers = {"d": 1.2, "a": 1.9, "b0": 1.5, "b1": 1.9}
+    point = np.array([values[n] for n in problem.names])
+    told = clock.told(point)
+    expected = [values[n] * scale ** powers.get(n, 0.0) for n in problem.names]
+    np.testing.assert_allclose(told, expected, rtol=1e-12)
+    np.testing.assert_allclose(clock.untold(told), point, rtol=1e-12)
+    # By differences: a step in the unit, and how each number moves with each.
+    tiny = 1e-6 * np.random.default_rng(3).standard_normal(point.size)
+    np.testing.assert_allclose(clock.step(point, clock.told(point + tiny) - told), tiny, rtol=1e-4, atol=1e-9)
+    turned = np.stack([(clock.told(point + 1e-6 * e) - told) / 1e-6 for e in np.eye(point.size)], axis=1)
+    root = np.random.default_rng(4).standard_normal((point.size, point.size))
+    covariance = root @ root.T
+    expected = np.sqrt(np.diag(turned @ covariance @ turned.T))
+    np.testing.assert_allclose(clock.errors(point, covariance), expected, rtol=1e-3)
+    # What the runs do not see has no error in any unit, nor has what moves with it.
+    place = problem.names.index("gamma")
+    covariance[place, :] = covariance[:, place] = np.nan
+    covariance[place, place] = np.inf
+    told_of = dict(zip(problem.names, clock.errors(point, covariance), strict=True))
+    assert [n for n, e in told_of.items() if np.isinf(e)] == ["gamma", "b0"]

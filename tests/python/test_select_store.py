@@ -1,0 +1,208 @@
+"""A selection that was stopped goes on where it was, to the same bits; what is no store of it is refused in words."""
+
+import shutil
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import ftlm
+from ftlm.cli.app import app
+from ftlm.fit.joint import fit_output_error
+from ftlm.search import frames
+from ftlm.selection import trial
+from ftlm.selection.candidates import named
+from ftlm.selection.store import ENCODER, SELECTION, Kept, Refused, Request, Store
+from ftlm.selection.trial import Folds
+from test_select import motor
+
+SECOND = ftlm.equation("D^2 y = d D y + a y + b u")
+FIRST = ftlm.equation("D y = a y + b u")
+
+
+@pytest.fixture(scope="module")
+def runs():
+    return [motor(0, rows=200), motor(1, rows=200)]
+
+
+@pytest.fixture
+def fits(monkeypatch):
+    """Fits that are computed."""
+    made = []
+
+    def counted(*args, **more):
+        made.append(1)
+        return fit_output_error(*args, **more)
+
+    monkeypatch.setattr(trial, "fit_output_error", counted)
+    return made
+
+
+@pytest.fixture(scope="module")
+def whole(runs, tmp_path_factory):
+    """A store of a selection that ended, and what it came to."""
+    path = tmp_path_factory.mktemp("store") / "whole.ftlm"
+    return path, ftlm.select(runs, [SECOND, FIRST], threads=1, store=path)
+
+
+def test_a_selection_stopped_anywhere_goes_on_to_the_same_bits(runs, fits, tmp_path):
+    asked = ftlm.equation("D^2 y = d D^mu y + a y + b u", orders={"mu": (0.5, 1.5, 0.1)}, offset="auto")
+    plain = ftlm.select(runs, asked, threads=2)
+    needed, place = len(fits), tmp_path / "grown.ftlm"
+    for stop in (1, plain.fitted // 2, plain.fitted - 1):
+
+        def interrupt(done, known, stop=stop):
+            if done == stop:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            ftlm.select(runs, asked, threads=1, store=place, progress=interrupt)
+    fits.clear()
+    again = ftlm.select(runs, asked, threads=2, store=place)
+    # Nearly all was there: what the last stop left, and the fits of what is not judged by growth.
+    assert len(fits) < needed / 3
+    assert again.to_dict() == plain.to_dict()
+    assert str(again) == str(plain)
+    fits.clear()
+    assert ftlm.select(runs, asked, threads=1, store=place).to_dict() == plain.to_dict()
+    assert fits == []
+
+
+def test_screened_subsets_are_kept(tmp_path):
+    rng = np.random.default_rng(5)
+    made = []
+    for seed in range(2):
+        one = motor(seed, rows=200)
+        others = {n: np.cumsum(rng.standard_normal(200)) * 0.02 for n in ("v", "w")}
+        made.append(
+            ftlm.Run.from_arrays(
+                step=one.step, inputs={"u": one["u"], **others}, outputs={"y": one["y"]}, name=one.name
+            )
+        )
+    asked = ftlm.equation("D^2 y = d D y + a y + b u + e v + f w")
+    plain = ftlm.select(made, asked, threads=2)
+    place = tmp_path / "subsets.ftlm"
+    assert ftlm.select(made, asked, threads=2, store=place).to_dict() == plain.to_dict()
+    assert ftlm.select(made, asked, threads=1, store=place).to_dict() == plain.to_dict()
+
+
+def test_a_store_cut_anywhere_goes_on_and_one_that_is_damaged_is_refused(runs, whole, tmp_path):
+    path, found = whole
+    data, place = path.read_bytes(), tmp_path / "cut.ftlm"
+    ends = [len(SELECTION.magic)]
+    digest = bytes(frames.DIGEST)
+    while ends[-1] < len(data):
+        _, digest, end = frames.next_frame(memoryview(data), ends[-1], digest)
+        ends.append(end)
+    assert len(ends) == 6  # The request, two fits, two judgements.
+    request = Request.of(*_asked(runs))
+    rng = np.random.default_rng(8)
+    cuts = [*rng.integers(0, len(data), 60).tolist(), *ends[1:], 0, 5]
+    for cut in cuts:
+        place.write_bytes(data[:cut])
+        with Store(place, request) as kept:
+            assert len(kept) == max(sum(end <= cut for end in ends[1:]) - 1, 0)
+        # What was torn is gone; a fresh one has its first frame again.
+        assert place.read_bytes() == data[: max([e for e in ends if e <= cut and e > ends[0]], default=ends[1])]
+    for place_of in rng.integers(0, len(data) - 200, 60).tolist():
+        flipped = bytearray(data)
+        flipped[place_of] ^= 0x10
+        place.write_bytes(bytes(flipped))
+        with pytest.raises(ftlm.DataError, match=r"damaged|no ftlm selection store|holds something else"):
+            Store(place, request)
+        assert place.read_bytes() == bytes(flipped)
+    place.write_bytes(data[: ends[3]])
+    assert ftlm.select(runs, [SECOND, FIRST], threads=1, store=place).to_dict() == found.to_dict()
+    assert place.read_bytes() == data
+
+
+def _asked(runs):
+    folds = Folds.of(runs, "runs")
+    return folds.runs, [[], named([SECOND, FIRST])], [], folds.words
+
+
+def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
+    path, _ = whole
+    place = tmp_path / "other.ftlm"
+    shutil.copy(path, place)
+    before = place.read_bytes()
+    for words, other in {
+        "of other candidates": lambda: ftlm.select(runs, [SECOND], store=place),
+        "of other runs": lambda: ftlm.select([runs[0], motor(3, rows=200)], [SECOND, FIRST], store=place),
+        "by another validation": lambda: ftlm.select(runs, [SECOND, FIRST], validation="blocks", store=place),
+    }.items():
+        with pytest.raises(ftlm.DataError, match=f"holds a selection {words}; choose another file"):
+            other()
+    judged = ftlm.select(runs[0], [FIRST], validation=runs[1], store=tmp_path / "judged.ftlm")
+    assert judged.winner.failed is None
+    with pytest.raises(ftlm.DataError, match="another validation"):
+        ftlm.select(runs[0], [FIRST], validation=motor(3, rows=200), store=tmp_path / "judged.ftlm")
+    request = Request.of(*_asked(runs))
+    with Store(place, request), pytest.raises(ftlm.DataError, match="in use by another selection; wait for it"):
+        ftlm.select(runs, [SECOND, FIRST], store=place)
+    older = Request(request.algorithm + 1, "0.0.1", request.runs, request.candidates, request.validation)
+    with Store(tmp_path / "older.ftlm", older):
+        pass
+    with pytest.raises(ftlm.DataError, match=r"is of ftlm 0\.0\.1, algorithm .* finish the selection"):
+        ftlm.select(runs, [SECOND, FIRST], store=tmp_path / "older.ftlm")
+    assert place.read_bytes() == before
+    text = tmp_path / "notes.txt"
+    text.write_text("to do\n")
+    with pytest.raises(ftlm.DataError, match="is no ftlm selection store; give a file written with store="):
+        ftlm.select(runs, [FIRST], store=text)
+    assert text.read_text() == "to do\n"
+    with pytest.raises(ftlm.DataError, match="cannot be opened"):
+        ftlm.select(runs, [FIRST], store=tmp_path)
+    with pytest.raises(ftlm.DataError, match="cannot be opened: No such file"):
+        ftlm.select(runs, [FIRST], store=tmp_path / "no" / "such.ftlm")
+    with pytest.raises(
+        ftlm.DataError, match="is the store of a selection, not of a search; go on with it by the call that began it"
+    ):
+        ftlm.resume_search(place)
+    with pytest.raises(ftlm.DataError, match=r"^.*other\.ftlm is the store of a selection, not of a search"):
+        ftlm.search_status(place)
+    forged = tmp_path / "forged.ftlm"
+    with Store(forged, request) as kept:
+        kept._log.append([ENCODER.encode(request)])
+    with pytest.raises(ftlm.DataError, match="holds something else at byte"):
+        Store(forged, request)
+
+
+def test_errors_of_candidates_are_kept_and_those_of_ftlm_are_not(runs, tmp_path):
+    with Store(tmp_path / "errors.ftlm", Request.of(*_asked(runs))) as kept:
+        lost = kept.fit(FIRST, [], True, lambda: ftlm.ConvergenceError("no start"))
+        again = kept.fit(FIRST, [], True, lambda: pytest.fail("is known"))
+        assert (type(again), str(again)) == (type(lost), str(lost)) == (ftlm.ConvergenceError, "no start")
+        wrong = ftlm.InternalError("a panic")
+        assert kept.fit(SECOND, [], True, lambda: wrong) is wrong
+        assert len(kept) == 1
+    assert ENCODER.encode(Kept(b"0", Refused("DataError", "x")))
+
+
+def test_the_command_goes_on(runs, tmp_path, monkeypatch):
+    for run in runs:
+        table = np.column_stack([np.arange(run.length) * run.step, run["u"], run["y"]])
+        np.savetxt(tmp_path / f"{run.name}.csv", table, delimiter=",", header="t,u,y", comments="")
+    files = [str(tmp_path / f"{r.name}.csv") for r in runs]
+    place = tmp_path / "kept.ftlm"
+    words = [
+        "select", *files, "--time", "t", "-u", "u=u", "-y", "y=y", "--structure", "D y = a y + b u", "--structure",
+        "D^2 y = d D y + a y + b u", "--store", str(place), "--json", "--threads", "1",
+    ]  # fmt: skip
+    held = []
+
+    def stopped(*args, **more):
+        held.append(1)
+        if len(held) == 3:
+            raise KeyboardInterrupt
+        return fit_output_error(*args, **more)
+
+    with monkeypatch.context() as here:
+        here.setattr(trial, "fit_output_error", stopped)
+        first = CliRunner().invoke(app, words)
+    assert first.exit_code == 130
+    assert "interrupted; go on with: the same command" in first.output
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, done.output
+    without = CliRunner().invoke(app, [w for w in words if w not in ("--store", str(place))])
+    assert done.stdout == without.stdout
