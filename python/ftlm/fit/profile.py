@@ -261,14 +261,16 @@ class Valley:
         orders = len(self.grid.problem.orders)
         still = self._along(i, values, np.zeros_like(tangent), value)
         points = [self._along(i, values, tangent, value), still]
-        moves = np.abs(tangent * (value - values[i])) > BY_POWERS * np.abs(values)
-        if value * values[i] > 0 and moves.any():
-            powers = tangent * values[i] / np.where(values, values, 1.0)
-            power = values * (value / values[i]) ** np.clip(powers, -STEEPEST, STEEPEST)
-            mixed = np.where(np.arange(values.size) < orders, power, values + tangent * (value - values[i]))
-            for towards in (power, mixed):
-                towards[i] = value
-                points.append(self._along(i, values, towards - values, value))
+        # Of numbers that nothing tells a tangent has no end; a point there is none, and has no cost.
+        with np.errstate(over="ignore", invalid="ignore"):
+            moves = np.abs(tangent * (value - values[i])) > BY_POWERS * np.abs(values)
+            if value * values[i] > 0 and moves.any():
+                powers = tangent * values[i] / np.where(values, values, 1.0)
+                power = values * (value / values[i]) ** np.clip(powers, -STEEPEST, STEEPEST)
+                mixed = np.where(np.arange(values.size) < orders, power, values + tangent * (value - values[i]))
+                for towards in (power, mixed):
+                    towards[i] = value
+                    points.append(self._along(i, values, towards - values, value))
         return sorted(points, key=lambda p: self._cost(i, p)) if len(points) > 2 else points
 
     def _cost(self, i: int, values: Floats) -> float:
@@ -284,7 +286,8 @@ class Valley:
         at[i] = value
         if not direction[i]:
             return at
-        towards = values + direction / direction[i] * (value - values[i])
+        with np.errstate(over="ignore", invalid="ignore"):
+            towards = values + direction / direction[i] * (value - values[i])
         towards[i] = value
         point = feasible(self.grid.problem, at, towards)
         point[i] = value
@@ -499,5 +502,6 @@ def _tangent(attempt: Attempt, i: int) -> Floats:
     """How all numbers move along the profile when one moves by 1."""
     (left, sizes, right), length = _span(attempt, i)
     along = np.asarray(attempt.outcome["jacobian"])[i]
-    others = -(left @ ((right @ along) / sizes)) / length
+    with np.errstate(over="ignore"):
+        others = -(left @ ((right @ along) / sizes)) / length
     return np.insert(others, i, 1.0)

@@ -266,10 +266,10 @@ def fits_text(fits: Mapping[str, Sequence[float]], label: int, widths: Sequence[
 
 
 def reproduction_text(found: Recomputed) -> str:
-    """Verdicts and fits for a terminal."""
+    """Verdicts, each with its shortest reason, and fits for a terminal; the page has the numbers."""
     lines = []
     for claim in claims(found):
-        lines += [f"{claim.verdict.upper()}: {claim.claim}", f"    {claim.evidence}"]
+        lines += [f"{claim.verdict.upper()}: {claim.claim}", f"    {claim.brief}"]
     for stage in found.stages.values():
         lines += ["", f"Stage {stage.number}: fit of the free run in percent, driven as identified"]
         lines.append(" " * 26 + "".join(f"{o + run:>16}" for o in stage.outputs for run in (" square", " sine")))
