@@ -113,7 +113,7 @@ impl Body {
     /// what friction does has no one answer. Orders above a body's own are left to the grid, which sees the same.
     fn check_yields(&self) -> Result<()> {
         let (n, sticks, links) = (self.equations.len(), self.sticks(), self.links());
-        if sticks.len() < 2 || links.iter().flatten().any(|link| link.integration < -ORDER_GRAIN) {
+        if links.iter().flatten().any(|link| link.integration < -ORDER_GRAIN) {
             return Ok(());
         }
         let mut matrix = vec![0.0; n * n];

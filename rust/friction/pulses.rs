@@ -32,9 +32,9 @@ impl Rubbing {
     /// Bodies with these laws.
     ///
     /// # Errors
-    /// [`Error::Diverged`] where several bodies move each other so that a pulse has no one answer: the step is too long.
+    /// [`Error::Diverged`] where bodies move each other, or what they carry them, so that a pulse has no one answer: the step is too long.
     pub fn new(laws: Vec<Law>, gains: Vec<f64>) -> Result<Self> {
-        if laws.len() > 1 && !is_p_matrix(&gains, laws.len()) {
+        if !is_p_matrix(&gains, laws.len()) {
             // Reported like a step too far, so that a search shortens it.
             return Err(Error::Diverged {
                 what: "friction of bodies that move each other; the free run".into(),

@@ -254,6 +254,18 @@ def test_hubs_keep_their_friction_beside_the_other_stage(cross) -> None:
     assert structure.sticks == (0, 2)
 
 
+def test_what_is_carried_does_not_turn_friction_round() -> None:
+    words = "D^2 x = c D^2 y + u - fx*sign(D x); D^2 y = D^2 x - 9 y - 1 D y"
+    t = np.arange(101) * 0.02
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": force(t)}, outputs={"x": 0 * t, "y": 0 * t})
+    brakes = ftlm.Model(ftlm.equation(words, fixed={"c": -0.5, "fx": 1.0})).simulate(run)
+    slides = ftlm.Model(ftlm.equation(words, fixed={"c": -0.5, "fx": 1e-4})).simulate(run)
+    assert np.ptp(brakes["x"]) < np.ptp(slides["x"])
+    # 1 / (1 - 2) of a force on the body is what moves it.
+    with pytest.raises(ModelError, match="a force on one moves it against the force"):
+        ftlm.Model(ftlm.equation(words, fixed={"c": 2.0, "fx": 1.0})).simulate(run)
+
+
 def test_highest_orders_that_cancel_are_refused() -> None:
     three = "D^2 x = q + u - 1*sign(D x); D^2 q = D^2 p - q; D^2 p = D^2 q - 2 p + x"
     t = np.arange(101) * 0.01
