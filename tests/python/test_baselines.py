@@ -46,7 +46,7 @@ def test_what_the_result_depends_on_is_told(found):
     assert found.settings["bounds"]["alpha"] == [1.3, 1.9]
     # The last generation may go a little past what was asked for.
     assert 2 * 12000 <= found.settings["evaluations"]["y"] <= 2 * (12000 + 100)
-    assert "seeds 0, 1" in str(found)
+    assert "seeds 0, 1" in found.details()
     assert "genetic" in str(found.to_dict())
 
 

@@ -209,7 +209,7 @@ def test_identify_reports_both_tests_and_the_criteria(noisy):
     assert found.residuals is not None
     assert found.information.parameters == 4  # a, c, b and the noise level
     assert found.information.samples == noisy.length - 2
-    assert "AIC " in str(found)
+    assert "AIC " in found.details()
     assert "residuals white" in str(found)
     assert json.loads(json.dumps(found.to_dict(), default=list, allow_nan=False))["information"]["parameters"] == 4
     assert found.resid(noisy).outputs["y"].rms == found.residuals.outputs["y"].rms

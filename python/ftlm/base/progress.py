@@ -19,8 +19,12 @@ PATIENCE = 1.0
 WONDER = 2.0
 
 
+class Parts(int):
+    """A total that stands for a whole, of which a person wants to know the share, not the count."""
+
+
 #: Work without a count of its own is told in so many parts.
-PARTS = 1000
+PARTS = Parts(1000)
 
 
 def left_in_words(seconds: float) -> str:
@@ -153,7 +157,7 @@ class Progress:
         passed = max(time.monotonic() - self._start, 1e-9)
         counted = f"{done:,.0f}/{total:,.0f} {done / passed:,.0f}/s"
         # Of work without a count of its own a person wants to know the share.
-        counted = f"{100 * done // total:.0f} %" if total == PARTS else counted
+        counted = f"{100 * done // total:.0f} %" if isinstance(total, Parts) else counted
         share = "" if pruned is None else f"{100 * pruned / max(done, 1):.1f} % pruned"
         left = left_in_words(passed * (total - done) / done) if done else ""
         state = {"description": self._label, "counted": counted, "pruned": share, "left": left}
