@@ -27,7 +27,7 @@ class Clock:
         ln of the unit of time.
     constants, weights
         alpha - nu of each parameter at orders of 0, and by how much it rises with each parameter; 0 where it is no
-        coefficient that stands alone before a term.
+        coefficient that stands alone before a term, and under a law of products.
     """
 
     unit: float
@@ -40,9 +40,11 @@ class Clock:
         spans = [math.log(run.step) + math.log(run.length * run.step) for run in runs]
         size, first = len(problem.names), len(problem.orders)
         constants, weights = np.zeros(size), np.zeros((size, size))
+        # Under a law between coefficients one number stands before terms of several orders, and keeps its own unit.
+        lawful = any(len(factors) > 1 for _, factors in problem.products.values())
         for place, name in enumerate(problem.coefficients, first):
             alone = [(e, t) for e in problem.structure.equations for t in e.terms if t.coefficient == name]
-            if not alone or name in problem.products:
+            if not alone or lawful:
                 continue
             (item, term), *_ = alone
             top, above = affine(item.order, problem.orders)

@@ -23,7 +23,11 @@ impl Clock {
         let spans: Vec<f64> = experiments.iter().map(span).collect();
         // A frequency half way, in logarithms, between that of the record and Nyquist's.
         let unit = spans.iter().sum::<f64>() / (2.0 * spans.len().max(1) as f64) - libm::log(std::f64::consts::PI);
-        Self { unit, powers: (0..model.coordinates.len()).map(|j| power(model, j)).collect() }
+        // Under a law between coefficients one number stands before terms of several orders: it keeps its own unit, as its
+        // companions must then.
+        let lawful = model.equations.iter().flat_map(|e| &e.terms).any(|(_, _, c)| c.powers.len() > 1);
+        let powers = (0..model.coordinates.len()).map(|j| if lawful { None } else { power(model, j) }).collect();
+        Self { unit, powers }
     }
 
     /// By what a coefficient is to be multiplied at some orders for its number in the unit.
