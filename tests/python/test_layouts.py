@@ -412,3 +412,47 @@ def test_a_reader_that_is_missing_is_named_with_its_line(tmp_path, monkeypatch, 
     gone = package.replace("-", "_")
     monkeypatch.setattr(apart.importlib.util, "find_spec", lambda wanted: None if wanted == gone else find(wanted))
     messages([f"needs {package}", f"pip install 'ftlm[{extra}]'"], lambda: read(tmp_path, b"x", name))
+
+
+@pytest.mark.parametrize(
+    ("content", "wanted"),
+    [
+        ("u,y\n0,1\n#N/A,2\n2,3\n4,5\n", "line 3 begins with #"),
+        ("u\ty\n0\t1\n\t\n2\t3\n4\t5\n", "empty cell"),
+        ("y,u\nNone,0\n1,1\n2,5\n3,4\n", "'None'"),
+    ],
+)
+def test_no_row_vanishes(tmp_path, content, wanted):
+    messages([wanted], lambda: read(tmp_path, content, step=0.1))
+
+
+@pytest.mark.parametrize("clock", ["13:00 AM", "24:30", "1" + " " * 70])
+def test_what_is_no_time_of_day(clock):
+    assert not text.is_moment(clock)
+    assert text.Moments.read(["11:59", "1:00 PM"]) is None
+
+
+def test_years_of_two_digits_that_may_be_days_are_refused():
+    days = text.Moments.read([f"24-05-0{k}" for k in range(1, 7)])
+    messages(["dates='ymd'", "dates='dmy'"], lambda: days.seconds("x", None))
+    assert days.seconds("x", "ymd")[-1] == 5 * 86400.0
+
+
+def test_a_long_header_costs_no_time(tmp_path):
+    rest = "".join(f"{k},{k % 3},{k}\n" for k in range(5))
+    messages(["'q'"], lambda: read(tmp_path, "t,u,y(" + " " * 20000 + "x\n" + rest, outputs={"y": "q"}))
+
+
+def test_files_with_the_same_dates_agree(tmp_path):
+    paths = []
+    for name in ("u", "y"):
+        body = "".join(f"2024-05-01 10:00:0{k},{k % 3}\n" for k in range(6))
+        paths.append(write(tmp_path, f"date,{name}\n{body}", f"{name}.csv"))
+    assert ftlm.load(paths, **SIGNALS).step == 1.0
+
+
+def test_no_escape_reaches_the_terminal(tmp_path):
+    content = "t,u\x1b[31m,y\n" + "".join(f"{k},{k % 3},{k}\n" for k in range(5))
+    shown = str(ftlm.open_file(write(tmp_path, content), inputs={"u": 1}, outputs={"y": "y"}))
+    assert "\x1b" not in shown
+    assert "next:" not in shown

@@ -42,7 +42,7 @@ def header_time(name: str) -> tuple[str, str | None]:
     The unit is one of :data:`TIME_UNITS`, None where none is stated, and as it stands where square brackets hold
     something else. Written as in ``time [ms]``, ``time (ms)``, ``time/ms``, ``time, ms`` or ``time_ms``.
     """
-    folded = name.strip().casefold()
+    folded = " ".join(name.split()).casefold()  # runs of spaces would cost their cube below
     bracketed = _BRACKETED.fullmatch(folded)
     if bracketed and bracketed[2]:
         return bracketed[1], _WRITTEN.get(bracketed[2], bracketed[2])

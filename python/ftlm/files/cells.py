@@ -19,8 +19,6 @@ _UNIT_WORDS = frozenset(
         "vdc", "vac",
     )
 )  # fmt: skip
-_BRACKETED = re.compile(r"\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*")
-_STATED = re.compile(r"(.+?)\s*(?:\[\s*([^\[\]]*?)\s*\]|\(\s*([^()]*?)\s*\))\s*")
 
 
 def number(cell: str, *, comma: bool = False) -> float:
@@ -60,16 +58,29 @@ def split(lines: list[str], separator: str | None, source: str, first: int) -> l
 
 def stated_unit(name: str) -> tuple[str, str]:
     """What a column is called, and the unit that its name states in brackets, both as written; "" for none."""
-    found = _STATED.fullmatch(name)
-    unit = None if found is None else found[2] or found[3]
-    return (name, "") if found is None or not unit else (found[1], unit)
+    # Without regular expressions, whose time would grow with the cube of a long name's spaces.
+    text = name.rstrip()
+    opening = {"]": "[", ")": "("}.get(text[-1:])
+    if opening is None:
+        return name, ""
+    bare, mark, unit = text[:-1].rpartition(opening)
+    bare, unit = bare.rstrip(), unit.strip()
+    return (bare, unit) if mark and bare and unit and text[-1] not in unit else (name, "")
+
+
+def _bracketed(cell: str) -> str | None:
+    """What stands in the brackets that a cell consists of; None where it does not."""
+    text = cell.strip()
+    whole = len(text) > 1 and text[0] in "[(" and text[-1] in "])" and not any(c in "[]()" for c in text[1:-1])
+    return text[1:-1].strip() if whole else None
 
 
 def is_unit(cell: str) -> bool:
     """Whether a cell can stand in a row of units."""
-    bracketed = _BRACKETED.fullmatch(cell)
-    word = bracketed[1] if bracketed else cell.strip()
-    return word in UNITS or word.casefold() in _UNIT_WORDS or is_time_unit(word) or bool(bracketed and len(word) <= 12)
+    bracketed = _bracketed(cell)
+    word = cell.strip() if bracketed is None else bracketed
+    short = bracketed is not None and len(word) <= 12
+    return word in UNITS or word.casefold() in _UNIT_WORDS or is_time_unit(word) or short
 
 
 def is_time_unit(word: str) -> bool:
@@ -79,5 +90,5 @@ def is_time_unit(word: str) -> bool:
 
 def unit_of(cell: str) -> str:
     """The unit that a cell of a row of units holds, without its brackets."""
-    bracketed = _BRACKETED.fullmatch(cell)
-    return bracketed[1] if bracketed else cell.strip()
+    bracketed = _bracketed(cell)
+    return cell.strip() if bracketed is None else bracketed

@@ -183,8 +183,13 @@ class Pool:
 
 
 def _check_agreement(one: Column, other: Column) -> None:
-    a, b = one.numbers(), other.numbers()
     names = f"time: the columns {one.name!r} of {one.source.name} and {other.name!r} of {other.source.name}"
+    if one.moments is not None and other.moments is not None:
+        own, its = (np.column_stack([c.parts, c.clock]) for c in (one.moments, other.moments))
+        if one.moments.mark != other.moments.mark or not np.array_equal(own, its):
+            raise DataError(f"{names} differ; give files of one record, or name the time to use with time=")
+        return
+    a, b = one.numbers(), other.numbers()
     if a.size != b.size:
         raise DataError(
             f"{names} have {a.size} and {b.size} rows; give files of one record, or name the time with time="

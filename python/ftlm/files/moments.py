@@ -20,11 +20,24 @@ _CLOCK = (
 _DATE = r"(?=\d{4}[-./]|\d{1,2}[-./]\d{1,2}[-./]\d{2})(\d{4}|\d{1,2})([-./])(\d{1,2})\2(\d{4}|\d{1,2})"
 _MOMENT = re.compile(rf"\s*(?:{_DATE}(?:(?:\s+|T){_CLOCK})?|{_CLOCK})\s*", re.ASCII)
 _NS = 1_000_000_000
+_LONGEST = 64
 
 
 def is_moment(cell: str) -> bool:
     """Whether a cell holds a date, a time of day, or both."""
-    return _MOMENT.fullmatch(cell) is not None
+    return _match(cell) is not None
+
+
+def _match(cell: str) -> re.Match[str] | None:
+    """The parts of a moment; None where it is none, as 13:00 AM and 24:30."""
+    text = cell.strip()
+    found = _MOMENT.fullmatch(text) if len(text) <= _LONGEST else None
+    if found is None:
+        return None
+    groups = found.groups("")
+    hour, minute, second, fraction, half, _ = groups[4:10] if groups[1] else groups[10:16]
+    late = hour == "24" and int(f"0{minute}{second}{fraction}") > 0
+    return None if late or (half and int(hour) > 12) else found
 
 
 @dataclass(frozen=True)
@@ -51,14 +64,15 @@ class Moments:
     @classmethod
     def read(cls, cells: Sequence[str]) -> Moments | None:
         """Moments of all cells; None where one is no moment, or written otherwise than the first."""
-        found = [_MOMENT.fullmatch(cell) for cell in cells]
+        found = [_match(cell) for cell in cells]
         if not found or any(match is None for match in found):
             return None
         groups = [match.groups("") for match in found if match is not None]
         mark = groups[0][1]
         zoned = bool(groups[0][9] or groups[0][15])
         rows = [(*g[:4], *(g[4:10] if g[1] else g[10:16])) for g in groups]
-        if any(row[1] != mark or bool(row[9]) != zoned for row in rows):
+        halved = bool(rows[0][8])
+        if any(row[1] != mark or bool(row[9]) != zoned or bool(row[8]) != halved for row in rows):
             return None
         parts = np.array([(int(r[0] or 0), int(r[2] or 0), int(r[3] or 0)) for r in rows], np.int64)
         return cls(parts, mark, np.array([_clock(*row[4:]) for row in rows], np.int64), cells[0].strip())
@@ -105,7 +119,7 @@ class Moments:
 
     def _order(self, thing: str, dates: str | None) -> tuple[int, int, int]:
         """Places of year, month and day."""
-        first, second, _ = self.parts.max(axis=0)
+        first, second, last = self.parts.max(axis=0)
         if first > 31:
             return 0, 1, 2
         if dates is not None:
@@ -113,8 +127,13 @@ class Moments:
         if second > 12 >= first:
             return 2, 0, 1
         # Dates with points begin with the day; of others the numbers may tell, and one day is the same either way.
-        if self.mark == "." or first > 12 or (self.parts == self.parts[0]).all():
+        if self.mark == "." or (first > 12 and last > 31) or (self.parts == self.parts[0]).all():
             return 2, 1, 0
+        if first > 12:
+            raise DataError(
+                f"{thing}: {self.first!r} may begin with the year or with the day; say layout=dict(dates='ymd') or "
+                "layout=dict(dates='dmy')"
+            )
         raise DataError(
             f"{thing}: {self.first!r} may begin with the day or with the month; say layout=dict(dates='dmy') or "
             "layout=dict(dates='mdy')"

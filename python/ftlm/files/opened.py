@@ -140,8 +140,9 @@ class OpenedFile:
         lines += [f"note: {note}" for note in self.notes]
         if self.problem:
             lines.append(f"to do: {self.problem}")
-        lines += [f"next: {line}" for line in self._commands()]
-        return "\n".join(lines)
+        # What cannot be printed cannot be copied from a terminal either.
+        lines += [f"next: {line}" for line in self._commands() if line.isprintable()]
+        return "\n".join(map(_escaped, lines))
 
     def _commands(self) -> list[str]:
         return [] if self.problem else [self.command("inspect"), self.command("identify")]
@@ -354,5 +355,8 @@ def _figures(column: FileColumn) -> tuple[str, str, str]:
 
 def _printed(text: str) -> str:
     """Text without what a terminal would obey, and not too long."""
-    shown = "".join(c if c.isprintable() else repr(c)[1:-1] for c in text[:60])
-    return shown + ("…" if len(text) > 60 else "")
+    return _escaped(text[:60]) + ("…" if len(text) > 60 else "")
+
+
+def _escaped(text: str) -> str:
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

@@ -401,7 +401,10 @@ def read_sheet(path: str, sheet: str | None) -> tuple[dict[str, Any], bytes]:
     ((name, found),) = filled.items()
     out = io.StringIO(newline="")
     writer = csv.writer(out, delimiter="\t", lineterminator="\n")
-    for row in found.to_python(skip_empty_area=False):
+    table = found.to_python(skip_empty_area=False)
+    while table and not any(map(cell_text, table[-1])):
+        table.pop()
+    for row in table:
         writer.writerow([cell_text(cell) for cell in row])
     content = out.getvalue().encode("utf-8", errors="replace")
     return {"sheet": name, "others": [n for n in names if n != name], "bytes": len(content)}, content

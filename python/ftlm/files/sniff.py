@@ -236,12 +236,20 @@ def _settings(cut: list[_Line], at: int) -> bool:
     words = [c.strip() for c, n in zip(line.cells, line.numbers, strict=True) if c.strip() and not n]
     units = [word for word in words if is_unit(word)]
     others = {word.casefold() for word in words if not is_unit(word)}
-    return at > 0 and cut[at - 1].named and line.count > 0 and bool(units) and others <= {_COUNTED}
+    # Settings stand in columns of their own; numbers that the row below has too are a row's.
+    below = cut[at + 1].numbers if at + 1 < len(cut) else []
+    row = any(one and other for one, other in zip(line.numbers, below, strict=False))
+    return at > 0 and cut[at - 1].named and line.count > 0 and _measured(units) and others <= {_COUNTED} and not row
 
 
 def _units(line: _Line) -> bool:
     cells = [cell for cell in line.cells if cell.strip()]
-    return line.named and all(is_unit(cell) for cell in cells)
+    return line.named and all(is_unit(cell) for cell in cells) and _measured(cells)
+
+
+def _measured(units: Sequence[str]) -> bool:
+    """Whether one of them is a unit and no mark that also stands for a missing number."""
+    return any(unit.strip().casefold() not in ("-", "none", "%") for unit in units)
 
 
 def _header(

@@ -160,7 +160,7 @@ def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
     words = remark.lstrip("# \t").replace(",", " ").split()
     if assumption.option != "header" or len(words) != width or any(map(is_number, words)):
         return assumption
-    return replace(assumption, words=f"{assumption.words} (a remark above them has as many words: {' '.join(words)})")
+    return replace(assumption, words=f"{assumption.words} (a remark above them has as many words: {' '.join(words)!r})")
 
 
 def _sample(
@@ -193,7 +193,14 @@ def _holds(line: str, mark: str) -> bool:
 def _take(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> None:
     """Read the rows of one block."""
     found = rows.found
-    kept = [(at, line) for at, line in enumerate(lines, first) if at >= found.begin and _holds(line, mark)]
+    kept = []
+    for at, line in enumerate(lines, first):
+        # Between tabs, a row of empty cells is a gap and no blank line.
+        gap = found.separator == "\t" and "\t" in line and not line.strip()
+        if at >= found.begin and (gap or _holds(line, mark)):
+            kept.append((at, line))
+        elif at >= found.begin and line.lstrip()[:1] == mark:
+            _check_remark(line, at, found, source)
     if not kept:
         return
     cells = split([line for _, line in kept], found.separator, source, kept[0][0])
@@ -207,6 +214,18 @@ def _take(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> 
         plain = not found.comma and not any("_" in line for _, line in kept)
         rows.blocks.append(_numbers(rows, cells, [at for at, _ in kept], plain=plain))
     rows.count += len(cells)
+
+
+def _check_remark(line: str, at: int, found: Found, source: str) -> None:
+    """Refuse a line among the rows that may be a remark or a row whose first cell is one like #N/A."""
+    cells = line.split(found.separator)
+    numbers = any(is_number(cell, comma=found.comma) or is_moment(cell) for cell in cells)
+    error = len(cells) == 1 and cells[0].strip().endswith(("!", "?", "/A"))
+    if len(cells) == found.width and (found.width > 1 or error) and (numbers or error or found.separator is not None):
+        raise DataError(
+            f"{source}: line {at} begins with # and has as many cells as a row ({line.strip()[:40]!r}), so it may be a "
+            "remark or a row; remove that line, or write a number in its first cell"
+        )
 
 
 def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
