@@ -453,6 +453,6 @@ def test_files_with_the_same_dates_agree(tmp_path):
 
 def test_no_escape_reaches_the_terminal(tmp_path):
     content = "t,u\x1b[31m,y\n" + "".join(f"{k},{k % 3},{k}\n" for k in range(5))
-    shown = str(ftlm.open_file(write(tmp_path, content), inputs={"u": 1}, outputs={"y": "y"}))
+    shown = str(ftlm.open_file(write(tmp_path, content), inputs={"u": "u\x1b[31m"}, outputs={"y": "y"}))
     assert "\x1b" not in shown
     assert "next:" not in shown

@@ -9,7 +9,7 @@ import pytest
 
 import ftlm
 from ftlm.frequency import dcgain, modes, steady_states
-from ftlm.solve.modes import zeros_of
+from ftlm.solve.modes import _mode, zeros_of
 from ftlm.solve.stability import characteristic, right_zeros
 
 
@@ -225,3 +225,20 @@ def test_bad_input_is_refused_in_words():
         with pytest.raises(ftlm.errors.ModelError, match="not a Model"):
             modes(bad)
     assert characteristic(limited, coupled=True)
+
+
+def test_what_hardly_anything_tells_is_no_certain_decay():
+    # Right of the axis, and its angle unknown: it is not turned onto the negative axis.
+    growing = _mode(complex(np.log(3.0), 1.2), (0.1, 5.0, 2.0))
+    assert growing.pole.real > 0
+    assert growing.swings
+    # A little off the axis, within what its own uncertainty says: a relaxation.
+    assert not _mode(complex(np.log(3.0), np.pi - 0.03), (0.1, 0.1, 0.1)).swings
+
+
+def test_a_dead_time_is_waited_for_and_an_order_of_nearly_0_is_0():
+    late = ftlm.Model(ftlm.equation("D y = -2 y + 3 u", delay={"u": 20.0}))
+    assert late.step().time[-1] > 22.0
+    assert abs(late.step().values[0, 0, -1] - 1.5) < 5e-3
+    nearly = ftlm.Model(ftlm.equation("D^1.8 y = -0.6 D^0.8 y - 9 D^0.00001 y + 4 u"))
+    assert abs(nearly.dcgain()[0, 0] - 4 / 9) < 1e-3

@@ -67,6 +67,36 @@ def test_a_clean_record_that_predicts_another_one_is_trusted(found, checked):
     assert str(checked).startswith("TRUST: ")
 
 
+def test_a_large_run_does_not_hide_that_a_small_one_is_lost(found, other):
+    small = ftlm.Run.from_arrays(
+        step=0.02, inputs={"u": 0.02 * other["u"]}, outputs={"y": -0.02 * other["y"]}, units={"u": "V", "y": "m"},
+        name="small",
+    )  # fmt: skip
+    checked = found.validate([other, small])
+    assert checked.output_error["y"].fit > 95.0
+    assert checked.verdict.level == "do not use"
+    assert "on small" in checked.verdict.reason
+
+
+def test_a_validation_that_leaves_much_more_is_with_care(found, checked):
+    worse = replace(checked, output_error={"y": replace(checked.output_error["y"], nr=0.15, fit=85.0)})
+    judged = found.verdict(worse)
+    assert (judged.level, judged.reason.endswith("85 % on validation")) == ("with care", True)
+
+
+@pytest.mark.parametrize(
+    "warning",
+    [
+        "the delay of u cannot be told from these runs: its standard error exceeds its bounds",
+        "nothing tells fs and vs in these runs",
+        "r says little of u (F = 2, 10 are needed): a weak instrument",
+    ],
+)
+def test_what_no_number_says_speaks_against_a_model(found, checked, warning):
+    doubted = replace(found, warnings=(*found.warnings, warning))
+    assert doubted.verdict(checked).level == "with care"
+
+
 def test_without_a_validation_nothing_is_trusted(found, run):
     assert found.verdict().level == "with care"
     assert found.verdict().reasons == ("no run that it was not fitted to has been tried",)

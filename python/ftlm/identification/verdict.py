@@ -12,6 +12,7 @@ from markupsafe import Markup
 from ftlm.identification.judged import Judged
 from ftlm.judge.comparison import LOST, USELESS, Comparison
 from ftlm.judge.concerns import BAD, CARE, KINDS, Kind, concerns
+from ftlm.judge.metrics import Metrics
 from ftlm.judge.residuals import NEGLIGIBLE
 from ftlm.model.model import Model
 from ftlm.paint.text import unbounded
@@ -21,6 +22,8 @@ NOT_TRIED = "no run that it was not fitted to has been tried"
 #: A coefficient that is known to no more than this share of itself, an order to no more than this: half of what its
 #: 95 % interval spans is then as large as itself, or as the steps of 0.5 in which mechanisms differ.
 VAGUE_SHARE, VAGUE_ORDER = 0.5, 0.25
+#: A validation leaves far more than estimation did where it is this many times as much, and more than so many percent.
+MORE_LEFT, LITTLE_LEFT = 3.0, 10.0
 _KINDS = {kind.name: kind for kind in KINDS}
 
 
@@ -144,7 +147,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
                 found.append(_Against(concern.kind.level, reason, concern.kind.remedy))
         if not known.standard_errors:
             found.append(_Against(CARE, f"{known.method} gives no standard errors", "use method='output-error'"))
-        seen = all(name in known.runs for c in validation for name, _, _ in c.per_run)
+        seen = any(name in known.runs for c in validation for name, _, _ in c.per_run)
         if not validation or seen:
             found.append(_Against(CARE, NOT_TRIED, "give a run that the model has not seen"))
     against = _most_serious(found)
@@ -210,26 +213,43 @@ def _growing(model: Model) -> Iterator[_Against]:
     if model.structure.has_friction:
         return
     stable = model.stability(coupling=model.structure.coupling)
-    if stable.unstable_poles > 0:
+    if math.isnan(stable.unstable_poles):
+        yield _Against(CARE, "whether its free run grows cannot be told", _KINDS["unstable"].remedy)
+    elif stable.unstable_poles > 0:
         count = int(stable.unstable_poles)
         poles = f"{count} pole{'s' if count > 1 else ''} with a positive real part"
         yield _Against(BAD, f"{_KINDS['unstable'].what} ({poles})", _KINDS["unstable"].remedy)
 
 
 def _useless(where: str, comparison: Comparison) -> Iterator[_Against]:
-    """Outputs that the free run explains by less than half."""
-    useless = [o for o, f in comparison.output_error.items() if not f.nr <= USELESS]
-    if useless:
-        shown = ", ".join(f"{o} (fit {comparison.output_error[o].fit:.3g} %)" for o in useless)
-        yield _Against(BAD, f"the free run explains little of {where}{shown}", _KINDS["useless"].remedy)
+    """Outputs that the free run explains by less than half, over all runs or on one: a large run hides a small one."""
+    for run, errors in _each(comparison):
+        useless = [o for o, f in errors.items() if not f.nr <= USELESS]
+        if useless:
+            shown = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{run})" for o in useless)
+            yield _Against(BAD, f"the free run explains little of {where}{shown}", _KINDS["useless"].remedy)
+            return
+
+
+def _each(comparison: Comparison) -> Iterator[tuple[str, Mapping[str, Metrics]]]:
+    """Errors of the free run over all runs, and where there are several on each."""
+    yield "", comparison.output_error
+    if len(comparison.per_run) > 1:
+        for name, _, errors in comparison.per_run:
+            yield f" on {name}", errors
 
 
 def _lost(before: Mapping[str, float], validation: Comparison) -> Iterator[_Against]:
-    """Outputs whose fit on validation is far below that on estimation."""
-    for output, figures in validation.output_error.items():
-        if output in before and not figures.fit >= before[output] - LOST:
-            words = f"the fit of {output} falls from {before[output]:.3g} to {figures.fit:.3g} % on validation"
-            yield _Against(CARE, words, _KINDS["lost"].remedy)
+    """Outputs whose fit on validation is far below that on estimation: by points, or by how much more is left over."""
+    for run, errors in _each(validation):
+        for output, figures in errors.items():
+            if output not in before:
+                continue
+            left, own = 100.0 - figures.fit, 100.0 - before[output]
+            if not (left <= own + LOST and (left <= MORE_LEFT * own or left <= LITTLE_LEFT)):
+                words = f"the fit of {output} falls from {before[output]:.3g} to {figures.fit:.3g} % on validation{run}"
+                yield _Against(CARE, words, _KINDS["lost"].remedy)
+                return
 
 
 def _residuals(result: Judged) -> Iterator[_Against]:

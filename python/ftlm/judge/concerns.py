@@ -69,7 +69,16 @@ KINDS = (
     ),
     Kind(
         "loop", CARE, "the runs were made in a closed loop", "name what drives the loop with reference=, or open it",
-        ("a closed loop", "says little of"),
+        ("a closed loop",),
+    ),
+    Kind(
+        "instrument", CARE, "what drives the loop tells little of its input", "record a stronger reference",
+        ("says little of",),
+    ),
+    Kind(
+        "untold", CARE, "the runs do not tell a number at all",
+        "fix it, leave it out, or record a richer input",
+        ("its standard error exceeds its bounds", "nothing tells fs and vs", "do not tell its damping"),
     ),
     Kind(
         "residuals", CARE, "the model leaves something out",
@@ -83,7 +92,7 @@ KINDS = (
     Kind(
         "vague", CARE, "the runs hardly tell some numbers", "fix a number, leave a term out, or record a richer input",
         (
-            "cannot be told", "is not different from 0", "do not bound", "nothing tells fs and vs",
+            "cannot be told", "is not different from 0", "do not bound",
             "what is seen of friction", "free numbers, but", "too few for orders", "intervals are rough",
         ),
     ),

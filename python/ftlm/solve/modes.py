@@ -27,6 +27,8 @@ from ftlm.solve.stability import characteristic, roots_in_base
 
 #: A zero this close to the negative axis [rad], or within its own uncertainty of it, relaxes: it swings no more there.
 NEAR_REAL = 0.02 * math.pi
+#: Orders as they are printed: below half of their last digit one is 0.
+SEEN_ORDER = 5e-5
 #: Zeros up to here are a relaxation where no pole is there at all: D^0.5 y = -a y has its own at arg s = 2 pi.
 SHEETS = 2.0 * math.pi
 #: Steps of approximate orders whose polynomials tell where zeros are to be sought.
@@ -126,7 +128,8 @@ def modes(model: Solved, *, coupling: str = "simulated") -> tuple[Mode, ...]:
 def _mode(w: complex, spread: tuple[float, float, float] | None) -> Mode:
     """A zero in ln s with the standard deviations of its parts as a mode."""
     size, angle = math.exp(w.real), w.imag
-    sure = NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1])
+    # Of a pole that hardly anything tells nobody may say that it is real, let alone that it dies away.
+    sure = min(NORMAL_95 * (0.0 if spread is None or not math.isfinite(spread[1]) else spread[1]), NEAR_REAL)
     if angle >= math.pi - max(sure, SAME) or angle <= SAME:
         sign = 1.0 if angle <= SAME else -1.0
         error = None if spread is None else spread[0]
@@ -311,7 +314,7 @@ def steady_states(model: Solved) -> tuple[SteadyState, ...]:
         errors = {pair: math.sqrt(max(float(v @ matrix @ v), 0.0)) for pair, v in slopes.items()}
     out = []
     for (output, signal), (order, rate) in pairs.items():
-        gain = rate if abs(order) < GRAIN else 0.0 if order < 0 else math.copysign(math.inf, rate)
+        gain = rate if abs(order) < SEEN_ORDER else 0.0 if order < 0 else math.copysign(math.inf, rate)
         out.append(SteadyState(output, signal, gain, errors.get((output, signal)), order, rate))
     return tuple(out)
 
@@ -373,4 +376,5 @@ def settling_time(model: Solved) -> float:
         return 10.0
     slowest = max(min(m.time_constant, 20.0 * 2 * math.pi / m.frequency) for m in found)
     swings = [2 * math.pi / m.frequency for m in found if m.swings]
-    return min(6.0 * slowest, 50.0 * min(swings)) if swings else 6.0 * slowest
+    settled = min(6.0 * slowest, 50.0 * min(swings)) if swings else 6.0 * slowest
+    return settled + max(model.structure.delay.values(), default=0.0)
