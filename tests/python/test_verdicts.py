@@ -54,7 +54,11 @@ def test_what_turns_with_the_arm_cannot_be_told_of_the_machine_from_a_simulated_
     assert ruled(cases(of_arm)).word == "turns with"
     # What the arm does not change can be told of any.
     assert str(ruled(cases(lambda prior, *_: prior == "1"), of_the_machine=True)) == "turns with K0"
-    assert str(ruled(cases(of_arm, arms=("one",)), of_the_machine=True)) == "turns with the angle"
+    # One arm says what was put into it, whatever it says.
+    for rule in (of_arm, lambda *_: True, lambda *_: False):
+        one = ruled(cases(rule, arms=("one",)), of_the_machine=True)
+        assert (str(one), one.cases) == ("cannot be told from a simulated truth", 4)
+    assert str(ruled(cases(lambda *_: True), of_the_machine=True)) == "holds"
 
 
 def test_an_error_arrives_where_it_stays():

@@ -351,8 +351,9 @@ def _claim_of_orders(found: Recomputed) -> Claim:
 def _claim_of_near_orders(found: Recomputed) -> Claim:
     near = {o: (s.near.estimation.equation_error[o].nr, s.near.estimation.output_error[o].nr) for s, o in found.angles}
     ruling = ruled(
-        _of_angles({o: out < FLATTERY * eq and out < EXPLAINS for o, (eq, out) in near.items()})
-    )  # fmt: skip
+        _of_angles({o: out < FLATTERY * eq and out < EXPLAINS for o, (eq, out) in near.items()}),
+        of_the_machine=found.simulated,
+    )
     return Claim(
         "The orders of Tables 4 and 5 (2; 1.95 to 1.8) describe the arm.",
         ruling,
