@@ -93,9 +93,14 @@ def _ran_section(found: Recomputed) -> Section:
 
 def _printed_section(found: Recomputed) -> Section:
     far = ", ".join(f"{t.away:.2f} ({symbol(o)})" for o, t in found.as_printed.items())
+    others = "; ".join(
+        f"{number(t.ratios['b'][-1], 3)}, {number(t.ratios['d'][-1], 3)}, {number(t.ratios['g'][-1], 3)} ({symbol(o)})"
+        for o, t in found.as_printed.items()
+    )
     ranks = ", ".join(f"{t.rank} of {t.among} ({symbol(o)})" for o, t in found.as_printed.items())
     words = [
-        f"How near Tables 4 and 5 can be brought: a and NR within a factor of {far}, in the mean. It takes the printed "
+        f"How near Tables 4 and 5 can be brought: a and NR, by which K₀ is chosen, within a factor of {far}, in the "
+        f"mean; b, d and g over the printed ones with p = 7 are {others}. It takes the printed "
         "orders, multi-innovation, the error of the equation in place of the free run, and choices that the paper does "
         "not name: K₀ for each angle, own terms on the left-hand side, the stock filter on the deflections, which of "
         "(22)–(25) and (26) is meant.",
