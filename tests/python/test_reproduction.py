@@ -181,6 +181,9 @@ def test_larger_p_converges_faster_where_the_prior_counts(reproduction):
     claim = by_words(claims(reproduction), "larger p converges faster")
     assert claim.verdict == "turns with K0"
     assert [(level, held == count) for level, count, held in claim.ruling.levels] == [("1", True), ("10¹⁰", False)]
+    # With K0 = 1 deflections arrive at once, whatever p is, and are no cases.
+    assert claim.ruling.levels[0] == ("1", 4, 4)
+    assert "no cases: 4 of 16" in claim.evidence
     strong, weak = (trials_of(reproduction, prior) for prior in (1.0, 1e10))
     for output in ("theta11", "theta21"):
         steps = list(strong[output].arrived.values())

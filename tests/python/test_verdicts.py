@@ -12,7 +12,7 @@ from ftlm.fit.differential import differential_evolution_search
 from ftlm.paper import printed
 from ftlm.paper.arm import ARMS, MAIN, demo_run
 from ftlm.paper.asprinted import SCAN, as_printed, implied_spreads, papers_record
-from ftlm.paper.claims import spread_in_words
+from ftlm.paper.claims import sooner, spread_in_words
 from ftlm.paper.panel import arrived_at
 from ftlm.paper.ran import one_angle, papers_current, printed_numbers, ran
 from ftlm.paper.rivalry import like_for_like, seeds_for
@@ -71,6 +71,17 @@ def test_an_error_arrives_where_it_stays():
     assert arrived_at(trace(np.inf, 1.0, 1.0), 1.0) == 4
     assert arrived_at(trace(0.5, 0.5), 1.0) == 2
     assert arrived_at(trace(1.0, 1.0, 1.5), 1.0) == np.inf
+
+
+def test_nothing_is_sooner_where_all_arrive_at_once_or_never():
+    def of(*steps):
+        return sooner(dict(zip(printed.INNOVATION_LENGTHS, steps, strict=True)))
+
+    assert of(46, 10, 10, 10) is True
+    assert of(26, 28, 28, 28) is False
+    assert of(2, 2, 2, 2) is None
+    assert of(np.inf, np.inf, np.inf, np.inf) is False
+    assert of(np.inf, 10, 10, 10) is False
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -309,19 +309,22 @@ def _claim_of_p_itself(found: Recomputed) -> Claim:
     )  # fmt: skip
 
 
-def _claim_of_convergence(found: Recomputed) -> Claim | None:
-    trials = found.panel.trials
-    if not trials:
+def sooner(arrived: Mapping[int, float]) -> bool | None:
+    """Whether a larger p takes fewer steps; None where all arrive with the first step that is looked at."""
+    steps = [arrived[p] for p in printed.INNOVATION_LENGTHS]
+    if max(steps) <= STEPS:
         return None
+    # What never arrives is not faster than what does not, either.
+    falls = all(b <= a for a, b in pairwise(steps)) and steps[-1] <= (1 - SOONER) * steps[0]
+    return math.isfinite(max(steps)) and falls
 
-    def faster(t: Trial) -> bool:
-        steps = [t.arrived[p] for p in ALL_P]
-        first = min(steps)
-        # Where all arrive with the first step that is looked at none can be faster.
-        at_once = max(steps) == first <= STEPS
-        return all(b <= a for a, b in pairwise(steps)) and (steps[-1] <= (1 - SOONER) * steps[0] or at_once)
 
-    ruling = ruled(_of_trials(trials, [faster(t) for t in trials]))
+def _claim_of_convergence(found: Recomputed) -> Claim | None:
+    trials = [t for t in found.panel.trials if sooner(t.arrived) is not None]
+    if not found.panel.trials:
+        return None
+    at_once = len(found.panel.trials) - len(trials)
+    ruling = ruled(_of_trials(trials, [bool(sooner(t.arrived)) for t in trials]))
     ends = [
         f"K0 = {prior_in_words(k)}: {listed({o: t.arrived.values() for o, t in _of_main(found, k).items()})}"
         for k in PRIORS
@@ -331,7 +334,9 @@ def _claim_of_convergence(found: Recomputed) -> Claim | None:
         ruling,
         _held(ruling),
         "steps until the error stays within 2 % of the end of p = 1, all p at the same orders, on the first record, "
-        f"for p = 1, 3, 5, 7: {'; '.join(ends)}.",
+        f"for p = 1, 3, 5, 7: {'; '.join(ends)}. Records where all p arrive by step {STEPS}, which is the first that is "
+        f"looked at, are no cases: {at_once} of {len(found.panel.trials)}. A case holds where all arrive, no larger p "
+        f"later, and p = 7 by {100 * SOONER:g} % sooner than p = 1.",
     )
 
 
