@@ -233,9 +233,8 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
     freed = tuple(replace(f, free={o: 0.1 * v for o, v in f.whole.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
                   for f in panel.freed)  # fmt: skip
     stage = reproduction.stages[1]
-    weak = {o: {p: {n: v * p for n, v in c.items()} for p, c in each.items()} for o, each in stage.weak.items()}
     swapped = {**stage.candidates, "published, output error": stage.candidates["output error"]}
-    other = replace(stage, candidates=swapped, weak=weak, near=stage.candidates["output error"])
+    other = replace(stage, candidates=swapped, near=stage.candidates["output error"])
     ran = tuple(
         replace(r, moved=r.implied, stability=replace(r.stability, stable=True)) for r in reproduction.ran
     )  # fmt: skip
@@ -258,6 +257,14 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
     assert near.verdict == "holds"
     # Of measured runs nobody knows the truth.
     assert not [c for c in claims(replace(reproduction, simulated=False)) if "find the orders" in c.claim]
+
+
+def test_p_itself_is_judged_by_errors_not_by_coefficients_that_differ(reproduction):
+    stage = reproduction.stages[1]
+    uneven = dict(zip(printed.INNOVATION_LENGTHS, (1.0, 1.1, 1.2, 5.0), strict=True))
+    weak = {o: {p: {n: uneven[p] for n in c} for p, c in each.items()} for o, each in stage.weak.items()}
+    found = claims(replace(reproduction, stages={1: replace(stage, weak=weak)}))
+    assert by_words(found, "p itself improves").verdict == "does not hold"
 
 
 def test_both_readings_are_saved(saved):
