@@ -114,3 +114,25 @@ def test_what_cannot_be_balanced_is_said(words, message):
     run = run_of({}, 100)
     with pytest.raises(ftlm.FtlmError, match=message):
         ftlm.energies(run, **words)
+
+
+def test_a_run_that_does_not_start_at_rest_is_refused():
+    run = run_of({}, 100)
+    t, rest = run.time, {n: run[n] for n in ("theta11", "theta12")}
+
+    def made(rows=101, **angles):
+        outputs = {n: x[:rows] for n, x in (rest | angles).items()}
+        return ftlm.Run.from_arrays(step=run.step, inputs={"I1": run["I1"][:rows]}, outputs=outputs, name="mine")
+
+    with pytest.raises(ftlm.DataError, match=r"run 'mine': theta12 starts at 0.5 rad, not at 0; .* slice it"):
+        ftlm.energies(made(theta12=0 * t + 0.5))
+    with pytest.raises(ftlm.DataError, match=r"theta11 moves by 0.2 rad in its first step"):
+        ftlm.energies(made(theta11=2.0 * t))
+    with pytest.raises(ftlm.DataError, match="run 'mine' has 3 rows; energies need at least 4"):
+        ftlm.energies(made(rows=3))
+    assert ftlm.energies(made(rows=4)).time.shape == (4,)
+    assert not ftlm.energies(made(theta11=0 * t, theta12=0 * t)).kinetic.any()
+    # A current that jumps starts from rest too.
+    still = {n: 0 * t for n in rest}
+    drive = ftlm.Run.from_arrays(step=0.01, inputs={"I1": 0 * t + 0.3}, outputs=still)
+    ftlm.energies(ftlm.link_model(stage=1, parameters={1: LINK}).simulate(drive))

@@ -143,11 +143,16 @@ def by_words(found, words):
 def test_verdicts_follow_the_numbers(reproduction):
     found = claims(reproduction)
     for words in (
-        "p itself, not the", "orders of Tables 4 and 5", "Table 3 gives", "Table 7 compares", "leaves the current",
+        "p itself improves", "Table 3 gives", "Table 7 compares", "leaves the current",
         "integer row of θ₂₂", "find the orders of an arm", "printed models, under the paper's current",
         "printed models are stable", "returns its coefficients", "printed orders are the best",
+        "can be computed again",
     ):  # fmt: skip
         assert by_words(found, words).verdict == "does not hold", words
+    # One simulated arm says nothing of the paper's.
+    assert by_words(found, "orders of Tables 4 and 5").verdict == "cannot be told from a simulated truth"
+    measured = claims(replace(reproduction, simulated=False))
+    assert by_words(measured, "orders of Tables 4 and 5").verdict == "does not hold"
     assert "α₂ 1.90" in by_words(found, "find the orders of an arm").evidence
     assert "316 times less" in by_words(found, "printed models, under").brief
 
@@ -176,6 +181,9 @@ def test_larger_p_converges_faster_where_the_prior_counts(reproduction):
     claim = by_words(claims(reproduction), "larger p converges faster")
     assert claim.verdict == "turns with K0"
     assert [(level, held == count) for level, count, held in claim.ruling.levels] == [("1", True), ("10¹⁰", False)]
+    # With K0 = 1 deflections arrive at once, whatever p is, and are no cases.
+    assert claim.ruling.levels[0] == ("1", 4, 4)
+    assert "no cases: 4 of 16" in claim.evidence
     strong, weak = (trials_of(reproduction, prior) for prior in (1.0, 1e10))
     for output in ("theta11", "theta21"):
         steps = list(strong[output].arrived.values())
@@ -225,13 +233,13 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
     freed = tuple(replace(f, free={o: 0.1 * v for o, v in f.whole.items()}, orders={"gamma1": (0.9, 0.8, 0.95)})
                   for f in panel.freed)  # fmt: skip
     stage = reproduction.stages[1]
-    weak = {o: {p: {n: v * p for n, v in c.items()} for p, c in each.items()} for o, each in stage.weak.items()}
     swapped = {**stage.candidates, "published, output error": stage.candidates["output error"]}
-    other = replace(stage, candidates=swapped, weak=weak, near=stage.candidates["output error"])
+    other = replace(stage, candidates=swapped, near=stage.candidates["output error"])
     ran = tuple(
         replace(r, moved=r.implied, stability=replace(r.stability, stable=True)) for r in reproduction.ran
     )  # fmt: skip
-    tables = {o: replace(t, rank=1, rows={p: replace(row, coefficients=dict(printed.FRACTIONAL[o][p].coefficients))
+    tables = {o: replace(t, rank=1, rows={p: replace(row, coefficients=dict(printed.FRACTIONAL[o][p].coefficients),
+                                                       equation=replace(row.equation, nr=printed.FRACTIONAL[o][p].nr))
                                           for p, row in t.rows.items()})
               for o, t in reproduction.as_printed.items()}  # fmt: skip
     made = replace(
@@ -240,13 +248,23 @@ def test_verdicts_turn_when_the_numbers_do(reproduction):
     found = claims(made)
     for words in (
         "larger innovation length", "larger p converges faster", "than the genetic algorithm", "closer to the run than",
-        "better than whole ones", "p itself, not the prior", "orders of Tables 4 and 5", "find the orders of an arm",
+        "better than whole ones", "p itself improves", "find the orders of an arm",
         "printed models, under the paper's current", "printed models are stable", "printed orders are the best",
         "can be computed again",
     ):  # fmt: skip
         assert by_words(found, words).verdict == "holds", words
+    near = by_words(claims(replace(made, simulated=False)), "orders of Tables 4 and 5")
+    assert near.verdict == "holds"
     # Of measured runs nobody knows the truth.
     assert not [c for c in claims(replace(reproduction, simulated=False)) if "find the orders" in c.claim]
+
+
+def test_p_itself_is_judged_by_errors_not_by_coefficients_that_differ(reproduction):
+    stage = reproduction.stages[1]
+    uneven = dict(zip(printed.INNOVATION_LENGTHS, (1.0, 1.1, 1.2, 5.0), strict=True))
+    weak = {o: {p: {n: uneven[p] for n in c} for p, c in each.items()} for o, each in stage.weak.items()}
+    found = claims(replace(reproduction, stages={1: replace(stage, weak=weak)}))
+    assert by_words(found, "p itself improves").verdict == "does not hold"
 
 
 def test_both_readings_are_saved(saved):

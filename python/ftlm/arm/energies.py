@@ -12,7 +12,7 @@ from ftlm import _core
 from ftlm.arm.link import order_law
 from ftlm.arm.parameters import PARAMETERS, LinkParameters, whole_order
 from ftlm.base.arrays import Floats
-from ftlm.base.errors import ModelError
+from ftlm.base.errors import DataError, ModelError
 from ftlm.data.run import Run
 from ftlm.solve.operators import fractional_derivative
 
@@ -21,11 +21,16 @@ from ftlm.solve.operators import fractional_derivative
 SLOWEST, FASTEST = 1e-3, 1e3
 #: Distance of two rates in their logarithm: the sum is then the integral to 1e-6.
 APART = 0.5
+#: An angle is at rest where it starts within this share of its largest value, its first difference within that of the
+#: largest one, or, in few samples, of the second: from rest t^alpha has 1/3 of it with alpha = 2, and 0.55 with 1.5.
+STARTS, MOVES_OFF, SPEEDS_UP = 0.01, 0.1, 2 / 3
+#: Rows that differences of third order need.
+FEWEST = 4
 
 
 @dataclass(frozen=True)
 class Power:
-    """Power of one force c D^nu theta on its own angle, and what becomes of it.
+    """Power of one force c D^nu theta on its own angle, and what becomes of it, each of shape (N,).
 
     Parameters
     ----------
@@ -44,7 +49,7 @@ class Power:
 
 @dataclass(frozen=True)
 class Energies:
-    """Energies and generalised forces of a run of one stage, at its samples.
+    """Energies and generalised forces of a run of one stage at its N samples, each of shape (N,).
 
     Parameters
     ----------
@@ -53,9 +58,9 @@ class Energies:
     potential
         Viscoelastic potential energy of the link as (7) has it: with K_s in N m/rad and beta_2 = 0 in J.
     hub_kinetic, link_kinetic
-        Kinetic energies (8).
+        Kinetic energies (8); with gamma_1 = mu_2 = 1 in J.
     hub_force, link_force
-        Non-conservative generalised forces (10), (11).
+        Non-conservative generalised forces (10), (11) [N m].
     motor
         Power of the motor's torque on its hub [W].
     inertia
@@ -99,8 +104,8 @@ def energies(
     Parameters
     ----------
     run
-        I1, theta11, theta12 or I2, theta21, theta22, in A and rad, from rest. Angles are differentiated: noise is
-        not for this; use what :func:`ftlm.simulate` gives.
+        I1, theta11, theta12 or I2, theta21, theta22, in A and rad, from rest, at least 4 rows. Angles are
+        differentiated: noise is not for this; use what :func:`ftlm.simulate` gives.
     stage
         1 or 2.
     parameters
@@ -118,7 +123,7 @@ def energies(
     ModelError
         A stage or an order that is not known, an order of a force outside [0, 1].
     DataError
-        A run that lacks one of the three signals, or has too few samples.
+        A run that lacks one of the three signals, has fewer than 4 rows, or an angle that does not start at rest at 0.
     """
     law = order_law(stage)
     h, d = 2 * stage - 1, 2 * stage
@@ -137,6 +142,10 @@ def energies(
         np.asarray(run[n], dtype=np.float64) for n in (f"theta{stage}1", f"theta{stage}2", f"I{stage}")
     )
     step = run.step
+    if run.length < FEWEST:
+        raise DataError(f"run {run.name!r} has {run.length} rows; energies need at least {FEWEST}")
+    for name, angle in ((f"theta{stage}1", hub), (f"theta{stage}2", bend)):
+        _check_rest(run.name, name, angle)
 
     def rate(x: Floats, order: float) -> Floats:
         return fractional_derivative(x, order, step=step, definition="caputo", initial=[0.0, 0.0, 0.0])
@@ -159,11 +168,39 @@ def energies(
     )  # fmt: skip
 
 
+def _check_rest(run: str, name: str, angle: Floats) -> None:
+    """Every derivative here is one of rest: what was there before would be taken for a blow at the first sample."""
+    moves = np.diff(angle)
+    way_out = (
+        "energies are those of a run from rest, with angles from 0: slice it where it rests, and take that angle off"
+    )
+    if abs(angle[0]) > STARTS * np.max(np.abs(angle)):
+        raise DataError(f"run {run!r}: {name} starts at {angle[0]:.4g} rad, not at 0; {way_out}")
+    if abs(moves[0]) > max(MOVES_OFF * np.max(np.abs(moves)), SPEEDS_UP * abs(moves[1])):
+        raise DataError(f"run {run!r}: {name} moves by {moves[0]:.4g} rad in its first step; {way_out}")
+
+
 def power(angle: Floats, coefficient: float, order: float, step: float) -> Power:
     """Power of c D^nu theta on theta, from rest: what it stores and what it loses.
 
     D^nu theta = sin(pi nu)/pi times the integral over w from 0 of w^(nu-1) z_w, where z_w' = -w z_w + theta'. Every z_w
     is a spring behind a dashpot: it stores z_w^2/2 and loses w z_w^2.
+
+    Parameters
+    ----------
+    angle
+        theta [rad], shape (N,), N at least 2; starts at rest at 0.
+    coefficient
+        c [N m s^nu/rad].
+    order
+        nu, from 0 (a spring) to 1 (a dashpot).
+    step
+        [s].
+
+    Returns
+    -------
+    Power
+        At the N samples.
     """
     start = np.concatenate([[0.0], np.diff(angle)])
     rate = np.gradient(angle, step)

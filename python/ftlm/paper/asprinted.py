@@ -36,7 +36,7 @@ READINGS = {
 SCAN = tuple(float(v) for v in np.logspace(-3, 5, 65))
 #: Orders around the printed ones, in the paper's steps, among which the printed ones have their place.
 LOW, HIGH, STEP = 1.6, 1.95, 0.05
-#: A column of a agrees with the printed one where its sign does and no entry is further than this factor.
+#: A column agrees with the printed one where its signs do and no entry is further than this factor.
 NEAR = 1.25
 ALL_P = printed.INNOVATION_LENGTHS
 
@@ -120,11 +120,19 @@ class AsPrinted:
         return [c for c in printed.COEFFICIENTS if course(self.rows, c) == course(table, c)]
 
     @property
-    def near(self) -> bool:
-        """Whether every a has the printed sign and is within a quarter of the printed value."""
+    def ratios(self) -> dict[str, list[float]]:
+        """Ours over printed by p, of every column and of NR."""
         table = printed.FRACTIONAL[self.output]
-        ratios = [r.coefficients["a"] / table[p].coefficients["a"] for p, r in self.rows.items()]
-        return all(1.0 / NEAR <= q <= NEAR for q in ratios)
+        columns = {
+            c: [r.coefficients[c] / table[p].coefficients[c] for p, r in self.rows.items()]
+            for c in printed.COEFFICIENTS
+        }
+        return columns | {"NR": [r.equation.nr / float(table[p].nr or 1.0) for p, r in self.rows.items()]}
+
+    @property
+    def near(self) -> bool:
+        """Whether every coefficient has the printed sign and is, as NR is, within a quarter of the printed value."""
+        return all(1.0 / NEAR <= q <= NEAR for column in self.ratios.values() for q in column)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -133,6 +141,7 @@ class AsPrinted:
             "filtered": self.reading.filtered, "sign reversed": self.reading.reversed, "away": finite(self.away),
             "away at K0 = 1": finite(self.away_at_one), "rank of the printed orders": self.rank, "among": self.among,
             "best orders": self.best, "scale": self.scale, "columns of the printed course": self.alike,
+            "ours / printed": self.ratios,
             "rows": {
                 str(p): {"coefficients": r.coefficients, "equation_error": r.equation.to_dict()}
                 for p, r in self.rows.items()

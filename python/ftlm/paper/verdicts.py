@@ -70,16 +70,14 @@ def ruled(cases: Sequence[Case], *, of_the_machine: bool = False) -> Ruling:
         At least one, or nothing can be told.
     of_the_machine
         Whether the claim is one of the machine, not of a method, and the machine was simulated: where it turns with the
-        arm, or there is one alone, the answer is what was put into it.
+        arm, or there is one arm alone, the answer is what was put into it.
     """
     held = sum(case.holds for case in cases)
     counts = len(cases), held
     if not cases:
         return Ruling("cannot be told")
-    arms = {dict(item.factors).get(TRUTH) for item in cases}
-    if of_the_machine and len(arms) < 2:
-        # Of one simulated arm the answer is what was put into it, whatever it is.
-        return Ruling("cannot be told from a simulated truth", (), *counts)
+    if of_the_machine and len({dict(case.factors).get(TRUTH) for case in cases}) < 2:
+        return Ruling("cannot be told from a simulated truth", (TRUTH,), *counts)
     if held in (0, len(cases)):
         return Ruling("holds" if held else "does not hold", (), *counts)
     names = [name for name, _ in cases[0].factors]
