@@ -145,6 +145,12 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
         pass
     with pytest.raises(ftlm.DataError, match=r"is of ftlm 0\.0\.1, algorithm .* finish the selection"):
         ftlm.select(runs, [SECOND, FIRST], store=tmp_path / "older.ftlm")
+    # Digests of another version tell nothing of what it was asked.
+    strange = Request(request.algorithm, "0.0.1", b"other", b"others", b"another")
+    with Store(tmp_path / "strange.ftlm", strange):
+        pass
+    with pytest.raises(ftlm.DataError, match=r"is of ftlm 0\.0\.1, algorithm .* finish the selection"):
+        ftlm.select(runs, [SECOND, FIRST], store=tmp_path / "strange.ftlm")
     assert place.read_bytes() == before
     text = tmp_path / "notes.txt"
     text.write_text("to do\n")

@@ -286,14 +286,15 @@ class Store:
 
     def _check_same(self, asked: Request, held: Request) -> None:
         path = self._log.path
-        difference = asked.difference(held)
-        if difference is not None:
-            raise DataError(f"store {path} holds a selection {difference}; choose another file")
+        # Digests are of what one version writes of candidates: those of another tell nothing.
         if (asked.algorithm, asked.version) != (held.algorithm, held.version):
             raise DataError(
                 f"store {path} is of ftlm {held.version}, algorithm {held.algorithm}, and this is {asked.version}, "
                 f"{asked.algorithm}: finish the selection with that version, or start it again in another file"
             )
+        difference = asked.difference(held)
+        if difference is not None:
+            raise DataError(f"store {path} holds a selection {difference}; choose another file")
 
     def __len__(self) -> int:
         return len(self._known)
