@@ -2,6 +2,7 @@
 
 import shutil
 
+import msgspec
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -12,7 +13,7 @@ from ftlm.fit.joint import fit_output_error
 from ftlm.search import frames
 from ftlm.selection import trial
 from ftlm.selection.candidates import named
-from ftlm.selection.store import ENCODER, SELECTION, Kept, Refused, Request, Store
+from ftlm.selection.store import ENCODER, SELECTION, FitFile, Kept, Refused, Request, Store
 from ftlm.selection.trial import Folds
 from test_select import motor
 
@@ -145,6 +146,12 @@ def test_what_is_another_selection_is_refused(runs, whole, tmp_path):
         pass
     with pytest.raises(ftlm.DataError, match=r"is of ftlm 0\.0\.1, algorithm .* finish the selection"):
         ftlm.select(runs, [SECOND, FIRST], store=tmp_path / "older.ftlm")
+    # Digests of another version tell nothing of what it was asked.
+    strange = Request(request.algorithm, "0.0.1", b"other", b"others", b"another")
+    with Store(tmp_path / "strange.ftlm", strange):
+        pass
+    with pytest.raises(ftlm.DataError, match=r"is of ftlm 0\.0\.1, algorithm .* finish the selection"):
+        ftlm.select(runs, [SECOND, FIRST], store=tmp_path / "strange.ftlm")
     assert place.read_bytes() == before
     text = tmp_path / "notes.txt"
     text.write_text("to do\n")
@@ -177,6 +184,86 @@ def test_errors_of_candidates_are_kept_and_those_of_ftlm_are_not(runs, tmp_path)
         assert kept.fit(SECOND, [], True, lambda: wrong) is wrong
         assert len(kept) == 1
     assert ENCODER.encode(Kept(b"0", Refused("DataError", "x")))
+
+
+def _forged(path, request, *payloads):
+    """A store as the log itself writes it, its digests valid whatever its frames hold."""
+    with Store(path, request) as kept:
+        kept._log.append(payloads)
+    return path
+
+
+def _fit(runs):
+    resting = ftlm.equation("D y = a y + b u", initial="rest")
+    return FitFile.of(fit_output_error(runs, resting, start={"a": -1.0, "b": 1.0}))
+
+
+def test_wrong_contents_under_valid_digests_are_refused_in_words(runs, tmp_path):
+    request = Request.of(*_asked(runs))
+    plain = _fit(runs)
+    sound = _forged(tmp_path / "sound.ftlm", request, ENCODER.encode(Kept(b"0", plain)))
+    with Store(sound, request) as kept:
+        assert len(kept) == 1
+    unknown = ENCODER.encode(Kept(b"0", Refused("KeyError", "x")))
+    history = msgspec.structs.replace(plain, initial="auto", history=True)
+    fits = {
+        r"a covariance or values of other than its \d numbers": [
+            msgspec.structs.replace(plain, covariance=plain.covariance[:-8]),
+            msgspec.structs.replace(plain, covariance=plain.covariance + b"0"),
+            msgspec.structs.replace(plain, on_grid=plain.on_grid * 2),
+            msgspec.structs.replace(plain, coefficients=plain.coefficients | {"c": 1.0}),
+        ],
+        "residuals that are no doubles": [msgspec.structs.replace(plain, residuals=({"y": b"1234567"},))],
+        "a history that is no powers of t but 'auto'": [history],
+    }
+    wrong = [("holds something else at byte .*choose another file", unknown)]
+    wrong += [
+        ("holds something else at byte .*choose another file", ENCODER.encode(Kept(b"0", one)))
+        for one in (
+            msgspec.structs.replace(plain, initial="nowhere"),
+            msgspec.structs.replace(plain, growth=(True, "x", False)),
+        )
+    ]
+    wrong += [
+        (f"holds a fit with {words} at byte .*; choose another file", ENCODER.encode(Kept(b"0", one)))
+        for words, each in fits.items()
+        for one in each
+    ]
+    for number, (words, payload) in enumerate(wrong):
+        place = _forged(tmp_path / f"{number}.ftlm", request, payload)
+        before = place.read_bytes()
+        with pytest.raises(ftlm.DataError, match=words):
+            Store(place, request)
+        assert place.read_bytes() == before
+
+
+def test_an_answer_to_another_question_is_refused_in_words(runs, tmp_path):
+    request = Request.of(*_asked(runs))
+    joint = _fit(runs).joint()
+
+    def ask(kept, what):
+        if what == "a fit":
+            return kept.fit(FIRST, [], True, lambda: joint)
+        if what == "a judgement":
+            return kept.judgement("first", FIRST, joint, False, lambda: trial.Trial("first", FIRST, 2, failed="x"))
+        return kept.subsets(FIRST, list)
+
+    questions, answers = ("a fit", "a judgement", "subsets"), {}
+    for what in questions:
+        with Store(tmp_path / f"{what}.ftlm", request) as kept:
+            ask(kept, what)
+            answers[what] = next(iter(kept._known.items()))
+    for what, (key, _) in answers.items():
+        others = {n: answer for n, (_, answer) in answers.items() if n != what}
+        if what != "a fit":
+            others["an error"] = Refused("DataError", "x")
+        for held, answer in others.items():
+            place = _forged(tmp_path / f"{what} {held}.ftlm", request, ENCODER.encode(Kept(key, answer)))
+            with (
+                Store(place, request) as kept,
+                pytest.raises(ftlm.DataError, match=f"holds {held} where {what} was asked for; choose another file"),
+            ):
+                ask(kept, what)
 
 
 def test_the_command_goes_on(runs, tmp_path, monkeypatch):

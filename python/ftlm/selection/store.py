@@ -12,7 +12,7 @@ import os
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Literal, TypeAlias, TypeVar
 
 import msgspec
 import numpy as np
@@ -34,7 +34,12 @@ Made = TypeVar("Made")
 #: Number of how a candidate is fitted and judged; answers of different ones must not be joined.
 ALGORITHM = 1
 #: Errors that a candidate may end with; any other is none of its own.
-ENDS = {kind.__name__: kind for kind in (ConvergenceError, DataError, ModelError)}
+End: TypeAlias = Literal["ConvergenceError", "DataError", "ModelError"]
+ENDS: dict[End, type[FtlmError]] = {
+    "ConvergenceError": ConvergenceError, "DataError": DataError, "ModelError": ModelError,
+}  # fmt: skip
+#: Bytes of a number.
+DOUBLE = 8
 
 
 def _plain(value: object) -> object:
@@ -87,13 +92,13 @@ def _told(run: Run) -> list[object]:
 class Refused(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="refused"):
     """A candidate that cannot be fitted."""
 
-    kind: str
+    kind: End
     words: str
 
     @classmethod
-    def of(cls, error: FtlmError) -> Refused:
-        """Write an error."""
-        return cls(type(error).__name__, str(error))
+    def of(cls, error: FtlmError) -> Refused | None:
+        """Write an error; None for what ftlm itself did wrong, which is no candidate's answer."""
+        return next((cls(n, str(error)) for n, kind in ENDS.items() if type(error) is kind), None)
 
     def error(self) -> FtlmError:
         """Give it back."""
@@ -117,7 +122,7 @@ class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"
     starts: tuple[tuple[float, str], ...]
     residuals: tuple[dict[str, bytes], ...]
     products: dict[str, tuple[float, tuple[str, ...]]]
-    initial: str | tuple[float, ...]
+    initial: Initial
     history: bool
     initial_terms: int
     origin: str
@@ -135,11 +140,24 @@ class FitFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="fit"
             joint.origin, None if growth is None else (growth.kept, growth.excess, growth.at_limit),
         )  # fmt: skip
 
+    @property
+    def _count(self) -> int:
+        return len(self.orders) + len(self.coefficients) + len(self.inputs)
+
+    def problem(self) -> str | None:
+        """What does not fit together, or None."""
+        if len(self.covariance) != DOUBLE * self._count**2 or len(self.on_grid) != DOUBLE * self._count:
+            return f"a covariance or values of other than its {self._count} numbers"
+        if any(len(e) % DOUBLE for part in self.residuals for e in part.values()):
+            return "residuals that are no doubles"
+        if self.history and isinstance(self.initial, str):
+            return f"a history that is no powers of t but {self.initial!r}"
+        return None
+
     def joint(self) -> JointFit:
         """Give it back."""
-        count = len(self.orders) + len(self.coefficients) + len(self.inputs)
-        initial: Any = self.initial
-        told: Initial = History(initial) if self.history else initial
+        count = self._count
+        told = History(self.initial) if self.history and not isinstance(self.initial, str) else self.initial
         return JointFit(
             dict(self.orders), dict(self.coefficients), _array(self.covariance).reshape(count, count),
             dict(self.noise), self.cost, self.samples, self.refinement, self.settled, self.converged,
@@ -271,9 +289,15 @@ class Store:
             try:
                 frame = DECODER.decode(payload)
             except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError) as error:
-                raise DataError(f"store {path} holds something else at byte {offset}: {error}") from error
+                raise DataError(
+                    f"store {path} holds something else at byte {offset}: {error}; choose another file"
+                ) from error
             if isinstance(frame, Request) != (offset == len(SELECTION.magic)):
                 raise DataError(f"store {path} holds something else at byte {offset}; choose another file")
+            # Digests tell what was damaged, not what was written wrong.
+            wrong = frame.answer.problem() if isinstance(frame, Kept) and isinstance(frame.answer, FitFile) else None
+            if wrong is not None:
+                raise DataError(f"store {path} holds a fit with {wrong} at byte {offset}; choose another file")
             if isinstance(frame, Request):
                 self._check_same(request, frame)
             else:
@@ -286,14 +310,21 @@ class Store:
 
     def _check_same(self, asked: Request, held: Request) -> None:
         path = self._log.path
-        difference = asked.difference(held)
-        if difference is not None:
-            raise DataError(f"store {path} holds a selection {difference}; choose another file")
+        # Digests are of what one version writes of candidates: those of another tell nothing.
         if (asked.algorithm, asked.version) != (held.algorithm, held.version):
             raise DataError(
                 f"store {path} is of ftlm {held.version}, algorithm {held.algorithm}, and this is {asked.version}, "
                 f"{asked.algorithm}: finish the selection with that version, or start it again in another file"
             )
+        difference = asked.difference(held)
+        if difference is not None:
+            raise DataError(f"store {path} holds a selection {difference}; choose another file")
+
+    def _other(self, asked: str, answer: Answer) -> DataError:
+        held = {FitFile: "a fit", Refused: "an error", JudgementFile: "a judgement", SubsetsFile: "subsets"}
+        return DataError(
+            f"store {self._log.path} holds {held[type(answer)]} where {asked} was asked for; choose another file"
+        )
 
     def __len__(self) -> int:
         return len(self._known)
@@ -326,12 +357,14 @@ class Store:
         def write(made: JointFit | FtlmError) -> Answer | None:
             if isinstance(made, JointFit):
                 return FitFile.of(made)
-            # What ftlm itself did wrong is no candidate's answer.
-            return Refused.of(made) if type(made).__name__ in ENDS else None
+            return Refused.of(made)
 
         def read(answer: Answer) -> JointFit | FtlmError:
-            assert isinstance(answer, (FitFile, Refused))
-            return answer.joint() if isinstance(answer, FitFile) else answer.error()
+            if isinstance(answer, FitFile):
+                return answer.joint()
+            if isinstance(answer, Refused):
+                return answer.error()
+            raise self._other("a fit", answer)
 
         return self.recalled(("fit", structure, [dict(s) for s in starts], refine), compute, write, read)
 
@@ -341,7 +374,8 @@ class Store:
         """A fitted candidate on what it never saw."""
 
         def read(answer: Answer) -> Trial:
-            assert isinstance(answer, JudgementFile)
+            if not isinstance(answer, JudgementFile):
+                raise self._other("a judgement", answer)
             return answer.trial(name, structure, joint)
 
         asked = ("judge", structure, joint.names, _bytes(joint.values), joint.initial, fine)
@@ -351,7 +385,8 @@ class Store:
         """Subsets that were screened."""
 
         def read(answer: Answer) -> list[Screened]:
-            assert isinstance(answer, SubsetsFile)
+            if not isinstance(answer, SubsetsFile):
+                raise self._other("subsets", answer)
             return answer.subsets()
 
         return self.recalled(("subsets", structure), compute, SubsetsFile.of, read)
