@@ -231,12 +231,14 @@ class Identification(Judged):
 
         *Do not use*: the free run leaves the range of numbers, or grows (a pole with a positive real part); numbers
         that the runs do not tell apart at all (infinite standard errors); an output that the free run explains by less
-        than half (NR above 0.5), on its own runs or on validation; own orders by which an equation says that an output
-        equals itself.
+        than half (NR above 0.5), on its own runs or on validation, over all runs or on one; own orders by which an
+        equation says that an output equals itself.
 
-        *With care*: a fit that falls by 20 points on validation; residuals that follow an input; a closed loop with
+        *With care*: a fit that falls by 20 points on validation, over all runs or on one, or leaves there more than a
+        tenth and three times as much as on its own runs; residuals that follow an input; a closed loop with
         coloured residuals; residuals that are not white (all three no smaller than a thousandth of the output); a fit
-        that did not stand still; a coefficient known to no more than half of itself, an order to no more than 0.25; an
+        that did not stand still; a number that nothing tells, or a coefficient known to no more than half of itself, an
+        order to no more than 0.25; growth that cannot be told; an
         offset that is hidden by what a run did before its start; every other warning of weight; no standard errors; no
         validation.
         """
