@@ -12,8 +12,8 @@ from ftlm.fit.differential import differential_evolution_search
 from ftlm.paper import printed
 from ftlm.paper.arm import ARMS, MAIN, demo_run
 from ftlm.paper.asprinted import SCAN, as_printed, implied_spreads, papers_record
-from ftlm.paper.claims import sooner, spread_in_words
-from ftlm.paper.panel import arrived_at
+from ftlm.paper.claims import beats, sooner, spread_in_words
+from ftlm.paper.panel import arrived_at, simulated_panel
 from ftlm.paper.ran import one_angle, papers_current, printed_numbers, ran
 from ftlm.paper.rivalry import like_for_like, seeds_for
 from ftlm.paper.verdicts import case, ruled
@@ -263,6 +263,32 @@ def test_differential_evolution_finds_what_is_there_and_the_same_again():
     moving = prepare([run.slice(1.0, 9.0)], replace(single, initial="caputo"), None, power_of_two=True)
     with pytest.raises(ftlm.ModelError, match="slice the runs to start at rest"):
         differential_evolution_search(moving, single, lattice, settings)
+
+
+def test_multi_innovation_is_held_against_the_median_seed():
+    seeds = (1.0, 4.0, 9.0)
+    assert beats(3.0, seeds)
+    assert not beats(5.0, seeds)
+    assert not beats(np.inf, (np.inf,))
+    # The best of ten seeds is better than the best of three, the median is not.
+    assert beats(3.0, seeds * 4) == beats(3.0, seeds)
+
+
+def test_rivals_have_as_many_seeds_on_every_arm(monkeypatch):
+    given = {}
+
+    def like(run, single, lattice, asked, *, seeds, threads):
+        given[single.outputs[0]] = seeds
+        return SimpleNamespace(
+            lattice={}, candidates=1, genetic=SimpleNamespace(errors={}), evolution=SimpleNamespace(errors={})
+        )
+
+    monkeypatch.setattr("ftlm.paper.panel.like_for_like", like)
+    monkeypatch.setattr("ftlm.paper.panel.trials_of", lambda *_: [])
+    monkeypatch.setattr("ftlm.paper.panel.freed_of", lambda *_: None)
+    wanted = {"theta11": (0, 1, 2, 3), "theta12": (0, 1)}
+    simulated_panel([1], "whole orders", [1], 0.0, 1, step=0.25, rival_seeds=wanted)
+    assert given == wanted
 
 
 def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +23,7 @@ from ftlm.judge.metrics import finite, metrics
 from ftlm.paper import printed
 from ftlm.paper.arm import ARMS, StageNumber, demo_run
 from ftlm.paper.records import PAIR, PRIORS, RIVAL_ALPHA, TRACE_EVERY, Stage
-from ftlm.paper.rivalry import FEWEST_SEEDS, LikeForLike, like_for_like
+from ftlm.paper.rivalry import LikeForLike, like_for_like
 from ftlm.paper.thinning import thinned
 from ftlm.search.orders import search_orders
 from ftlm.solve.free_run import explicit_euler
@@ -272,9 +272,12 @@ def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads:
 
 def simulated_panel(
     stages: Sequence[StageNumber], arm: str, seeds: Sequence[int], noise: float, threads: int | None, *,
-    genetic: Genetic | None = None, step: float | None = None,
+    genetic: Genetic | None = None, step: float | None = None, rival_seeds: Mapping[str, Sequence[int]] | None = None,
 ) -> Panel:  # fmt: skip
-    """All stages on one simulated arm; with a step contests and joint fits as well, on the first record."""
+    """All stages on one simulated arm; with a step contests and joint fits as well, on the first record.
+
+    Rivals have these seeds by angle where none are asked for: verdicts compare what every arm had as often.
+    """
     trials: list[Trial] = []
     contests: list[Contest] = []
     freed: list[Freed] = []
@@ -289,7 +292,8 @@ def simulated_panel(
             own = run.select(list(structure.signals))
             for output in structure.outputs:
                 made = like_for_like(
-                    own, structure.equation(output), lattice, genetic, most=FEWEST_SEEDS, threads=threads
+                    own, structure.equation(output), lattice, genetic, seeds=(rival_seeds or {}).get(output),
+                    threads=threads,
                 )  # fmt: skip
                 contests.append(contest(made, output, arm, lattice.step))
             freed.append(freed_of(stage, run, arm, threads))

@@ -205,11 +205,15 @@ def reproduce(
     say("verdicts: both ends of K0")
     panel = panel_of(made, square, own, seed, threads)
     if simulated:
+        rival_seeds = {c.output: tuple(c.genetic) for c in panel.contests}
         seeds = [seed + k for k in range(records)]
         panel = panel.beside(simulated_panel(numbers, own, seeds[1:], noise, threads))
         for arm in others:
             say(f"verdicts: the arm “{arm}”")
-            panel = panel.beside(simulated_panel(numbers, arm, seeds, noise, threads, genetic=genetic, step=step))
+            more = simulated_panel(
+                numbers, arm, seeds, noise, threads, genetic=genetic, step=step, rival_seeds=rival_seeds
+            )
+            panel = panel.beside(more)
     notes = dict.fromkeys(note for work in works for note in work.notes)
     return Reproduction(
         square, sine, simulated, stages, lattice, tuple(notes), panel, tuple(ran_models), printed_reading

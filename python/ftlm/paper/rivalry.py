@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from ftlm.data.lattice import Lattice
@@ -37,8 +37,8 @@ def seeds_for(candidates: int) -> tuple[int, ...]:
 
 
 def like_for_like(
-    run: Run, single: Structure, lattice: Lattice, asked: Genetic | None = None, *, most: int = MOST_SEEDS,
-    threads: int | None = None, progress: Callable[[int, int], None] | None = None,
+    run: Run, single: Structure, lattice: Lattice, asked: Genetic | None = None, *,
+    seeds: Sequence[int] | None = None, threads: int | None = None, progress: Callable[[int, int], None] | None = None,
 ) -> LikeForLike:  # fmt: skip
     """Give the genetic algorithm and differential evolution as many evaluations a seed as the lattice has candidates.
 
@@ -52,8 +52,8 @@ def like_for_like(
         Of multi-innovation; its ends bound the rivals' orders.
     asked
         Seeds and evaluations that are asked for.
-    most
-        Most seeds where none are asked for.
+    seeds
+        Where none are asked for; default as many as the evaluations allow.
     threads, progress
         See :func:`ftlm.search_orders`.
 
@@ -72,7 +72,7 @@ def like_for_like(
         for prior in PRIORS
     }  # fmt: skip
     count = searches[PRIORS[0]].candidates
-    settings = asked or Genetic(seeds=seeds_for(count)[:most])
+    settings = asked or Genetic(seeds=tuple(seeds or seeds_for(count)))
     settings = replace(settings, evaluations=settings.evaluations or max(count, 2 * settings.population))
     records = prepare([run], blind, None, power_of_two=True)
     rivals = [
