@@ -38,7 +38,6 @@ SCAN = tuple(float(v) for v in np.logspace(-3, 5, 65))
 LOW, HIGH, STEP = 1.6, 1.95, 0.05
 #: A column agrees with the printed one where its signs do and no entry is further than this factor.
 NEAR = 1.25
-ALL_P = printed.INNOVATION_LENGTHS
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ class AsPrinted:
         table = printed.FRACTIONAL[self.output]
 
         def course(rows: Mapping[int, Any], letter: str) -> list[float]:
-            return np.sign(np.diff([rows[p].coefficients[letter] for p in ALL_P])).tolist()  # type: ignore[no-any-return]
+            return np.sign(np.diff([rows[p].coefficients[letter] for p in printed.INNOVATION_LENGTHS])).tolist()  # type: ignore[no-any-return]
 
         return [c for c in printed.COEFFICIENTS if course(self.rows, c) == course(table, c)]
 
@@ -249,15 +248,15 @@ def _nearest(output: str, angles: Mapping[bool, _Angle], scale: float) -> AsPrin
         angle = angles[filtered]
         time, haar = angle.regressors(terms, orders)
         priors = (*SCAN, 1.0)
-        solved = {p: angle.solved(haar, priors, p) for p in ALL_P}
+        solved = {p: angle.solved(haar, priors, p) for p in printed.INNOVATION_LENGTHS}
         for k, prior in enumerate(priors):
-            x = {p: solved[p][k] for p in ALL_P}
-            figures = {p: metrics(angle.y, time @ x[p]) for p in ALL_P}
+            x = {p: solved[p][k] for p in printed.INNOVATION_LENGTHS}
+            figures = {p: metrics(angle.y, time @ x[p]) for p in printed.INNOVATION_LENGTHS}
             for flipped in (False, True):
                 signs = np.array([-1.0 if flipped and place == "own" else 1.0 for place in angle.places(terms)])
                 rows = {
                     p: Row(dict(zip(printed.COEFFICIENTS, (signs * x[p]).tolist(), strict=True)), figures[p])
-                    for p in ALL_P
+                    for p in printed.INNOVATION_LENGTHS
                 }
                 away = _away(rows, table)
                 if prior == 1.0:
@@ -288,7 +287,7 @@ def _ranked(angle: _Angle, reading: Reading, orders: Mapping[str, float]) -> tup
     for beta, gamma, mu in product(values, values, values):
         at = {"alpha": float(orders["alpha"]), "beta": beta, "gamma": gamma, "mu": mu}
         time, haar = angle.regressors(reading.terms, at)
-        (x,) = angle.solved(haar, (reading.prior,), ALL_P[-1])
+        (x,) = angle.solved(haar, (reading.prior,), printed.INNOVATION_LENGTHS[-1])
         errors[beta, gamma, mu] = float(np.sum(np.abs(angle.y - time @ x)))
     own = errors[tuple(round(float(orders[n]), 9) for n in ("beta", "gamma", "mu"))]
     first = min(errors, key=lambda k: errors[k])

@@ -16,7 +16,7 @@ from ftlm.paint.text import symbol
 from ftlm.paper import printed
 from ftlm.paper.arm import STAGES
 from ftlm.paper.asprinted import NEAR, implied_spreads
-from ftlm.paper.panel import ALL_P, Trial
+from ftlm.paper.panel import Trial
 from ftlm.paper.recomputed import Recomputed
 from ftlm.paper.records import PRIORS, TRACE_EVERY, WEAK_PRIOR, Stage
 from ftlm.paper.verdicts import Case, Ruling, case, ruled
@@ -186,7 +186,7 @@ def _claims_of_printed_models(found: Recomputed) -> list[Claim]:
             for (r, k, a), own_a in zip(returned, own, strict=True)
         ]
     )
-    last = [(r, k, a, w) for (r, k, a), w in zip(returned, own, strict=True) if r.p == ALL_P[-1]]
+    last = [(r, k, a, w) for (r, k, a), w in zip(returned, own, strict=True) if r.p == printed.INNOVATION_LENGTHS[-1]]
     return [
         Claim(
             "The printed models, under the paper's current, move as the paper's arm does.", moves,

@@ -36,7 +36,6 @@ EVERY = 4
 #: Step of the panel's order lattices, and the smallest one of its genetic comparisons: what the paper's has, 60 000
 #: candidates an angle, would take minutes on every arm.
 PANEL_STEP, CONTEST_STEP = 0.25, 0.1
-ALL_P = printed.INNOVATION_LENGTHS
 
 
 @dataclass(frozen=True)
@@ -197,15 +196,15 @@ def trials_of(stage: StageNumber, square: Run, arm: str, seed: int, threads: int
                     run, single, Lattice(step=PANEL_STEP), coefficients="multi-innovation", innovation_length=p,
                     prior_covariance=prior, keep=1, threads=threads,
                 )
-                for p in ALL_P
+                for p in printed.INNOVATION_LENGTHS
             }  # fmt: skip
-            last = best[ALL_P[-1]].model
+            last = best[printed.INNOVATION_LENGTHS[-1]].model
             known = single.with_orders({n: last.orders[n] for n in single.order_names})
             traces = {
                 p: multi_innovation_trace(run, known, innovation_length=p, prior_covariance=prior, every=TRACE_EVERY)
-                for p in ALL_P
+                for p in printed.INNOVATION_LENGTHS
             }
-            end = float(traces[ALL_P[0]].error[-1])
+            end = float(traces[printed.INNOVATION_LENGTHS[0]].error[-1])
             nr = compare_means(last, run).output_error[output].nr
             found.append(
                 Trial(

@@ -192,7 +192,8 @@ def reproduce(
         say("recording both stages on the virtual rig, under a square and a sine current")
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     numbers = stages_of(square, sine)
-    say(f"this takes up to {expected(step, len(numbers), len(others) if simulated else 0):.0f} s of processor time")
+    seconds = processor_seconds(step, len(numbers), len(others) if simulated else 0)
+    say(f"this takes up to {seconds:.0f} s of processor time")
     preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True)
     works = [StageWork(n, square, sine, preset, threads, say, progress) for n in numbers]
     one_by_one = len(works) == 1 or threads == 1
@@ -220,7 +221,7 @@ def reproduce(
     )  # fmt: skip
 
 
-def expected(step: float, stages: int, arms: int) -> float:
+def processor_seconds(step: float, stages: int, arms: int) -> float:
     """Processor time that all of it takes [s], by what it took where it was measured."""
     return stages * (EACH_STAGE + EACH_ARM * arms + SEARCHES * (0.05 / step) ** 4)
 
