@@ -212,6 +212,20 @@ fn whole_powers(exponent: f64, m: usize) -> Vec<f64> {
     powers
 }
 
+/// `(2k+1)^exponent` for k = 0 … m−1, as [`whole_powers`].
+#[allow(clippy::cast_precision_loss)]
+fn odd_powers(exponent: f64, m: usize) -> Vec<f64> {
+    let divisors = least_divisors(2 * m);
+    let mut powers = vec![1.0; m];
+    for k in 1..m {
+        let n = 2 * k + 1;
+        let divisor = divisors[n] as usize;
+        powers[k] =
+            if divisor == n { libm::pow(n as f64, exponent) } else { powers[divisor / 2] * powers[n / divisor / 2] };
+    }
+    powers
+}
+
 /// A table that only ever grows: one for all threads, and one of a thread's own for when that is not to be had.
 struct Table<T: 'static> {
     shared: &'static Shared<Values<T>>,
@@ -330,14 +344,31 @@ pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
         return first.iter().zip(&next).map(|(a, b)| scale * (a + 0.5 * (order + 1.0) * b)).collect();
     }
     let a = exponent + 1.0;
-    let scale = libm::pow(step, exponent) / a;
-    (1..=m)
-        .map(|k| {
-            let k = k as f64;
-            // k^a − (k−1)^a without the cancellation.
-            scale * if k == 1.0 { 1.0 } else { -libm::pow(k, a) * libm::expm1(a * libm::log1p(-1.0 / k)) }
-        })
-        .collect()
+    let scale = libm::pow(step, exponent);
+    let near = (1..=m.min(if m < SIEVED { m } else { HEAD })).map(|k| {
+        let k = k as f64;
+        // k^a − (k−1)^a without the cancellation.
+        scale / a * if k == 1.0 { 1.0 } else { -libm::pow(k, a) * libm::expm1(a * libm::log1p(-1.0 / k)) }
+    });
+    let mut means: Vec<f64> = near.collect();
+    if means.len() < m {
+        // About the middle of a pulse, at d/2 for an odd d, it is (d/2)^e·Σ C(a, 2j+1)/a·d^−2j.
+        let mut sums = [0.0; terms_at(0)];
+        let mut c = 1.0;
+        for (j, sum) in sums.iter_mut().enumerate() {
+            *sum = c;
+            let next = (2 * j + 1) as f64;
+            c *= (a - next) * (a - next - 1.0) / ((next + 1.0) * (next + 2.0));
+        }
+        let half = scale * libm::exp2(-exponent);
+        let odd = odd_powers(exponent, m);
+        means.extend(odd.iter().enumerate().skip(HEAD).map(|(k, &power)| {
+            let d = (2 * k + 1) as f64;
+            let shrink = 1.0 / (d * d);
+            half * power * sums[..terms_at(2 * k)].iter().rev().fold(0.0, |sum, &c| sum * shrink + c)
+        }));
+    }
+    means
 }
 
 /// Refuses an order outside [0, [`MAX_ORDER`]].

@@ -533,6 +533,54 @@ fn a_number_that_is_held_stays_and_the_others_are_the_optimum_beside_it() {
     }
 }
 
+/// A model with its orders known to be these.
+fn with_known_orders(model: &FreeModel, orders: &[f64]) -> FreeModel {
+    let known = |law: &AffineOrder| {
+        let free: f64 = law.weights.iter().zip(orders).map(|(w, x)| w * x).sum();
+        AffineOrder { constant: law.constant + free, weights: Vec::new() }
+    };
+    let mut out = model.clone();
+    for equation in &mut out.equations {
+        equation.order = known(&equation.order);
+        equation.terms.iter_mut().for_each(|(_, order, _)| *order = known(order));
+    }
+    out.order_bounds.clear();
+    out
+}
+
+#[test]
+fn whole_orders_that_are_known_give_what_the_same_orders_give_where_they_may_move() {
+    // Known, they are solved by running sums; where they may move, by transforms.
+    let whole = [1.0, 0.0, 1.0];
+    let mut cases = variants();
+    let (_, model, experiments) = &cases[0];
+    let delay = FreeInput { signal: 2, law: InputLaw::Delay, bounds: (0.0, 0.1) };
+    let delayed = ("delayed", FreeModel { inputs: vec![delay], ..model.clone() }, experiments.clone());
+    cases.push(delayed);
+    for (name, model, experiments) in cases {
+        let known = with_known_orders(&model, &whole);
+        let inputs = vec![0.03; model.inputs.len()];
+        let settings = Settings { evaluations: 1, ..Settings::default() };
+        let at = |model: &FreeModel, orders: &[f64]| {
+            let start = Point { orders: orders.to_vec(), coefficients: START.1.to_vec(), inputs: inputs.clone() };
+            fit(model, &experiments, &start, settings).unwrap()
+        };
+        let (moving, still) = (at(&model, &whole), at(&known, &[]));
+        let mut worst = relative_distance(&still.residuals, &moving.residuals);
+        assert_eq!(moving.jacobian.len(), still.jacobian.len() + 3);
+        for (a, b) in still.jacobian.iter().zip(&moving.jacobian[3..]) {
+            worst = worst.max(relative_distance(a, b));
+        }
+        for (a, b) in still.initial.iter().flatten().zip(moving.initial.iter().flatten()) {
+            worst = worst.max(if a.is_empty() { 0.0 } else { relative_distance(a, b) });
+        }
+        check(&format!("running sums against transforms, {name}"), worst, 1e-9);
+        let (there, here) =
+            (fit(&known, &experiments, &at(&known, &[]).point, Settings::default()).unwrap(), still.cost);
+        assert!(there.cost < here);
+    }
+}
+
 /// D^1.5 y = c₀ y + c₁ u₁ + c₂ D^0.3 u₂ on two runs.
 fn driven() -> (FreeModel, Vec<Experiment>) {
     let fixed = |order: f64| AffineOrder { constant: order, weights: Vec::new() };

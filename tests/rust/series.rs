@@ -4,11 +4,11 @@
 use ftlm::error::Error;
 use ftlm::fft;
 use ftlm::kernels::{block_pulse_kernel, power_means};
-use ftlm::series::{self, Buffers, Division, Kernel, Solver, SumOfProducts, BLOCK};
+use ftlm::series::{self, Buffers, Division, Kernel, Recursion, Solver, Source, SumOfProducts, BLOCK, MAX_SUMS};
 use proptest::prelude::*;
 
 use crate::common::{
-    bits, cases, check, check_between, dense_solve, distance, largest, norm, orders, toeplitz, Random,
+    bits, cases, check, check_between, dense_solve, distance, largest, norm, orders, relative_error, toeplitz, Random,
 };
 
 /// Lengths on both sides of the block, of its doublings and of the switch to transforms, and every small one.
@@ -509,4 +509,88 @@ proptest! {
         let (a, b) = (series::divide(&f, &unit).unwrap(), series::divide(&f, &scaled).unwrap());
         prop_assert!(block_distance(&a, &b) <= 1e-10);
     }
+}
+
+/// The same system by kernels and division.
+fn by_division(
+    n: usize,
+    m: usize,
+    step: f64,
+    terms: &[(usize, usize, usize, f64)],
+    sources: &[Source],
+) -> Vec<Vec<f64>> {
+    let mut matrix = vec![vec![vec![0.0; m]; n]; n];
+    (0..n).for_each(|i| matrix[i][i][0] = 1.0);
+    for &(i, j, order, c) in terms {
+        let kernel = block_pulse_kernel(order as f64, m, step);
+        matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v);
+    }
+    let mut rhs = vec![vec![0.0; m]; n];
+    for source in sources {
+        let driven = series::multiply_naive(&block_pulse_kernel(source.order as f64, m, step), source.series, m);
+        rhs[source.equation].iter_mut().zip(driven).for_each(|(b, v)| *b += source.weight * v);
+    }
+    series::solve(&matrix, &rhs.iter().map(Vec::as_slice).collect::<Vec<_>>()).unwrap()
+}
+
+#[test]
+fn integrals_of_whole_order_by_running_sums() {
+    let (m, step) = (700, 0.004);
+    let mut pulse = vec![0.0; m];
+    pulse[0] = 1.0;
+    let mut worst = 0.0_f64;
+    for order in 0..=MAX_SUMS {
+        let source = Source { equation: 0, order, weight: 1.0, series: &pulse };
+        let found = Recursion::new(1, order, step, &[]).unwrap().solve(m, &[source]).unwrap();
+        worst = worst.max(relative_error(&found[0], &block_pulse_kernel(order as f64, m, step)));
+    }
+    check("kernels by running sums", worst, 1e-11);
+}
+
+#[test]
+fn systems_of_whole_order_by_running_sums_are_those_by_division() {
+    let mut random = Random::new(11);
+    let (m, step) = (1500, 0.01);
+    let signals: Vec<Vec<f64>> = (0..3).map(|_| random.signal(m)).collect();
+    let source = |equation, order, weight, k: usize| Source { equation, order, weight, series: &signals[k] };
+    let cases: Vec<(usize, usize, Vec<(usize, usize, usize, f64)>, Vec<Source>)> = vec![
+        (1, 0, vec![], vec![source(0, 0, 2.0, 0)]),
+        (1, 1, vec![(0, 0, 1, -3.0)], vec![source(0, 1, 2.0, 0), source(0, 0, 0.5, 1)]),
+        (1, 2, vec![(0, 0, 1, -0.4), (0, 0, 2, -90.0)], vec![source(0, 2, 5.0, 0), source(0, 0, -1.0, 1)]),
+        // It grows.
+        (1, 2, vec![(0, 0, 1, 0.3), (0, 0, 2, 9.0)], vec![source(0, 1, 5.0, 2)]),
+        // A source integrated more often than the output.
+        (1, 3, vec![(0, 0, 1, -2.0)], vec![source(0, 3, 1.0, 0)]),
+        (
+            1,
+            4,
+            vec![(0, 0, 1, -2.0), (0, 0, 2, -80.0), (0, 0, 3, -60.0), (0, 0, 4, -700.0)],
+            vec![source(0, 4, 9.0, 1)],
+        ),
+        (1, 5, vec![(0, 0, 2, -50.0), (0, 0, 1, -4.0)], vec![source(0, 5, 1.0, 1)]),
+        (
+            3,
+            2,
+            vec![(0, 0, 2, -40.0), (0, 1, 0, 0.3), (1, 1, 1, -2.0), (1, 0, 2, 5.0), (2, 1, 1, 3.0), (2, 2, 1, -1.0)],
+            vec![source(0, 2, 1.0, 0), source(1, 0, 1.0, 1), source(2, 1, -2.0, 2)],
+        ),
+    ];
+    let mut worst = 0.0_f64;
+    for (n, sums, terms, sources) in cases {
+        let found = Recursion::new(n, sums, step, &terms).unwrap().solve(m, &sources).unwrap();
+        for (a, b) in found.iter().zip(by_division(n, m, step, &terms, &sources)) {
+            worst = worst.max(block_distance(a, &b));
+        }
+    }
+    check("running sums against division", worst, 1e-10);
+}
+
+#[test]
+fn running_sums_that_cannot_be() {
+    assert!(matches!(Recursion::new(1, 1, 0.1, &[(0, 0, 2, 1.0)]), Err(Error::Structure { .. })));
+    assert!(matches!(Recursion::new(1, MAX_SUMS + 1, 0.1, &[]), Err(Error::Structure { .. })));
+    // 1 − c·h/2 = 0.
+    assert!(matches!(Recursion::new(1, 1, 0.5, &[(0, 0, 1, 4.0)]), Err(Error::LeadingZero { .. })));
+    let short = Source { equation: 0, order: 0, weight: 1.0, series: &[1.0] };
+    assert!(matches!(Recursion::new(1, 0, 0.5, &[]).unwrap().solve(2, &[short]), Err(Error::Length { .. })));
 }

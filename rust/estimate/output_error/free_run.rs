@@ -3,17 +3,21 @@
 use super::corners::Corners;
 use super::experiment::Experiment;
 use super::feedthrough::{Direct, Early};
+use super::inverse::{Inverse, Rights, Solved};
 use super::linear::best_moves;
 use super::model::{FreeModel, Point};
 use super::part::Part;
-use super::shelf::{Shelf, FACTORS};
+use super::shelf::{Operator, Shelf, FACTORS};
 use crate::dense;
 use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimate::least_squares;
 use crate::excess::MAX_EXCESS;
 use crate::impulses::is_impulse;
-use crate::series::{Buffers, Solver, SumOfProducts};
+use crate::regressors::Record;
+use crate::series::{Buffers, Recursion, Solver, SumOfProducts};
+use std::borrow::Cow;
+use std::rc::Rc;
 
 /// Own-output orders closer to α than this make the equation say that the output equals itself.
 const LEAST_INTEGRATION: f64 = 1e-3;
@@ -104,48 +108,10 @@ impl FreeModel {
         let acted = (self.inputs.iter().zip(&point.inputs))
             .map(|(&input, &value)| self.acted(record, input, value))
             .collect::<Result<Vec<_>>>()?;
-        let (m, n) = (record.m(), structures.len());
-        let mut matrix = vec![vec![vec![0.0; m]; n]; n];
-        let mut rhs = vec![vec![0.0; m]; n];
-        let mut buffers = Buffers::default();
-        let mut operators = Vec::with_capacity(n);
-        let mut sum = SumOfProducts::with_length(FACTORS * m);
-        for (i, structure) in structures.iter().enumerate() {
-            matrix[i][i][0] += 1.0;
-            let mut row = Vec::with_capacity(structure.terms.len());
-            let mut drives = false;
-            for (k, term) in structure.terms.iter().enumerate() {
-                let eta = structure.order - term.order;
-                let held = experiment.instants.get(term.signal).is_some_and(|instant| instant.held);
-                let least = if term.signal == structure.output {
-                    LEAST_INTEGRATION
-                } else if held {
-                    // The derivative of a jump is infinite.
-                    0.0
-                } else {
-                    LEAST_INTEGRATION - MAX_EXCESS
-                };
-                if eta < least {
-                    // Reported like a step too far, so that the search shortens it.
-                    return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
-                }
-                let operator = shelf.operator((i, k), eta, self.turns(i, k), experiment);
-                let c = self.equations[i].terms[k].2.at(&point.coefficients);
-                if let Some(j) = self.unknown(i, term.signal) {
-                    matrix[i][j].iter_mut().zip(&operator.kernel).for_each(|(a, v)| *a -= c * v);
-                } else if c != 0.0 {
-                    drives = true;
-                    sum.add(c, &operator.spectrum(false), &shelf.driver(self, experiment, term.signal, &acted));
-                }
-                row.push(operator);
-            }
-            if drives {
-                sum.take(&mut rhs[i], &mut buffers);
-            }
-            operators.push(row);
-        }
-        let mut solver = Solver::new(&matrix)?;
-        let response = solver.solve(&rhs)?;
+        let operators = self.operators(experiment, shelf, structures)?;
+        out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
+        let asked = out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
+        let (response, solved) = self.response(experiment, shelf, &operators, point, &acted, asked)?;
         let mut residuals = experiment.measured();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
         let mut sampled = experiment.sampled(&response);
@@ -164,13 +130,11 @@ impl FreeModel {
         if let Some(index) = residuals.iter().position(|e| !e.is_finite()) {
             return Err(Error::Diverged { what: "free run".into(), index });
         }
-        let mut inverse = None;
         let mut free = Vec::new();
         let mut basis = Vec::new();
-        out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
-        if out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty() {
-            let made = solver.inverse_spectra(FACTORS * m)?;
-            let mut target = SumOfProducts::with_length(FACTORS * m);
+        if asked {
+            let inverse = solved.inverse(record.m())?;
+            let mut rights = Rights::new(inverse, structures.len(), record.m());
             for (i, list) in out.exponents.iter().enumerate() {
                 for &exponent in list {
                     if is_impulse(exponent) && !record.is_filtered() {
@@ -180,15 +144,9 @@ impl FreeModel {
                         continue;
                     }
                     let power = shelf.power(experiment, exponent);
-                    let means: Vec<Vec<f64>> = made
-                        .iter()
-                        .map(|row| {
-                            let mut means = vec![0.0; m];
-                            target.add(1.0, &row[i], &power);
-                            target.take(&mut means, &mut buffers);
-                            means
-                        })
-                        .collect();
+                    rights.clear();
+                    rights.add_series(i, Cow::Owned(power.series.clone()), |_| power.spectrum());
+                    let means = inverse.times(&rights, record.m(), &mut Buffers::default())?;
                     let mut samples = experiment.sampled(&means);
                     if experiment.own.is_some() {
                         let corner = Corners::of_power(experiment, i, exponent);
@@ -198,15 +156,114 @@ impl FreeModel {
                     free.push(Free { equation: i, samples, means });
                 }
             }
-            inverse = Some(made);
         }
-        let mut part =
-            Part { matrix, inverse, operators, response, basis, driven: Vec::new(), acted, direct, early, corners };
+        let mut part = Part { solved, operators, response, basis, driven: Vec::new(), acted, direct, early, corners };
         for &coefficient in linear {
             let column = self.driven_by(experiment, shelf, &part, point, coefficient)?;
             part.driven.push(column);
         }
         Ok(Answer { part, residuals, free })
+    }
+
+    /// The integral of each term of each equation.
+    fn operators(
+        &self,
+        experiment: &Experiment,
+        shelf: &mut Shelf,
+        structures: &[Structure],
+    ) -> Result<Vec<Vec<Rc<Operator>>>> {
+        let mut operators = Vec::with_capacity(structures.len());
+        for (i, structure) in structures.iter().enumerate() {
+            let mut row = Vec::with_capacity(structure.terms.len());
+            for (k, term) in structure.terms.iter().enumerate() {
+                let eta = structure.order - term.order;
+                let held = experiment.instants.get(term.signal).is_some_and(|instant| instant.held);
+                let least = if term.signal == structure.output {
+                    LEAST_INTEGRATION
+                } else if held {
+                    // The derivative of a jump is infinite.
+                    0.0
+                } else {
+                    LEAST_INTEGRATION - MAX_EXCESS
+                };
+                if eta < least {
+                    // Reported like a step too far, so that the search shortens it.
+                    return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
+                }
+                row.push(shelf.operator((i, k), eta, self.turns(i, k), experiment));
+            }
+            operators.push(row);
+        }
+        Ok(operators)
+    }
+
+    /// Pulse means of the free run from rest, and A⁻¹, or what it is made of until it is asked for.
+    fn response(
+        &self,
+        experiment: &Experiment,
+        shelf: &mut Shelf,
+        operators: &[Vec<Rc<Operator>>],
+        point: &Point,
+        acted: &[(Vec<f64>, Vec<f64>)],
+        asked: bool,
+    ) -> Result<(Vec<Vec<f64>>, Solved)> {
+        let (record, n) = (&experiment.record, operators.len());
+        let m = record.m();
+        let coefficient = |i: usize, k: usize| self.equations[i].terms[k].2.at(&point.coefficients);
+        let places = || operators.iter().enumerate().flat_map(|(i, row)| (0..row.len()).map(move |k| (i, k)));
+        let mut buffers = Buffers::default();
+        let whole: Option<Vec<usize>> = operators.iter().flatten().map(|operator| operator.whole()).collect();
+        if let Some(orders) = whole {
+            let own = places().zip(&orders).filter_map(|((i, k), &order)| {
+                let j = self.unknown(i, self.equations[i].terms[k].0)?;
+                Some((i, j, order, coefficient(i, k)))
+            });
+            let highest = orders.iter().copied().max().unwrap_or(0);
+            let inverse = Inverse::Sums(Recursion::new(n, highest, record.step(), &own.collect::<Vec<_>>())?);
+            let mut rights = Rights::new(&inverse, n, m);
+            for (i, k) in places() {
+                let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
+                if self.unknown(i, signal).is_none() && c != 0.0 {
+                    let series = || Cow::Borrowed(self.drives(record, signal, acted));
+                    rights
+                        .add(i, c, (&operators[i][k], false), series, || shelf.driver(self, experiment, signal, acted));
+                }
+            }
+            let response = inverse.times(&rights, m, &mut buffers)?;
+            return Ok((response, Solved::of(inverse)));
+        }
+        let mut matrix = vec![vec![vec![0.0; m]; n]; n];
+        let mut rhs = vec![vec![0.0; m]; n];
+        let mut sum = SumOfProducts::with_length(FACTORS * m);
+        for (i, row) in operators.iter().enumerate() {
+            matrix[i][i][0] += 1.0;
+            let mut drives = false;
+            for (k, operator) in row.iter().enumerate() {
+                let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
+                if let Some(j) = self.unknown(i, signal) {
+                    matrix[i][j].iter_mut().zip(operator.kernel()).for_each(|(a, v)| *a -= c * v);
+                } else if c != 0.0 {
+                    drives = true;
+                    sum.add(c, &operator.spectrum(false), &shelf.driver(self, experiment, signal, acted));
+                }
+            }
+            if drives {
+                sum.take(&mut rhs[i], &mut buffers);
+            }
+        }
+        // By division: exact whether or not A⁻¹ grows.
+        let mut solver = Solver::new(&matrix)?;
+        let response = solver.solve(&rhs)?;
+        if asked {
+            let inverse = Inverse::Spectra(solver.inverse_spectra(FACTORS * m)?);
+            return Ok((response, Solved::of(inverse)));
+        }
+        Ok((response, Solved::by(matrix)))
+    }
+
+    /// Pulse means of what drives: a signal of the record, or what an actuator makes of it.
+    pub(super) fn drives<'a>(&self, record: &'a Record, signal: usize, acted: &'a [(Vec<f64>, Vec<f64>)]) -> &'a [f64] {
+        self.law_of(signal).map_or_else(|| record.signal(signal), |law| &acted[law].0)
     }
 
     /// Initial terms: the projection of the residuals on their responses.

@@ -4,13 +4,14 @@
 //! only own terms, orders and inputs' numbers are searched: no sign to guess, no valley between what drives alike.
 
 use super::experiment::Experiment;
+use super::inverse::Rights;
 use super::model::{Coordinate, FreeModel, Point};
 use super::part::{Driven, Part};
-use super::shelf::{Shelf, FACTORS};
+use super::shelf::Shelf;
 use crate::dense;
 use crate::error::{Error, Result};
-use crate::series::SumOfProducts;
 use crate::small::back_substitute;
+use std::borrow::Cow;
 
 /// What is not told from the rest by this share of its column stays where it was: there rounding is as large.
 const UNTOLD: f64 = 1e-7;
@@ -45,22 +46,20 @@ impl FreeModel {
         point: &Point,
         coefficient: usize,
     ) -> Result<Driven> {
-        let (total, n) = (FACTORS * experiment.record.m(), self.equations.len());
-        let mut rights: Vec<Option<SumOfProducts>> = (0..n).map(|_| None).collect();
+        let record = &experiment.record;
+        let mut rights = Rights::new(part.solved.inverse(record.m())?, self.equations.len(), record.m());
         for (i, equation) in self.equations.iter().enumerate() {
             for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
                 let weight = monomial.slope(&point.coefficients, coefficient);
                 if weight != 0.0 {
-                    let driver = shelf.driver(self, experiment, *signal, &part.acted);
-                    let right = rights[i].get_or_insert_with(|| SumOfProducts::with_length(total));
-                    right.add(weight, &part.operators[i][k].spectrum(false), &driver);
+                    let series = || Cow::Borrowed(self.drives(record, *signal, &part.acted));
+                    rights.add(i, weight, (&part.operators[i][k], false), series, || {
+                        shelf.driver(self, experiment, *signal, &part.acted)
+                    });
                 }
             }
         }
-        let rights: Vec<(usize, &SumOfProducts)> =
-            rights.iter().enumerate().filter_map(|(i, right)| right.as_ref().map(|r| (i, r))).collect();
-        let inverse = part.inverse.as_deref().unwrap_or_default();
-        let driven = part.moved_by(point.orders.len() + coefficient, &rights, inverse, (self, experiment, point))?;
+        let driven = part.moved_by(point.orders.len() + coefficient, &rights, (self, experiment, point))?;
         match driven.samples.iter().position(|v| !v.is_finite()) {
             Some(index) => Err(Error::Diverged { what: "free run".into(), index }),
             None => Ok(driven),

@@ -15,6 +15,7 @@ mod feedthrough;
 pub mod fit;
 mod free_run;
 pub mod input;
+mod inverse;
 pub mod levenberg_marquardt;
 mod linear;
 pub mod model;

@@ -3,18 +3,17 @@
 use super::corners::Corners;
 use super::experiment::Experiment;
 use super::feedthrough::{add_slope, Direct, Early};
+use super::inverse::{Rights, Solved};
 use super::model::{FreeModel, Point};
-use super::shelf::{Operator, FACTORS};
+use super::shelf::Operator;
 use crate::error::Result;
-use crate::series::{Buffers, Kernel, SumOfProducts};
+use crate::series::Buffers;
 use std::rc::Rc;
 
 /// What one experiment leaves behind for its sensitivities.
 pub(super) struct Part {
-    /// A of A y = b.
-    pub(super) matrix: Vec<Vec<Vec<f64>>>,
-    /// Spectra of A⁻¹ where initial terms or linear coefficients needed them already.
-    pub(super) inverse: Option<Vec<Vec<Kernel>>>,
+    /// A of A y = b, or its inverse.
+    pub(super) solved: Solved,
     /// Of each term of each equation.
     pub(super) operators: Vec<Vec<Rc<Operator>>>,
     /// Simulated pulse means, initial terms included.
@@ -35,27 +34,15 @@ pub(super) struct Part {
 
 impl Part {
     /// What one more of a parameter does to pulse means and weighted samples: `rights` is what it does to the right-hand
-    /// sides of the equations that it moves, `inverse` holds the spectra of A⁻¹. Orders come first among the
-    /// parameters, coefficients next, numbers of inputs last.
+    /// sides. Orders come first among the parameters, coefficients next, numbers of inputs last.
     pub(super) fn moved_by(
         &self,
         parameter: usize,
-        rights: &[(usize, &SumOfProducts)],
-        inverse: &[Vec<Kernel>],
+        rights: &Rights,
         (model, experiment, point): (&FreeModel, &Experiment, &Point),
     ) -> Result<Driven> {
         let m = experiment.record.m();
-        let mut target = SumOfProducts::with_length(FACTORS * m);
-        let mut buffers = Buffers::default();
-        let means: Vec<Vec<f64>> = inverse
-            .iter()
-            .map(|row| {
-                rights.iter().for_each(|&(i, right)| target.add_product(right, &row[i]));
-                let mut means = vec![0.0; m];
-                target.take(&mut means, &mut buffers);
-                means
-            })
-            .collect();
+        let means = self.solved.inverse(m)?.times(rights, m, &mut Buffers::default())?;
         let mut samples = experiment.sampled(&means);
         self.early.correct_slope(model, experiment, point, parameter, &mut samples)?;
         if let Some(direct) = &self.direct {

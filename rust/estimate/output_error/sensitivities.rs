@@ -2,12 +2,15 @@
 
 use super::experiment::Experiment;
 use super::free_run::Evaluation;
+use super::inverse::Rights;
 use super::linear::project_out;
 use super::model::{FreeModel, Point};
 use super::part::Part;
 use super::shelf::{Shelf, FACTORS};
 use crate::error::{check_length, Error, Result};
-use crate::series::{Kernel, Solver, SumOfProducts};
+use crate::series::Kernel;
+use std::borrow::Cow;
+use std::rc::Rc;
 
 impl FreeModel {
     /// Derivatives of the residuals at an evaluated point with respect to orders, coefficients (plain coordinates),
@@ -47,18 +50,9 @@ impl FreeModel {
         let (orders, coefficients) = (&point.orders, &point.coefficients);
         let numbers = orders.len() + coefficients.len();
         let (m, n) = (record.m(), self.equations.len());
-        let total = FACTORS * m;
-        let spectrum = |series: &[f64]| Kernel::with_length(series, total);
-        let made;
-        let inverse = match &part.inverse {
-            Some(inverse) => inverse,
-            None => {
-                made = Solver::new(&part.matrix)?.inverse_spectra(total)?;
-                &made
-            }
-        };
-        let mut responses: Vec<Option<Kernel>> = part.response.iter().map(|_| None).collect();
-        let mut rights: Vec<SumOfProducts> = (0..n).map(|_| SumOfProducts::with_length(total)).collect();
+        let spectrum = |series: &[f64]| Rc::new(Kernel::with_length(series, FACTORS * m));
+        let mut responses: Vec<Option<Rc<Kernel>>> = part.response.iter().map(|_| None).collect();
+        let mut rights = Rights::new(part.solved.inverse(m)?, n, m);
         for (parameter, out) in jacobian.iter_mut().enumerate() {
             let place = parameter.checked_sub(orders.len()).and_then(|c| linear.iter().position(|&j| j == c));
             if let Some(driven) = place.and_then(|k| part.driven.get(k)) {
@@ -67,9 +61,8 @@ impl FreeModel {
                 out.extend(column.iter().map(|v| -v));
                 continue;
             }
-            let mut moves = vec![false; n];
+            rights.clear();
             for (i, equation) in self.equations.iter().enumerate() {
-                rights[i].clear();
                 for (k, (signal, order, monomial)) in equation.terms.iter().enumerate() {
                     let operator = &part.operators[i][k];
                     let c = monomial.at(coefficients);
@@ -77,8 +70,8 @@ impl FreeModel {
                         // A number of an input moves only what it drives: kernel and coefficient stay, the driver is its slope.
                         let input = parameter - numbers;
                         if self.inputs[input].signal == *signal && c != 0.0 {
-                            moves[i] = true;
-                            rights[i].add(c, &operator.spectrum(false), &spectrum(&part.acted[input].1));
+                            let slope = &part.acted[input].1;
+                            rights.add(i, c, (operator, false), || Cow::Borrowed(slope), || spectrum(slope));
                         }
                         continue;
                     }
@@ -93,31 +86,37 @@ impl FreeModel {
                     if weight == 0.0 {
                         continue;
                     }
-                    moves[i] = true;
-                    let operator = operator.spectrum(turns);
                     match self.unknown(i, *signal) {
                         Some(j) => {
-                            let response = responses[j].get_or_insert_with(|| spectrum(&part.response[j]));
-                            rights[i].add(weight, &operator, response);
+                            let response = &part.response[j];
+                            let known = &mut responses[j];
+                            rights.add(
+                                i,
+                                weight,
+                                (operator, turns),
+                                || Cow::Borrowed(response),
+                                || known.get_or_insert_with(|| spectrum(response)).clone(),
+                            );
                         }
                         None => {
-                            rights[i].add(weight, &operator, &shelf.driver(self, experiment, *signal, &part.acted));
+                            let series = || Cow::Borrowed(self.drives(record, *signal, &part.acted));
+                            rights.add(i, weight, (operator, turns), series, || {
+                                shelf.driver(self, experiment, *signal, &part.acted)
+                            });
                         }
                     }
                 }
                 if parameter < orders.len() {
                     if let Some(moved) = initial_slope(self, i, parameter, orders, &initial[i], experiment)? {
-                        moves[i] = true;
-                        rights[i].add_series(&spectrum(&moved));
+                        rights.add_series(i, Cow::Owned(moved), spectrum);
                     }
                 }
             }
-            if !moves.contains(&true) {
+            if !rights.moves() {
                 out.extend(std::iter::repeat_n(0.0, n * experiment.compared()));
                 continue;
             }
-            let moved: Vec<(usize, &SumOfProducts)> = rights.iter().enumerate().filter(|&(i, _)| moves[i]).collect();
-            let mut column = part.moved_by(parameter, &moved, inverse, (self, experiment, point))?.samples;
+            let mut column = part.moved_by(parameter, &rights, (self, experiment, point))?.samples;
             project_out(&part.basis, &mut column);
             // Residuals fall where the response rises.
             out.extend(column.iter().map(|v| -v));

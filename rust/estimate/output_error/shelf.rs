@@ -3,7 +3,7 @@
 use super::experiment::Experiment;
 use super::model::FreeModel;
 use crate::excess::{kernel, kernel_and_slope};
-use crate::series::Kernel;
+use crate::series::{Kernel, MAX_SUMS};
 use std::cell::OnceCell;
 use std::collections::HashMap;
 use std::rc::Rc;
@@ -14,23 +14,72 @@ pub(super) const FACTORS: usize = 3;
 /// Spectra of longer records are made anew each time: those of all terms together would be many times the record.
 const KEPT_PULSES: usize = 1 << 15;
 
-/// The kernel of a term's integral, and the kernel's derivative with respect to its order where the order is free.
+/// Powers of t that are kept of long records and of others.
+const FEW_POWERS: usize = 8;
+const MANY_POWERS: usize = 64;
+
+/// How near to a whole number an order of integration is one: the kernels differ by as much.
+const WHOLE: f64 = 1e-12;
+
+/// The integral of a term: its kernel, and the kernel's derivative with respect to its order where the order is free.
 pub(super) struct Operator {
     eta: f64,
-    pub(super) kernel: Vec<f64>,
-    pub(super) slope: Vec<f64>,
+    free: bool,
+    m: usize,
+    step: f64,
+    /// Kernel and derivative, once they are asked for.
+    series: OnceCell<(Vec<f64>, Vec<f64>)>,
     spectra: [OnceCell<Rc<Kernel>>; 2],
 }
 
 impl Operator {
+    fn series(&self) -> &(Vec<f64>, Vec<f64>) {
+        self.series.get_or_init(|| match self.free {
+            true => kernel_and_slope(self.eta, self.m, self.step),
+            false => (kernel(self.eta, self.m, self.step), Vec::new()),
+        })
+    }
+
+    /// Of the integral.
+    pub(super) fn kernel(&self) -> &[f64] {
+        &self.series().0
+    }
+
+    /// The order of the integral where it is whole and stays so.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    pub(super) fn whole(&self) -> Option<usize> {
+        let near = self.eta.round();
+        let stays = !self.free && (self.eta - near).abs() <= WHOLE && near >= 0.0;
+        (stays && near <= MAX_SUMS as f64).then_some(near as usize)
+    }
+
     /// The spectrum of the kernel, or of its derivative, for products of [`FACTORS`] series.
     pub(super) fn spectrum(&self, slope: bool) -> Rc<Kernel> {
-        let series = if slope { &self.slope } else { &self.kernel };
-        let made = || Rc::new(Kernel::with_length(series, FACTORS * series.len()));
-        if series.len() > KEPT_PULSES {
+        let made = || {
+            let series = self.series();
+            Rc::new(Kernel::with_length(if slope { &series.1 } else { &series.0 }, FACTORS * self.m))
+        };
+        if self.m > KEPT_PULSES {
             return made();
         }
         self.spectra[usize::from(slope)].get_or_init(made).clone()
+    }
+}
+
+/// What an initial term t^e adds, and its spectrum for products of [`FACTORS`] series.
+pub(super) struct Power {
+    pub(super) series: Vec<f64>,
+    spectrum: OnceCell<Rc<Kernel>>,
+}
+
+impl Power {
+    /// Its spectrum.
+    pub(super) fn spectrum(&self) -> Rc<Kernel> {
+        let made = || Rc::new(Kernel::with_length(&self.series, FACTORS * self.series.len()));
+        if self.series.len() > KEPT_PULSES {
+            return made();
+        }
+        self.spectrum.get_or_init(made).clone()
     }
 }
 
@@ -41,8 +90,8 @@ pub(super) struct Shelf {
     operators: HashMap<(usize, usize), Rc<Operator>>,
     /// Spectra of signals that drive and have no free number.
     drivers: HashMap<usize, Rc<Kernel>>,
-    /// Spectra of powers of t that initial terms bring, by the bits of their exponents.
-    powers: HashMap<u64, Rc<Kernel>>,
+    /// Powers of t that initial terms bring, by the bits of their exponents.
+    powers: HashMap<u64, Rc<Power>>,
     /// Weighted samples of impulses that the filter of an output gets, by output and the bits of their exponents.
     impulses: HashMap<(usize, u64), Vec<f64>>,
 }
@@ -60,8 +109,8 @@ impl Shelf {
             return known.clone();
         }
         let (m, step) = (experiment.record.m(), experiment.record.step());
-        let (kernel, slope) = if free { kernel_and_slope(eta, m, step) } else { (kernel(eta, m, step), Vec::new()) };
-        let made = Rc::new(Operator { eta, kernel, slope, spectra: [OnceCell::new(), OnceCell::new()] });
+        let (series, spectra) = (OnceCell::new(), [OnceCell::new(), OnceCell::new()]);
+        let made = Rc::new(Operator { eta, free, m, step, series, spectra });
         self.operators.insert(place, made.clone());
         made
     }
@@ -85,17 +134,14 @@ impl Shelf {
         self.drivers.entry(signal).or_insert_with(made).clone()
     }
 
-    /// The spectrum of what an initial term t^e adds, for products of [`FACTORS`] series.
-    pub(super) fn power(&mut self, experiment: &Experiment, exponent: f64) -> Rc<Kernel> {
-        let (record, total) = (&experiment.record, FACTORS * experiment.record.m());
-        let made = || Rc::new(Kernel::with_length(&record.initial_term(exponent), total));
-        if record.m() > KEPT_PULSES {
-            return made();
-        }
+    /// What an initial term t^e adds.
+    pub(super) fn power(&mut self, experiment: &Experiment, exponent: f64) -> Rc<Power> {
+        let record = &experiment.record;
         // Exponents that move with free orders would fill the shelf.
-        if self.powers.len() > 64 {
+        if self.powers.len() > if record.m() > KEPT_PULSES { FEW_POWERS } else { MANY_POWERS } {
             self.powers.clear();
         }
+        let made = || Rc::new(Power { series: record.initial_term(exponent), spectrum: OnceCell::new() });
         self.powers.entry(exponent.to_bits()).or_insert_with(made).clone()
     }
 
