@@ -27,5 +27,5 @@ pub use division::{Division, BLOCK};
 #[cfg(feature = "oracles")]
 pub use naive::{divide_naive, multiply_naive};
 pub use product::{multiply, Buffers, Kernel, SumOfProducts};
-pub use recursion::{running_sums, Recursion, Source, MAX_SUMS};
+pub use recursion::{running_sums, Recursion, Source, ABREAST, MAX_SUMS};
 pub use system::{divide, reciprocal, solve, Solver};

@@ -6,10 +6,17 @@
 //! stay as small as the motion is, which a difference equation in y alone does not.
 
 use crate::error::{check_length, Error, Result};
+use crate::lanes::{widest, Kernel};
 use crate::small;
 
 /// Highest order of an integral: beyond it transforms are as good.
 pub const MAX_SUMS: usize = 6;
+
+/// Right-hand sides that are solved for side by side: each alone waits for its own last term.
+pub const ABREAST: usize = 4;
+
+/// Terms at a time, so that what drives them stays near.
+const BLOCK: usize = 256;
 
 /// Weights of the running sums Q^0 … Q^η in I^η of pulse means.
 ///
@@ -92,65 +99,83 @@ impl Recursion {
         Ok(Self { n, sums, step, own, inverse: small::inverse(&leading, n)? })
     }
 
-    /// The n unknown series of m terms that sources drive.
+    /// The n unknown series of m terms that each list of sources drives.
     ///
     /// # Errors
     /// [`Error::Length`] for a source shorter than m.
     ///
     /// # Panics
     /// Where a source names an equation that is not there or an order above the sums.
-    pub fn solve(&self, m: usize, sources: &[Source]) -> Result<Vec<Vec<f64>>> {
-        let stride = self.sums + 1;
-        // Term by term, then equation by equation, what drives each sum.
-        let mut drive = vec![0.0; m * self.n * stride];
-        for source in sources {
+    pub fn solve(&self, m: usize, lists: &[Vec<Source>]) -> Result<Vec<Vec<Vec<f64>>>> {
+        for source in lists.iter().flatten() {
             if source.series.len() < m {
                 check_length("series that drives", m, source.series.len())?;
             }
-            let weights: Vec<f64> = running_sums(source.order, self.step).iter().map(|w| w * source.weight).collect();
-            let rows = drive.chunks_exact_mut(self.n * stride);
-            for (row, &value) in rows.zip(source.series) {
+        }
+        if self.n > 1 {
+            return Ok(lists.iter().map(|sources| self.many(m, sources)).collect());
+        }
+        let solve = match self.sums {
+            0 => Self::abreast::<1>,
+            1 => Self::abreast::<2>,
+            2 => Self::abreast::<3>,
+            3 => Self::abreast::<4>,
+            4 => Self::abreast::<5>,
+            5 => Self::abreast::<6>,
+            _ => Self::abreast::<7>,
+        };
+        let solved = lists.chunks(ABREAST).flat_map(|part| solve(self, m, part));
+        Ok(solved.map(|answer| vec![answer]).collect())
+    }
+
+    /// One unknown under up to [`ABREAST`] right-hand sides; L is one more than there are sums.
+    fn abreast<const L: usize>(&self, m: usize, lists: &[Vec<Source>]) -> Vec<Vec<f64>> {
+        let mut own = [0.0; L];
+        own.copy_from_slice(&self.own[..L]);
+        let driven: Vec<Vec<(Vec<f64>, &[f64])>> = lists
+            .iter()
+            .map(|list| list.iter().map(|source| (self.weights(source), source.series)).collect())
+            .collect();
+        let mut out = vec![vec![0.0; m]; lists.len()];
+        let mut states = [[0.0; ABREAST]; L];
+        let mut drive = vec![[[0.0; ABREAST]; L]; BLOCK.min(m)];
+        let mut answer = vec![[0.0; ABREAST]; BLOCK.min(m)];
+        for start in (0..m).step_by(BLOCK) {
+            let length = BLOCK.min(m - start);
+            drive[..length].fill([[0.0; ABREAST]; L]);
+            for (lane, sources) in driven.iter().enumerate() {
+                for (weights, series) in sources {
+                    for (given, value) in drive.iter_mut().zip(&series[start..start + length]) {
+                        given.iter_mut().zip(weights).for_each(|(sum, w)| sum[lane] += w * value);
+                    }
+                }
+            }
+            let (drive, answer) = (&drive[..length], &mut answer[..length]);
+            widest(Block { own: &own, inverse: self.inverse[0], states: &mut states, drive, answer });
+            for (lane, series) in out.iter_mut().enumerate() {
+                series[start..start + length].iter_mut().zip(&*answer).for_each(|(value, y)| *value = y[lane]);
+            }
+        }
+        out
+    }
+
+    /// What a source adds to each sum, by its series.
+    fn weights(&self, source: &Source) -> Vec<f64> {
+        running_sums(source.order, self.step).iter().map(|w| w * source.weight).collect()
+    }
+
+    fn many(&self, m: usize, sources: &[Source]) -> Vec<Vec<f64>> {
+        let (n, stride) = (self.n, self.sums + 1);
+        // Term by term, then equation by equation, what drives each sum.
+        let mut drive = vec![0.0; m * n * stride];
+        for source in sources {
+            let weights = self.weights(source);
+            for (row, &value) in drive.chunks_exact_mut(n * stride).zip(source.series) {
                 let part = &mut row[source.equation * stride..][..weights.len()];
                 part.iter_mut().zip(&weights).for_each(|(sum, w)| *sum += w * value);
             }
         }
-        Ok(match (self.n, self.sums) {
-            (1, 0) => vec![self.one::<1>(&drive)],
-            (1, 1) => vec![self.one::<2>(&drive)],
-            (1, 2) => vec![self.one::<3>(&drive)],
-            (1, 3) => vec![self.one::<4>(&drive)],
-            (1, 4) => vec![self.one::<5>(&drive)],
-            _ => self.many(&drive),
-        })
-    }
-
-    /// One unknown; L is one more than there are sums.
-    fn one<const L: usize>(&self, drive: &[f64]) -> Vec<f64> {
-        let (mut own, inverse) = ([0.0; L], self.inverse[0]);
-        own.copy_from_slice(&self.own[..L]);
-        let mut sums = [0.0; L];
-        drive
-            .chunks_exact(L)
-            .map(|given| {
-                let mut open = given[0];
-                for l in 1..L {
-                    open += given[l] + sums[l];
-                }
-                let y = inverse * open;
-                let mut above = 0.0;
-                for l in (1..L).rev() {
-                    sums[l] += given[l] + own[l] * y + above;
-                    above = sums[l];
-                }
-                y
-            })
-            .collect()
-    }
-
-    fn many(&self, drive: &[f64]) -> Vec<Vec<f64>> {
-        let (n, stride) = (self.n, self.sums + 1);
-        let terms = drive.len() / (n * stride).max(1);
-        let mut out: Vec<Vec<f64>> = (0..n).map(|_| Vec::with_capacity(terms)).collect();
+        let mut out: Vec<Vec<f64>> = (0..n).map(|_| Vec::with_capacity(m)).collect();
         let (mut sums, mut open, mut y) = (vec![0.0; n * stride], vec![0.0; n], vec![0.0; n]);
         for given in drive.chunks_exact(n * stride) {
             for (i, sum) in open.iter_mut().enumerate() {
@@ -172,6 +197,43 @@ impl Recursion {
             }
         }
         out
+    }
+}
+
+/// One unknown under [`ABREAST`] right-hand sides over a block of terms.
+struct Block<'a, const L: usize> {
+    own: &'a [f64; L],
+    inverse: f64,
+    states: &'a mut [[f64; ABREAST]; L],
+    drive: &'a [[[f64; ABREAST]; L]],
+    answer: &'a mut [[f64; ABREAST]],
+}
+
+impl<const L: usize> Kernel for Block<'_, L> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        let mut states = *self.states;
+        for (given, y) in self.drive.iter().zip(self.answer) {
+            let mut open = given[0];
+            for l in 1..L {
+                for w in 0..ABREAST {
+                    open[w] += given[l][w] + states[l][w];
+                }
+            }
+            let mut above = [0.0; ABREAST];
+            for w in 0..ABREAST {
+                y[w] = self.inverse * open[w];
+            }
+            for l in (1..L).rev() {
+                for w in 0..ABREAST {
+                    states[l][w] += given[l][w] + self.own[l] * y[w] + above[w];
+                }
+                above = states[l];
+            }
+        }
+        *self.states = states;
     }
 }
 

@@ -541,8 +541,8 @@ fn integrals_of_whole_order_by_running_sums() {
     let mut worst = 0.0_f64;
     for order in 0..=MAX_SUMS {
         let source = Source { equation: 0, order, weight: 1.0, series: &pulse };
-        let found = Recursion::new(1, order, step, &[]).unwrap().solve(m, &[source]).unwrap();
-        worst = worst.max(relative_error(&found[0], &block_pulse_kernel(order as f64, m, step)));
+        let found = Recursion::new(1, order, step, &[]).unwrap().solve(m, &[vec![source]]).unwrap();
+        worst = worst.max(relative_error(&found[0][0], &block_pulse_kernel(order as f64, m, step)));
     }
     check("kernels by running sums", worst, 1e-11);
 }
@@ -577,8 +577,14 @@ fn systems_of_whole_order_by_running_sums_are_those_by_division() {
     ];
     let mut worst = 0.0_f64;
     for (n, sums, terms, sources) in cases {
-        let found = Recursion::new(n, sums, step, &terms).unwrap().solve(m, &sources).unwrap();
-        for (a, b) in found.iter().zip(by_division(n, m, step, &terms, &sources)) {
+        // More lists than go side by side, one of them empty.
+        let twice = sources.iter().map(|s| Source { weight: 2.0 * s.weight, ..*s }).collect();
+        let lists = [sources.clone(), Vec::new(), twice, sources.clone(), sources.clone(), sources.clone()];
+        let found = Recursion::new(n, sums, step, &terms).unwrap().solve(m, &lists).unwrap();
+        assert_eq!(found.len(), lists.len());
+        assert!(found[1].iter().flatten().all(|v| *v == 0.0) && found[5] == found[0]);
+        assert!(found[2].iter().flatten().zip(found[0].iter().flatten()).all(|(a, b)| *a == 2.0 * b));
+        for (a, b) in found[0].iter().zip(by_division(n, m, step, &terms, &sources)) {
             worst = worst.max(block_distance(a, &b));
         }
     }
@@ -592,5 +598,5 @@ fn running_sums_that_cannot_be() {
     // 1 − c·h/2 = 0.
     assert!(matches!(Recursion::new(1, 1, 0.5, &[(0, 0, 1, 4.0)]), Err(Error::LeadingZero { .. })));
     let short = Source { equation: 0, order: 0, weight: 1.0, series: &[1.0] };
-    assert!(matches!(Recursion::new(1, 0, 0.5, &[]).unwrap().solve(2, &[short]), Err(Error::Length { .. })));
+    assert!(matches!(Recursion::new(1, 0, 0.5, &[]).unwrap().solve(2, &[vec![short]]), Err(Error::Length { .. })));
 }

@@ -3,11 +3,11 @@
 use super::corners::Corners;
 use super::experiment::Experiment;
 use super::feedthrough::{Direct, Early};
-use super::inverse::{Inverse, Rights, Solved};
+use super::inverse::{Inverse, Solved};
 use super::linear::best_moves;
 use super::model::{FreeModel, Point};
 use super::part::Part;
-use super::shelf::{Operator, Shelf, FACTORS};
+use super::shelf::{Operator, Power, Shelf, FACTORS};
 use crate::dense;
 use crate::equation::Structure;
 use crate::error::{Error, Result};
@@ -134,34 +134,41 @@ impl FreeModel {
         let mut basis = Vec::new();
         if asked {
             let inverse = solved.inverse(record.m())?;
-            let mut rights = Rights::new(inverse, structures.len(), record.m());
-            for (i, list) in out.exponents.iter().enumerate() {
-                for &exponent in list {
-                    if is_impulse(exponent) && !record.is_filtered() {
-                        let samples = shelf.impulse(experiment, i, exponent);
-                        dense::extend_orthonormal(&mut basis, samples.clone(), SPANNED);
-                        free.push(Free { equation: i, samples, means: Vec::new() });
-                        continue;
+            let terms: Vec<(usize, f64)> =
+                out.exponents.iter().enumerate().flat_map(|(i, list)| list.iter().map(move |e| (i, *e))).collect();
+            let still = |exponent: f64| is_impulse(exponent) && !record.is_filtered();
+            let powers: Vec<Option<Rc<Power>>> =
+                terms.iter().map(|&(_, e)| (!still(e)).then(|| shelf.power(experiment, e))).collect();
+            inverse.each(
+                (structures.len(), record.m()),
+                terms.len(),
+                |place, rights| {
+                    if let Some(power) = &powers[place] {
+                        rights.add_series(terms[place].0, Cow::Borrowed(&power.series), |_| power.spectrum());
                     }
-                    let power = shelf.power(experiment, exponent);
-                    rights.clear();
-                    rights.add_series(i, Cow::Owned(power.series.clone()), |_| power.spectrum());
-                    let means = inverse.times(&rights, record.m(), &mut Buffers::default())?;
-                    let mut samples = experiment.sampled(&means);
-                    if experiment.own.is_some() {
-                        let corner = Corners::of_power(experiment, i, exponent);
-                        samples.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
-                    }
+                    Ok(())
+                },
+                |place, means| {
+                    let (i, exponent) = terms[place];
+                    let (samples, means) = match means {
+                        None => (shelf.impulse(experiment, i, exponent), Vec::new()),
+                        Some(means) => {
+                            let mut samples = experiment.sampled(&means);
+                            if experiment.own.is_some() {
+                                let corner = Corners::of_power(experiment, i, exponent);
+                                samples.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
+                            }
+                            (samples, means)
+                        }
+                    };
                     dense::extend_orthonormal(&mut basis, samples.clone(), SPANNED);
                     free.push(Free { equation: i, samples, means });
-                }
-            }
+                    Ok(())
+                },
+            )?;
         }
         let mut part = Part { solved, operators, response, basis, driven: Vec::new(), acted, direct, early, corners };
-        for &coefficient in linear {
-            let column = self.driven_by(experiment, shelf, &part, point, coefficient)?;
-            part.driven.push(column);
-        }
+        part.driven = self.driven_by(experiment, shelf, &part, point, linear)?;
         Ok(Answer { part, residuals, free })
     }
 
@@ -220,16 +227,27 @@ impl FreeModel {
             });
             let highest = orders.iter().copied().max().unwrap_or(0);
             let inverse = Inverse::Sums(Recursion::new(n, highest, record.step(), &own.collect::<Vec<_>>())?);
-            let mut rights = Rights::new(&inverse, n, m);
-            for (i, k) in places() {
-                let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
-                if self.unknown(i, signal).is_none() && c != 0.0 {
-                    let series = || Cow::Borrowed(self.drives(record, signal, acted));
-                    rights
-                        .add(i, c, (&operators[i][k], false), series, || shelf.driver(self, experiment, signal, acted));
-                }
-            }
-            let response = inverse.times(&rights, m, &mut buffers)?;
+            let mut response = vec![vec![0.0; m]; n];
+            inverse.each(
+                (n, m),
+                1,
+                |_, rights| {
+                    for (i, k) in places() {
+                        let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
+                        if self.unknown(i, signal).is_none() && c != 0.0 {
+                            let series = || Cow::Borrowed(self.drives(record, signal, acted));
+                            rights.add(i, c, (&operators[i][k], false), series, || {
+                                shelf.driver(self, experiment, signal, acted)
+                            });
+                        }
+                    }
+                    Ok(())
+                },
+                |_, means| {
+                    means.into_iter().for_each(|means| response = means);
+                    Ok(())
+                },
+            )?;
             return Ok((response, Solved::of(inverse)));
         }
         let mut matrix = vec![vec![vec![0.0; m]; n]; n];

@@ -2,8 +2,8 @@
 //! every order of integration is whole and stays so.
 
 use super::shelf::{Operator, FACTORS};
-use crate::error::{Error, Result};
-use crate::series::{Buffers, Kernel, Recursion, Solver, Source, SumOfProducts};
+use crate::error::Result;
+use crate::series::{Buffers, Kernel, Recursion, Solver, Source, SumOfProducts, ABREAST};
 use std::borrow::Cow;
 use std::cell::OnceCell;
 use std::rc::Rc;
@@ -25,16 +25,6 @@ pub(super) enum Rights<'a> {
 }
 
 impl<'a> Rights<'a> {
-    /// Nothing yet, for n equations and m pulses, as the inverse takes it.
-    pub(super) fn new(inverse: &Inverse, n: usize, m: usize) -> Self {
-        match inverse {
-            Inverse::Spectra(_) => {
-                Self::Spectra((0..n).map(|_| (false, SumOfProducts::with_length(FACTORS * m))).collect())
-            }
-            Inverse::Sums(_) => Self::Sums(Vec::new()),
-        }
-    }
-
     /// Forgets what was added.
     pub(super) fn clear(&mut self) {
         match self {
@@ -54,6 +44,38 @@ impl<'a> Rights<'a> {
             Self::Spectra(rights) => rights.iter().any(|(used, _)| *used),
             Self::Sums(sources) => !sources.is_empty(),
         }
+    }
+
+    /// What an inverse by spectra makes of it.
+    fn through(
+        &self,
+        rows: &[Vec<Kernel>],
+        m: usize,
+        target: &mut SumOfProducts,
+        buffers: &mut Buffers,
+    ) -> Option<Vec<Vec<f64>>> {
+        let Self::Spectra(rights) = self else { return None };
+        let of_row = |row: &Vec<Kernel>| {
+            let moved = row.iter().zip(rights).filter(|(_, (used, _))| *used);
+            moved.for_each(|(entry, (_, right))| target.add_product(right, entry));
+            let mut means = vec![0.0; m];
+            target.take(&mut means, buffers);
+            means
+        };
+        self.moves().then(|| rows.iter().map(of_row).collect())
+    }
+
+    /// What running sums take.
+    fn sources(&self) -> Vec<Source<'_>> {
+        let Self::Sums(sources) = self else { return Vec::new() };
+        (sources.iter())
+            .map(|(equation, order, weight, series)| Source {
+                equation: *equation,
+                order: *order,
+                weight: *weight,
+                series,
+            })
+            .collect()
     }
 
     /// Adds an operator, or with `slope` its derivative with respect to its order, of a signal; its spectrum is asked for
@@ -128,32 +150,46 @@ impl Solved {
 }
 
 impl Inverse {
-    /// Pulse means of each unknown, m of them.
-    pub(super) fn times(&self, rights: &Rights, m: usize, buffers: &mut Buffers) -> Result<Vec<Vec<f64>>> {
-        match (self, rights) {
-            (Self::Spectra(rows), Rights::Spectra(rights)) => {
+    /// For each of `count` right-hand sides, as `given` adds it up, the pulse means of each unknown to `taken`; none where
+    /// nothing was added.
+    ///
+    /// # Errors
+    /// Those of `given` and `taken`.
+    pub(super) fn each<'a>(
+        &self,
+        (n, m): (usize, usize),
+        count: usize,
+        mut given: impl FnMut(usize, &mut Rights<'a>) -> Result<()>,
+        mut taken: impl FnMut(usize, Option<Vec<Vec<f64>>>) -> Result<()>,
+    ) -> Result<()> {
+        match self {
+            Self::Spectra(rows) => {
+                let mut rights =
+                    Rights::Spectra((0..n).map(|_| (false, SumOfProducts::with_length(FACTORS * m))).collect());
                 let mut target = SumOfProducts::with_length(FACTORS * m);
-                let of_row = |row: &Vec<Kernel>| {
-                    let moved = row.iter().zip(rights).filter(|(_, (used, _))| *used);
-                    moved.for_each(|(entry, (_, right))| target.add_product(right, entry));
-                    let mut means = vec![0.0; m];
-                    target.take(&mut means, buffers);
-                    means
-                };
-                Ok(rows.iter().map(of_row).collect())
+                let mut buffers = Buffers::default();
+                for place in 0..count {
+                    given(place, &mut rights)?;
+                    taken(place, rights.through(rows, m, &mut target, &mut buffers))?;
+                    rights.clear();
+                }
             }
-            (Self::Sums(recursion), Rights::Sums(sources)) => {
-                let sources: Vec<Source> = (sources.iter())
-                    .map(|(equation, order, weight, series)| Source {
-                        equation: *equation,
-                        order: *order,
-                        weight: *weight,
-                        series,
-                    })
-                    .collect();
-                recursion.solve(m, &sources)
+            Self::Sums(recursion) => {
+                for first in (0..count).step_by(ABREAST) {
+                    let mut lists = Vec::with_capacity(ABREAST);
+                    for place in first..(first + ABREAST).min(count) {
+                        let mut rights = Rights::Sums(Vec::new());
+                        given(place, &mut rights)?;
+                        lists.push(rights);
+                    }
+                    let sources: Vec<Vec<Source>> = lists.iter().map(Rights::sources).collect();
+                    for (place, (means, rights)) in (first..).zip(recursion.solve(m, &sources)?.into_iter().zip(&lists))
+                    {
+                        taken(place, rights.moves().then_some(means))?;
+                    }
+                }
             }
-            _ => Err(Error::Internal { what: "right-hand sides of another inverse".into() }),
         }
+        Ok(())
     }
 }

@@ -4,7 +4,6 @@
 //! only own terms, orders and inputs' numbers are searched: no sign to guess, no valley between what drives alike.
 
 use super::experiment::Experiment;
-use super::inverse::Rights;
 use super::model::{Coordinate, FreeModel, Point};
 use super::part::{Driven, Part};
 use super::shelf::Shelf;
@@ -37,33 +36,49 @@ impl FreeModel {
         (0..self.coordinates.len()).filter(|&j| moves(j) && stands(j)).collect()
     }
 
-    /// What one more of a coefficient does that stands before what drives.
+    /// What one more of each coefficient does that stands before what drives.
     pub(super) fn driven_by(
         &self,
         experiment: &Experiment,
         shelf: &mut Shelf,
         part: &Part,
         point: &Point,
-        coefficient: usize,
-    ) -> Result<Driven> {
-        let record = &experiment.record;
-        let mut rights = Rights::new(part.solved.inverse(record.m())?, self.equations.len(), record.m());
-        for (i, equation) in self.equations.iter().enumerate() {
-            for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
-                let weight = monomial.slope(&point.coefficients, coefficient);
-                if weight != 0.0 {
-                    let series = || Cow::Borrowed(self.drives(record, *signal, &part.acted));
-                    rights.add(i, weight, (&part.operators[i][k], false), series, || {
-                        shelf.driver(self, experiment, *signal, &part.acted)
-                    });
+        coefficients: &[usize],
+    ) -> Result<Vec<Driven>> {
+        if coefficients.is_empty() {
+            return Ok(Vec::new());
+        }
+        let (record, n) = (&experiment.record, self.equations.len());
+        let mut driven = Vec::with_capacity(coefficients.len());
+        part.solved.inverse(record.m())?.each(
+            (n, record.m()),
+            coefficients.len(),
+            |place, rights| {
+                for (i, equation) in self.equations.iter().enumerate() {
+                    for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
+                        let weight = monomial.slope(&point.coefficients, coefficients[place]);
+                        if weight != 0.0 {
+                            let series = || Cow::Borrowed(self.drives(record, *signal, &part.acted));
+                            rights.add(i, weight, (&part.operators[i][k], false), series, || {
+                                shelf.driver(self, experiment, *signal, &part.acted)
+                            });
+                        }
+                    }
                 }
-            }
-        }
-        let driven = part.moved_by(point.orders.len() + coefficient, &rights, (self, experiment, point))?;
-        match driven.samples.iter().position(|v| !v.is_finite()) {
-            Some(index) => Err(Error::Diverged { what: "free run".into(), index }),
-            None => Ok(driven),
-        }
+                Ok(())
+            },
+            |place, means| {
+                let parameter = point.orders.len() + coefficients[place];
+                let means = means.unwrap_or_else(|| vec![vec![0.0; record.m()]; n]);
+                let found = part.moved_by(parameter, means, (self, experiment, point))?;
+                if let Some(index) = found.samples.iter().position(|v| !v.is_finite()) {
+                    return Err(Error::Diverged { what: "free run".into(), index });
+                }
+                driven.push(found);
+                Ok(())
+            },
+        )?;
+        Ok(driven)
     }
 }
 

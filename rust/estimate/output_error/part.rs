@@ -3,11 +3,10 @@
 use super::corners::Corners;
 use super::experiment::Experiment;
 use super::feedthrough::{add_slope, Direct, Early};
-use super::inverse::{Rights, Solved};
+use super::inverse::Solved;
 use super::model::{FreeModel, Point};
 use super::shelf::Operator;
 use crate::error::Result;
-use crate::series::Buffers;
 use std::rc::Rc;
 
 /// What one experiment leaves behind for its sensitivities.
@@ -33,16 +32,14 @@ pub(super) struct Part {
 }
 
 impl Part {
-    /// What one more of a parameter does to pulse means and weighted samples: `rights` is what it does to the right-hand
-    /// sides. Orders come first among the parameters, coefficients next, numbers of inputs last.
+    /// What one more of a parameter does to weighted samples, from what it does to pulse means. Orders come first among
+    /// the parameters, coefficients next, numbers of inputs last.
     pub(super) fn moved_by(
         &self,
         parameter: usize,
-        rights: &Rights,
+        means: Vec<Vec<f64>>,
         (model, experiment, point): (&FreeModel, &Experiment, &Point),
     ) -> Result<Driven> {
-        let m = experiment.record.m();
-        let means = self.solved.inverse(m)?.times(rights, m, &mut Buffers::default())?;
         let mut samples = experiment.sampled(&means);
         self.early.correct_slope(model, experiment, point, parameter, &mut samples)?;
         if let Some(direct) = &self.direct {

@@ -2,11 +2,11 @@
 
 use super::experiment::Experiment;
 use super::free_run::Evaluation;
-use super::inverse::Rights;
 use super::linear::project_out;
 use super::model::{FreeModel, Point};
 use super::part::Part;
 use super::shelf::{Shelf, FACTORS};
+use crate::equation::AffineOrder;
 use crate::error::{check_length, Error, Result};
 use crate::series::Kernel;
 use std::borrow::Cow;
@@ -48,81 +48,89 @@ impl FreeModel {
     ) -> Result<()> {
         let record = &experiment.record;
         let (orders, coefficients) = (&point.orders, &point.coefficients);
-        let numbers = orders.len() + coefficients.len();
         let (m, n) = (record.m(), self.equations.len());
-        let spectrum = |series: &[f64]| Rc::new(Kernel::with_length(series, FACTORS * m));
         let mut responses: Vec<Option<Rc<Kernel>>> = part.response.iter().map(|_| None).collect();
-        let mut rights = Rights::new(part.solved.inverse(m)?, n, m);
-        for (parameter, out) in jacobian.iter_mut().enumerate() {
-            let place = parameter.checked_sub(orders.len()).and_then(|c| linear.iter().position(|&j| j == c));
-            if let Some(driven) = place.and_then(|k| part.driven.get(k)) {
-                let mut column = driven.samples.clone();
-                project_out(&part.basis, &mut column);
-                out.extend(column.iter().map(|v| -v));
-                continue;
-            }
-            rights.clear();
-            for (i, equation) in self.equations.iter().enumerate() {
-                for (k, (signal, order, monomial)) in equation.terms.iter().enumerate() {
-                    let operator = &part.operators[i][k];
-                    let c = monomial.at(coefficients);
-                    if parameter >= numbers {
-                        // A number of an input moves only what it drives: kernel and coefficient stay, the driver is its slope.
-                        let input = parameter - numbers;
-                        if self.inputs[input].signal == *signal && c != 0.0 {
+        let mut columns: Vec<Option<Vec<f64>>> = vec![None; jacobian.len()];
+        for (&coefficient, driven) in linear.iter().zip(&part.driven) {
+            columns[orders.len() + coefficient] = Some(driven.samples.clone());
+        }
+        let open: Vec<usize> = (0..columns.len()).filter(|&parameter| columns[parameter].is_none()).collect();
+        part.solved.inverse(m)?.each(
+            (n, m),
+            open.len(),
+            |place, rights| {
+                let parameter = open[place];
+                for (i, equation) in self.equations.iter().enumerate() {
+                    for (k, (signal, _, _)) in equation.terms.iter().enumerate() {
+                        let turns = parameter < orders.len();
+                        let weight = self.pull((i, k), point, parameter);
+                        if weight == 0.0 {
+                            continue;
+                        }
+                        let operator = &part.operators[i][k];
+                        if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
                             let slope = &part.acted[input].1;
-                            rights.add(i, c, (operator, false), || Cow::Borrowed(slope), || spectrum(slope));
-                        }
-                        continue;
-                    }
-                    let turns = parameter < orders.len();
-                    let weight = if turns {
-                        let d_eta = equation.order.weights.get(parameter).unwrap_or(&0.0)
-                            - order.weights.get(parameter).unwrap_or(&0.0);
-                        c * d_eta
-                    } else {
-                        monomial.slope(coefficients, parameter - orders.len())
-                    };
-                    if weight == 0.0 {
-                        continue;
-                    }
-                    match self.unknown(i, *signal) {
-                        Some(j) => {
-                            let response = &part.response[j];
-                            let known = &mut responses[j];
-                            rights.add(
-                                i,
-                                weight,
-                                (operator, turns),
-                                || Cow::Borrowed(response),
-                                || known.get_or_insert_with(|| spectrum(response)).clone(),
-                            );
-                        }
-                        None => {
+                            rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || spectrum(slope));
+                        } else if let Some(j) = self.unknown(i, *signal) {
+                            let (response, known) = (&part.response[j], &mut responses[j]);
+                            let made = || known.get_or_insert_with(|| spectrum(response)).clone();
+                            rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), made);
+                        } else {
                             let series = || Cow::Borrowed(self.drives(record, *signal, &part.acted));
-                            rights.add(i, weight, (operator, turns), series, || {
-                                shelf.driver(self, experiment, *signal, &part.acted)
-                            });
+                            let made = || shelf.driver(self, experiment, *signal, &part.acted);
+                            rights.add(i, weight, (operator, turns), series, made);
+                        }
+                    }
+                    if parameter < orders.len() {
+                        if let Some(moved) = initial_slope(self, i, parameter, orders, &initial[i], experiment)? {
+                            rights.add_series(i, Cow::Owned(moved), spectrum);
                         }
                     }
                 }
-                if parameter < orders.len() {
-                    if let Some(moved) = initial_slope(self, i, parameter, orders, &initial[i], experiment)? {
-                        rights.add_series(i, Cow::Owned(moved), spectrum);
-                    }
+                Ok(())
+            },
+            |place, means| {
+                if let Some(means) = means {
+                    columns[open[place]] = Some(part.moved_by(open[place], means, (self, experiment, point))?.samples);
+                }
+                Ok(())
+            },
+        )?;
+        for (column, out) in columns.into_iter().zip(jacobian) {
+            match column {
+                None => out.extend(std::iter::repeat_n(0.0, n * experiment.compared())),
+                Some(mut column) => {
+                    project_out(&part.basis, &mut column);
+                    // Residuals fall where the response rises.
+                    out.extend(column.iter().map(|v| -v));
                 }
             }
-            if !rights.moves() {
-                out.extend(std::iter::repeat_n(0.0, n * experiment.compared()));
-                continue;
-            }
-            let mut column = part.moved_by(parameter, &rights, (self, experiment, point))?.samples;
-            project_out(&part.basis, &mut column);
-            // Residuals fall where the response rises.
-            out.extend(column.iter().map(|v| -v));
         }
         Ok(())
     }
+
+    /// How a parameter moves the right-hand side by term k of equation i: the weight of the term's operator, of its
+    /// derivative for an order, of the slope of what drives for a number of an input.
+    fn pull(&self, (i, k): (usize, usize), point: &Point, parameter: usize) -> f64 {
+        let (equation, (orders, coefficients)) = (&self.equations[i], (&point.orders, &point.coefficients));
+        let (signal, order, monomial) = &equation.terms[k];
+        if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
+            // It moves only what it drives: kernel and coefficient stay.
+            return if self.inputs[input].signal == *signal { monomial.at(coefficients) } else { 0.0 };
+        }
+        match parameter.checked_sub(orders.len()) {
+            Some(coefficient) => monomial.slope(coefficients, coefficient),
+            None => {
+                let of = |law: &AffineOrder| law.weights.get(parameter).copied().unwrap_or(0.0);
+                monomial.at(coefficients) * (of(&equation.order) - of(order))
+            }
+        }
+    }
+}
+
+/// Of a series, for products of [`FACTORS`] of them.
+fn spectrum(series: &[f64]) -> Rc<Kernel> {
+    Rc::new(Kernel::with_length(series, FACTORS * series.len()))
 }
 
 /// How the initial terms of equation i move with a free order, weighted by their coefficients; none if they do not.
