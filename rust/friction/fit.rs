@@ -279,7 +279,7 @@ pub fn fit_until(
     let found = minimise(&problem, Point { orders, coefficients, inputs, states }, settings)?;
     let numbers = found.point.orders.len() + found.point.coefficients.len() + found.point.inputs.len();
     let mut basis = Vec::new();
-    for column in &found.jacobian[numbers..] {
+    for column in found.jacobian.iter().skip(numbers) {
         dense::extend_orthonormal(&mut basis, column.clone(), SPANNED);
     }
     let mut jacobian = found.jacobian;

@@ -298,7 +298,7 @@ pub fn output_error<'py>(
     dict.set_item("inputs", fit.point.inputs)?;
     dict.set_item("cost", fit.cost)?;
     dict.set_item("residuals", PyArray1::from_vec(py, fit.residuals))?;
-    dict.set_item("jacobian", stacked(py, &fit.jacobian)?)?;
+    dict.set_item("jacobian", if fit.jacobian.is_empty() { None } else { Some(stacked(py, &fit.jacobian)?) })?;
     dict.set_item("initial", fit.initial)?;
     dict.set_item("exponents", fit.exponents)?;
     dict.set_item("evaluations", fit.evaluations)?;

@@ -504,6 +504,17 @@ fn a_fit_that_its_grid_stops_says_so() {
 }
 
 #[test]
+fn no_evaluation_is_residuals_without_slopes() {
+    let experiments = [run(100, 1, &[], 0.05, 431)];
+    let model = two_link(true, Initial::Caputo);
+    let there = at(&model, &experiments, &START.0, &START.1);
+    let settings = Settings { evaluations: 0, ..Settings::default() };
+    let found = fit(&model, &experiments, &point(&START.0, &START.1), settings).unwrap();
+    assert_eq!((&found.residuals, found.cost, found.status), (&there.residuals, there.cost, there.status));
+    assert!(found.jacobian.is_empty() && !there.jacobian.is_empty());
+}
+
+#[test]
 fn a_number_that_is_held_stays_and_the_others_are_the_optimum_beside_it() {
     let experiments = [run(200, 1, &[], 0.05, 430)];
     let free = two_link(true, Initial::Rest);

@@ -238,6 +238,10 @@ class Grid:
             tolerance=tolerance, steady=self.steady,
         )  # fmt: skip
 
+    def evaluated(self, attempt: Attempt) -> Attempt:
+        """An attempt with its residuals and its cost on this grid, without derivatives."""
+        return self.descend(attempt, 0)
+
     def lowest(self, attempt: Attempt, evaluations: int) -> Attempt:
         """Descend in logarithmic coordinates, then in plain ones, which may cross zero."""
         first = self.descend(attempt, evaluations)
@@ -286,7 +290,7 @@ class Grid:
         What is left over is noise at least; of a structure that is not all of the machine's physics it is more.
         """
         try:
-            ends = [grid.descend(attempt, 1).outcome["residuals"] for grid in (self, self.finer)]
+            ends = [grid.evaluated(attempt).outcome["residuals"] for grid in (self, self.finer)]
         except FtlmError:
             # Finite on one grid and not on the other: it matters.
             return True
@@ -303,7 +307,7 @@ class Grid:
 
         def worse(attempt: Attempt) -> float:
             try:
-                return max(attempt.level, self.descend(attempt, 1).level)
+                return max(attempt.level, self.evaluated(attempt).level)
             except FtlmError:
                 # It has no finite free run there.
                 return math.inf

@@ -333,7 +333,7 @@ def nearer(best: Attempt, grid: Grid, limit: Floats, clock: Clock) -> Floats:
     costs = []
     for attempt in (ahead, best):
         try:
-            costs.append(float(grid.finer.descend(attempt, 1).outcome["cost"]))
+            costs.append(float(grid.finer.evaluated(attempt).outcome["cost"]))
         except FtlmError:
             # No finite free run there.
             costs.append(math.inf)

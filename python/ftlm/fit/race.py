@@ -24,6 +24,9 @@ RUNNERS = 3
 FEWEST = 8
 #: Share of its start below which a coefficient is as good as 0: a descent that keeps its sign ends at e^-20.
 VANISHED = 1e-8
+#: Starts that tell how fine the grid must be on which all compete, chosen by this many evaluations.
+PIONEERS = 3
+GLANCE = 2
 #: All get as many as those ahead where the best is above the noise by this factor.
 ABOVE_FLOOR = 2.0
 #: Coarse fits that continue on all samples.
@@ -76,10 +79,9 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
         alike = replace(alike, problem=problem)
     starts = delayed_attempts(runs, problem, threads)
     laps = Laps(len(starts), threads, progress)
-    coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
+    coarse = replace(alike, decimation=max(1, round(min(run.length - 1 for run in runs) / COARSE_SAMPLES)))
+    coarse = fine_enough(coarse, starts, laps)
     reached = laps.run(coarse, starts, FIRST_LAP)
-    # A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its
-    # own: once more from the same starts, on half the step.
     while coarse.every < FINEST and (not reached or coarse.matters(reached[0])):
         coarse = coarse.finer
         reached = laps.run(coarse, starts, FIRST_LAP)
@@ -87,24 +89,26 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
     # with a pole too fast to see.
     others: list[Simpler | LowerOrder | Whole] = [*simpler(problem), *lower_orders(problem, runs)]
     others += whole(problem, reached[0].orders) if reached else []
+    first = reached
     for less in others if reached else []:
-        try:
-            runners = delayed_attempts(runs, less.problem, threads)
-        except ModelError:
-            # At whole orders two of its terms have become one.
-            continue
         if isinstance(less, Simpler) and less.driven:
-            # What drives is solved for at every point, with a term less as well: own terms alone are told apart, so the
-            # nearest starts will do, and their way goes on in the whole problem.
-            runners = laps.run(coarse, runners, 1, less.problem)[:FINALISTS]
+            # What drives is solved for at every point, with a term less as well: own terms alone are told apart, so
+            # where the whole problem starts and ends will do, and the way goes on in the whole problem.
+            runners = [less.without(a, problem) for a in (*distinct(first)[:FINALISTS], *starts)]
+            runners = laps.run(coarse, runners, GLANCE, less.problem)[:FINALISTS]
             ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
             reached = sorted(
                 reached + laps.run(coarse, [less.embedded(a, problem) for a in ended[:1]], 1), key=lambda a: a.level
             )
             continue
+        try:
+            runners = delayed_attempts(runs, less.problem, threads)
+        except ModelError:
+            # At whole orders two of its terms have become one.
+            continue
         if isinstance(less, Whole):
             # At given orders most starts lead to one optimum.
-            runners = laps.run(coarse, runners, 1, less.problem)[:FINALISTS]
+            runners = laps.run(coarse, runners, GLANCE, less.problem)[:FINALISTS]
         ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
         ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
         reached = sorted(reached + [less.embedded(a, problem) for a in ended[:1]], key=lambda a: a.level)
@@ -124,6 +128,20 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
     if progress is not None:
         progress(len(starts), len(starts))
     return reached
+
+
+def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> Grid:
+    """A grid on which starts may compete, as far as a few of them tell.
+
+    A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its
+    own: all start anew on half the step.
+    """
+    while coarse.every < FINEST and len(starts) > PIONEERS:
+        reached = laps.run(coarse, laps.run(coarse, starts, GLANCE)[:PIONEERS], FIRST_LAP)
+        if reached and not coarse.matters(reached[0]):
+            break
+        coarse = coarse.finer
+    return coarse
 
 
 def without_vanished(problem: FreeProblem, start: Attempt, ended: Attempt) -> Attempt:

@@ -94,6 +94,18 @@ class Simpler:
     value: float = 0.0
     driven: bool = False
 
+    def without(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
+        """A point of the whole problem as a start of this one."""
+        orders = dict(zip(whole.orders, attempt.orders, strict=True))
+        values = dict(zip(whole.coefficients, attempt.coefficients, strict=True))
+        return replace(
+            attempt,
+            orders=[orders[n] for n in self.problem.orders],
+            coefficients=[values[n] for n in self.problem.coefficients],
+            outcome={},
+            alike=(),
+        )
+
     def embedded(self, attempt: Attempt, whole: FreeProblem) -> Attempt:
         """The same point of the whole problem; the order of a term that is 0 may be any, so it is half the highest."""
         known = dict(zip(self.problem.orders, attempt.orders, strict=True))

@@ -21,7 +21,7 @@ pub struct Fit {
     /// Weighted residuals (y − ŷ)/σ, records one after the other, outputs within.
     pub residuals: Vec<f64>,
     /// Their derivatives with respect to orders, coefficients (plain coordinates), then inputs, initial terms projected
-    /// out.
+    /// out; none where only residuals were asked for.
     pub jacobian: Vec<Vec<f64>>,
     /// Coefficients of the initial terms per record and equation.
     pub initial: Vec<Vec<Vec<f64>>>,

@@ -109,7 +109,7 @@ pub enum Status {
 /// How long to search.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Settings {
-    /// Most evaluations of the residuals.
+    /// Most evaluations of the residuals; 0 for those of the start without their derivatives.
     pub evaluations: usize,
     /// Share of the cost by which a Gauss–Newton step lowers it at a minimum, and so the square of the gradient's cosine.
     pub tolerance: f64,
@@ -130,7 +130,7 @@ pub struct Minimum<P, E> {
     pub evaluation: E,
     /// Half the sum of squared residuals.
     pub cost: f64,
-    /// Derivatives of the residuals there, one column a parameter.
+    /// Derivatives of the residuals there, one column a parameter; none where only residuals were asked for.
     pub jacobian: Vec<Vec<f64>>,
     /// Evaluations of residuals.
     pub evaluations: usize,
@@ -396,8 +396,12 @@ pub fn minimise<P: Problem>(
     let mut current = problem.evaluate(&point)?;
     point = problem.settled(&current, point);
     let mut least = cost(problem.residuals(&current));
-    let mut jacobian = slopes_at(&point, &current)?;
     let mut evaluations = 1;
+    if settings.evaluations == 0 {
+        let (jacobian, status) = (Vec::new(), Status::Exhausted);
+        return Ok(Minimum { point, evaluation: current, cost: least, jacobian, evaluations, status });
+    }
+    let mut jacobian = slopes_at(&point, &current)?;
     let mut trusted = problem.trusted(&point);
     let mut damping = FIRST_DAMPING;
     let mut status = Status::Exhausted;
