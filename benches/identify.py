@@ -1,0 +1,138 @@
+"""What a default `identify` costs in processor time, in real FFTs of 4096 points of the same machine, beside SciPy.
+
+``python benches/identify.py [five] [three] [long]``: theta22 of both laboratories' runs at 8 ms, five coefficients
+(promise P9), the same with three free orders, and one run of 50 000 samples with a free order (P10). Each in a process
+of its own; the rival of the first is SciPy's least_squares on the two numbers of the link, all that is linear projected
+out by run (less than the five numbers that both runs share), from twenty starts. ``--samples`` sets the last's length.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python"))
+
+import ftlm
+from arm_measured import arm_run
+from lsim_link import projected
+from results import append, heading
+
+FILTERED = ("theta12", "theta22")
+TERMS = [("theta21", 2), ("theta11", 2), ("theta12", 2)]
+#: The three linear terms are those of TERMS.
+WORDS = {
+    "five": "D^2 theta22 = a theta22 + d D theta22 + b D^2 theta21 + p D^2 theta11 + q D^2 theta12",
+    "three": "D^alpha theta22 = a theta22 + d D^mu theta22 + b D^gamma theta21 + p D^2 theta11 + q D^2 theta12",
+}
+STARTS = [(-(w**2), -2 * z * w) for w in (3.0, 8.0, 15.0, 25.0, 40.0) for z in (0.01, 0.05, 0.2, 0.5)]
+
+
+def spent(work: Callable[[], object]) -> float:
+    """Processor time of this process."""
+    begun = time.process_time()
+    work()
+    return time.process_time() - begun
+
+
+def transform() -> float:
+    """Processor time of one real FFT of 4096 points by NumPy, the least of five hundred times five."""
+    x = np.random.default_rng(0).normal(size=4096)
+    return min(spent(lambda: [np.fft.rfft(x) for _ in range(500)]) / 500 for _ in range(5))
+
+
+def peak() -> float:
+    """Most memory that this process held [MB]."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def told(name: str, seconds: float, before: float, fit: str) -> None:
+    """One row."""
+    print(f"| {name} | {seconds:.2f} | {seconds / transform() / 1000:.0f} | {peak():.0f} | {before:.0f} | {fit} |")
+
+
+def arm(name: str) -> None:
+    """Both runs of the arm."""
+    runs = [arm_run("psf"), arm_run("lqr")]
+    structure = ftlm.equation(WORDS[name], sensor_filter=ftlm.SensorFilter.low_pass(FILTERED))
+    before, found = peak(), []
+    seconds = spent(lambda: found.append(ftlm.identify(runs, structure, threads=1)))
+    numbers = ", ".join(f"{n} {v:.4g}" for n, v in found[0].joint_values.items())
+    told(name, seconds, before, f"{found[0].fit_percent['theta22']:.2f} %: {numbers}")
+
+
+def rival() -> None:
+    """SciPy on the problem of five numbers, from the best of its own starts: both runs, filter, initial motions."""
+    runs = [arm_run("psf"), arm_run("lqr")]
+    signals = [{n: np.asarray(r[n]) for n in r.outputs} for r in runs]
+    before, ends = peak(), []
+
+    def left(point: np.ndarray) -> np.ndarray:
+        pairs = zip(signals, runs, strict=True)
+        parts = [projected(s, r.step, "theta22", point, TERMS, filtered=FILTERED)[1] for s, r in pairs]
+        return np.concatenate(parts)
+
+    def scaled(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
+        return left(x * scale)
+
+    def all_starts() -> None:
+        for start in STARTS:
+            scale = np.abs(start)
+            end = least_squares(scaled, np.sign(start), method="lm", max_nfev=60, args=(scale,))
+            ends.append((float(end.cost), end.x * scale))
+
+    seconds = spent(all_starts)
+    cost, point = min(ends, key=lambda e: e[0])
+    told("five, SciPy (terms by run)", seconds, before, f"a {point[0]:.4g}, d {point[1]:.4g}, cost {cost:.4g}")
+
+
+def long(samples: int) -> None:
+    """One long run, three numbers, one of them an order."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.choice([-1.0, 1.0], size=samples // 50 + 1), 50)[:samples]
+    machine = ftlm.Model(ftlm.equation("D^1.4 y = -4 y + 2 u"))
+    drive = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": np.zeros(samples)})
+    y = machine.simulate(drive)["y"]
+    y = y + 0.01 * np.std(y) * rng.normal(size=samples)
+    run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y})
+    before, found = peak(), []
+    seconds = spent(lambda: found.append(ftlm.identify(run, ftlm.equation("D^alpha y = a y + b u"), threads=1)))
+    numbers = ", ".join(f"{n} {v:.6g}" for n, v in found[0].joint_values.items())
+    told(f"{samples} samples", seconds, before, f"{found[0].fit_percent['y']:.2f} %: {numbers}")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("cases", nargs="*", default=["five", "rival", "three", "long"])
+    parser.add_argument("--samples", type=int, default=50_000)
+    parser.add_argument("--alone", action="store_true", help="measure in this process")
+    parser.add_argument("--write", action="store_true", help="append to RESULTS.md")
+    asked = parser.parse_args()
+    if asked.alone:
+        for case in asked.cases:
+            {"long": lambda: long(asked.samples), "rival": rival}.get(case, lambda case=case: arm(case))()
+        return
+    lines = [heading(), "", "| case | processor s | thousand FFTs | peak MB | before | found |", "| --- " * 6 + "|"]
+    print("\n".join(lines), flush=True)
+    alone = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    for case in asked.cases:
+        command = [sys.executable, __file__, case, "--samples", str(asked.samples), "--alone"]
+        made = subprocess.run(command, capture_output=True, text=True, check=True, env=alone).stdout.strip()
+        print(made, flush=True)
+        lines.append(made)
+    if asked.write:
+        append(lines)
+
+
+if __name__ == "__main__":
+    main()
