@@ -553,7 +553,7 @@ fn systems_of_whole_order_by_running_sums_are_those_by_division() {
     let (m, step) = (1500, 0.01);
     let signals: Vec<Vec<f64>> = (0..3).map(|_| random.signal(m)).collect();
     let source = |equation, order, weight, k: usize| Source { equation, order, weight, series: &signals[k] };
-    let cases: Vec<(usize, usize, Vec<(usize, usize, usize, f64)>, Vec<Source>)> = vec![
+    let cases: Vec<(usize, usize, Vec<Integral>, Vec<Source>)> = vec![
         (1, 0, vec![], vec![source(0, 0, 2.0, 0)]),
         (1, 1, vec![(0, 0, 1, -3.0)], vec![source(0, 1, 2.0, 0), source(0, 0, 0.5, 1)]),
         (1, 2, vec![(0, 0, 1, -0.4), (0, 0, 2, -90.0)], vec![source(0, 2, 5.0, 0), source(0, 0, -1.0, 1)]),
