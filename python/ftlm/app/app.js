@@ -3,11 +3,14 @@
 const $ = (id) => document.getElementById(id);
 const said = $("said"), ask = $("ask"), files = $("files"), models = $("models");
 const most = Number(document.body.dataset.most);
-let known = { files: {}, models: {} };
 
+let silence = 0;
 function say(words, bad) {
   said.textContent = words;
   said.classList.toggle("bad", Boolean(bad));
+  clearTimeout(silence);
+  // What went wrong stays until something else is said.
+  if (!bad) silence = setTimeout(() => { said.textContent = ""; }, 6000);
 }
 
 async function request(path, options) {
@@ -302,7 +305,6 @@ async function look() {
     }
   }
   if (changed) { arrange(); await compare(); }
-  known = state;
   return Object.values(state.models).some((each) => each.busy);
 }
 

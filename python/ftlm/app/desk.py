@@ -16,14 +16,18 @@ from pathlib import Path
 from typing import Any
 
 from ftlm.app.child import Task, TaskError
-from ftlm.app.recipe import Reading, Recipe, check_way
+from ftlm.app.recipe import Reading, Recipe, checked_structures
+from ftlm.base.checks import nearest, real_number
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.progress import left_in_words
+from ftlm.data.structures import Structure
 
 #: Bytes of one file and of all, files, models kept, models that wait, and seconds that opening a file may take.
 MOST_BYTES, MOST_BYTES_IN_ALL = 256 << 20, 1 << 30
 MOST_FILES, MOST_MODELS, MOST_WAITING = 20, 40, 8
 SECONDS_TO_OPEN = 120.0
+#: Files that are opened at a time.
+MOST_OPENING = 2
 #: Bytes of a file's name.
 MOST_LETTERS = 200
 #: What one system refuses in names; the others take it.
@@ -125,6 +129,7 @@ class Desk:
         self.files: dict[str, File] = {}
         self.models: dict[str, Model] = {}
         self._turn = asyncio.Lock()
+        self._openings = asyncio.Semaphore(MOST_OPENING)
         self._jobs: set[asyncio.Task[None]] = set()
         self._count = 0
 
@@ -138,13 +143,13 @@ class Desk:
             self._check_size(name, size)
         return self._free_name(safe_name(name))
 
-    def _check_size(self, name: str, size: int) -> None:
+    def _check_size(self, name: str, size: int, own: File | None = None) -> None:
         if size > MOST_BYTES:
             raise DataError(
                 f"{safe_name(name)!r} is larger than {MOST_BYTES >> 20} MB, the most that the page takes; load it in "
                 "Python, or take fewer rows"
             )
-        if size + sum(f.size for f in self.files.values()) > MOST_BYTES_IN_ALL:
+        if size + sum(f.size for f in self.files.values() if f is not own) > MOST_BYTES_IN_ALL:
             raise DataError(f"the files together are larger than {MOST_BYTES_IN_ALL >> 20} MB; remove one")
 
     def _free_name(self, name: str) -> str:
@@ -173,7 +178,8 @@ class Desk:
             with open(path, "xb") as stream:
                 async for chunk in chunks:
                     written += len(chunk)
-                    self._check_size(name, written)
+                    self._check_size(name, written, file)
+                    file.size = written
                     stream.write(chunk)
         except OSError as error:
             self.remove_file(file.key)
@@ -181,7 +187,6 @@ class Desk:
         except BaseException:
             self.remove_file(file.key)
             raise
-        file.size = written
         await self.open(file)
         return file
 
@@ -192,7 +197,8 @@ class Desk:
         asked = {"do": "open", "file": file.name, "options": file.asked}
         file.task = task = Task(asked, self.folder, lambda _: None)
         try:
-            told, error = await task.answer(SECONDS_TO_OPEN), ""
+            async with self._openings:
+                told, error = await task.answer(SECONDS_TO_OPEN), ""
         except TaskError as failed:
             told, error = None, self.without_paths(str(failed))
         if file.task is not task:
@@ -228,9 +234,7 @@ class Desk:
             A file that is not there or no run yet; words that are not known; an equation that is none.
         """
         other = str(told.get("validation") or "")
-        share = told.get("share", 0)
-        if isinstance(share, bool) or not isinstance(share, (int, float)):
-            raise ModelError("share is no number; keep from 0 to 0.8 of the run for validation")
+        share = real_number("share", told.get("share", 0))
         texts = told.get("structure") or []
         texts = [texts] if isinstance(texts, str) else texts
         if not isinstance(texts, list) or len(texts) > 20 or not all(isinstance(t, str) for t in texts):
@@ -239,11 +243,13 @@ class Desk:
             raise ModelError("the equation has more than 4000 letters; write a shorter one")
         recipe = Recipe(
             self._run(str(told.get("estimation") or "")), self._run(other) if other else None,
-            0.0 if other else float(share), tuple(t.strip() for t in texts if t.strip()),
+            0.0 if other else share, tuple(t.strip() for t in texts if t.strip()),
             *(str(told.get(name) or default) for name, default in (("way", "fit"), ("method", ""), ("offset", ""),
                                                                     ("loss", ""))),
         )  # fmt: skip
-        check_way(recipe)
+        for structure in checked_structures(recipe):
+            for reading in filter(None, (recipe.estimation, recipe.validation)):
+                _check_signals(structure, reading)
         return recipe
 
     def _run(self, key: str) -> Reading:
@@ -332,6 +338,17 @@ class Desk:
         if self._jobs:
             await asyncio.wait(self._jobs, timeout=2.0)
         shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def _check_signals(structure: Structure, reading: Reading) -> None:
+    """Refuse a signal that a run does not have, before a process is started for it."""
+    there = [name for role in ("outputs", "inputs") for name in reading.options.get(role, {})]
+    for name in structure.signals:
+        if name not in there:
+            raise ModelError(
+                f"{reading.file!r} has no signal {name!r}{nearest(name, there)}; it has {', '.join(there)}, as its "
+                "columns are named above"
+            )
 
 
 def _names(recipe: Recipe) -> set[str]:

@@ -38,7 +38,7 @@ def asked_of(said: Mapping[str, Any]) -> dict[str, Any]:
     if ends != [None, None]:
         asked["slice"] = ends
     layout: dict[str, Any] = {name: _text(said, name) for name in WORDS if _text(said, name)}
-    layout |= {name: int(number(name, _text(said, name))) for name in NUMBERS if _text(said, name)}
+    layout |= {name: _whole(name, _text(said, name)) for name in NUMBERS if _text(said, name)}
     if layout:
         asked["layout"] = layout
     return asked | _roles(said.get("columns"))
@@ -78,6 +78,13 @@ def number(name: str, text: str) -> float:
         return float(text)
     except ValueError:
         raise DataError(f"{name}: {text[:40]!r} is no number; write one such as 0.5") from None
+
+
+def _whole(name: str, text: str) -> int:
+    """A whole number of a field."""
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise DataError(f"{name}: {text[:40]!r} is no number of lines; write one such as 2")
+    return int(text)
 
 
 def _text(said: Mapping[str, Any], name: str) -> str:

@@ -10,7 +10,10 @@ from typing import Any, Protocol
 
 from ftlm._core import __version__
 from ftlm.arm.link import flexible_link
+from ftlm.base.checks import check_threads
 from ftlm.base.errors import ModelError
+from ftlm.base.pace import by_output_error, expected
+from ftlm.base.progress import WONDER, left_in_words
 from ftlm.data.language import equation
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
@@ -145,7 +148,7 @@ class Recipe:
         wanted = self.structures()
         told.phase("reading")
         own, other, cut = self._runs()
-        told.phase("choosing a structure" if self.way != "fit" else "fitting")
+        told.phase("choosing a structure" if self.way != "fit" else f"fitting{self._takes(own, wanted[0])}")
         choice = None
         if self.way == "fit":
             result = identify(own, wanted[0], progress=told, **self.settings())
@@ -155,6 +158,14 @@ class Recipe:
             result = choice.best
         told.phase("validating")
         return Made(result, own, other, None if other is None else result.validate(other), choice, self._script(cut))
+
+    def _takes(self, run: Run, structure: Structure) -> str:
+        """About how long a fit takes, where that is long enough to wonder."""
+        numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
+        seconds = expected(by_output_error(run.length * len(structure.outputs), numbers), check_threads(None))
+        if seconds < WONDER or self.method not in ("", METHODS[0]):
+            return ""
+        return f", {left_in_words(seconds).removesuffix(' left')} in all"
 
     def _runs(self) -> tuple[Run, Run | None, float | None]:
         """The run that is fitted to, the one that is not, and where one was cut from the other [s]."""
@@ -211,8 +222,8 @@ def structure_of(text: str) -> Structure:
     return NAMED[text]() if text in NAMED else equation(text)
 
 
-def check_way(recipe: Recipe) -> None:
-    """Refuse what does not belong together, before any work."""
+def checked_structures(recipe: Recipe) -> list[Structure]:
+    """The structures of a recipe; what does not belong together is refused, before any work."""
     for name, value, known in (
         ("way", recipe.way, WAYS), ("method", recipe.method, ("", *METHODS)),
         ("offset", recipe.offset, ("", *OFFSETS)), ("loss", recipe.loss, ("", *LOSSES)),
@@ -230,7 +241,7 @@ def check_way(recipe: Recipe) -> None:
         )
     if not 0.0 <= recipe.share <= 0.8:
         raise ModelError(f"share = {recipe.share!r} of the run for validation; keep from 0 to 0.8")
-    recipe.structures()
+    return recipe.structures()
 
 
 def cut_at(rows: int, step: float, share: float) -> float:

@@ -109,7 +109,7 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
     )  # fmt: skip
     server = uvicorn.Server(config)
     for name in ("SIGTERM", "SIGHUP"):
-        if hasattr(signal, name):
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:
             signal.signal(getattr(signal, name), lambda *_: setattr(server, "should_exit", True))
     address = f"http://{hosts[0]}/{token}/"
     try:
@@ -118,9 +118,8 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
         print(f"ftlm app: {address}\nCtrl-C ends it. Who knows this address can use it: do not pass it on.", flush=True)
         opener = None
         if browser:
-            opener = asyncio.get_running_loop().run_in_executor(
-                None, webbrowser.open, f"http://{hosts[0]}/open/{key}"
-            )
+            first = f"http://{hosts[0]}/open/{key}"
+            opener = asyncio.get_running_loop().run_in_executor(None, webbrowser.open, first)
         await server.serve(sockets=[sock])
         del opener
     finally:

@@ -135,7 +135,11 @@ class Door:
         except RefusedError as refused:
             answer = Answer(refused.status, json.dumps({"error": str(refused)}))
         except FtlmError as error:
-            answer = Answer(400, json.dumps({"error": self._desk.without_paths(str(error))}))
+            words = view.page_words(self._desk.without_paths(str(error)))
+            answer = Answer(400, json.dumps({"error": words}))
+        except Exception as error:
+            # The page must be told; a traceback would name folders of this machine.
+            answer = Answer(500, json.dumps({"error": f"a fault in ftlm itself ({type(error).__name__})"}))
         body = answer.body.encode("utf-8", "replace") if isinstance(answer.body, str) else answer.body
         headers = {**ALWAYS, "content-type": answer.kind, "content-length": str(len(body)), **(answer.more or {})}
         if answer.status in (403, 404, 413, 415):
@@ -167,7 +171,10 @@ class Door:
             self._first(path[1])
         if not secrets.compare_digest(path[0].encode("utf-8", "replace"), self._token.encode()):
             raise RefusedError(404, "there is nothing here; use the address that ftlm app printed")
-        query = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=10, errors="replace")
+        try:
+            query = parse_qs(scope["query_string"].decode("latin-1"), max_num_fields=10, errors="replace")
+        except ValueError:
+            raise RefusedError(400, "the address has too many fields") from None
         return Request(method, path[1:], {k: v[0] for k, v in query.items()}, headers, receive)
 
     def _first(self, key: str) -> None:

@@ -74,7 +74,7 @@ def main() -> None:
         reports.send(error=str(error))
     except MemoryError:
         reports.send(error="it needs more memory than there is; take a shorter file, or a coarser step")
-    except Exception as error:  # noqa: BLE001 — the page must be told, whatever it was
+    except Exception as error:
         reports.send(error=f"a fault in ftlm itself ({type(error).__name__}: {error}); please report it")
     else:
         reports.send(answer=answer)

@@ -42,8 +42,8 @@ def version(
 
 
 for _command in (
-    demo, page, record, open_, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce,
-    orders, plot, export, doctor,
+    demo, page, record, open_, inspect, identify, select, search, resume, status, compare, resid, simulate, report,
+    reproduce, orders, plot, export, doctor,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"), cls=Command)(_command)
 
