@@ -227,16 +227,17 @@ function wanted() {
   };
 }
 
+function wrong(words) {
+  $("structure-error").textContent = words;
+  if (words) $("structure").setAttribute("aria-invalid", "true"); else $("structure").removeAttribute("aria-invalid");
+}
+
 let pause = 0;
 async function check() {
-  const error = $("structure-error");
   try {
-    await send("check", wanted());
-    error.textContent = "";
-    $("structure").removeAttribute("aria-invalid");
+    wrong(JSON.parse(await send("check", wanted())).error);
   } catch (refused) {
-    error.textContent = refused.message;
-    $("structure").setAttribute("aria-invalid", "true");
+    say(refused.message, true);
   }
 }
 
@@ -244,22 +245,21 @@ $("structure").addEventListener("input", () => { mark(); clearTimeout(pause); pa
 ask.addEventListener("change", (event) => {
   if (event.target.id === "estimation") arrange();
   ways();
-  if (event.target.id !== "structure") $("structure-error").textContent = "";
+  if (event.target.id !== "structure") wrong("");
 });
 ask.addEventListener("submit", async (event) => {
   event.preventDefault();
   clearTimeout(pause);
   try {
     const part = put(models, await send("models", wanted()), true);
-    $("structure-error").textContent = "";
-    $("structure").removeAttribute("aria-invalid");
+    wrong("");
     arrange();
     say(`Model ${part.querySelector("h3").textContent} is on its way.`);
     part.scrollIntoView({ block: "nearest", behavior: "smooth" });
     soon();
   } catch (error) {
     if ($("equation-field").hidden) say(error.message, true);
-    else { $("structure-error").textContent = error.message; $("structure").setAttribute("aria-invalid", "true"); }
+    else wrong(error.message);
   }
 });
 

@@ -335,9 +335,11 @@ class Desk:
                 file.task.stop()
         for key in self.models:
             self.stop(key)
-        if self._jobs:
-            await asyncio.wait(self._jobs, timeout=2.0)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        try:
+            if self._jobs:
+                await asyncio.wait(self._jobs, timeout=2.0)
+        finally:
+            shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def _check_signals(structure: Structure, reading: Reading) -> None:

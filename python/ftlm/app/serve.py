@@ -123,6 +123,9 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
         await server.serve(sockets=[sock])
         del opener
     finally:
+        # Ctrl-C cancels what is awaited next, which must not be the end of the work.
+        with contextlib.suppress(asyncio.CancelledError):
+            await asyncio.sleep(0)
         await desk.close()
 
 

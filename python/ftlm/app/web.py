@@ -207,8 +207,7 @@ class Door:
                 model = self._desk.start(self._desk.recipe(await request.words()))
                 return Answer(200, view.model(model), HTML)
             case "POST", ["check"]:
-                self._desk.recipe(await request.words())
-                return Answer(200, "{}")
+                return Answer(200, json.dumps({"error": self._wrong(await request.words())}))
             case "GET", ["comparison"]:
                 return Answer(200, view.comparison(self._desk), HTML)
             case _, ["models", key, *what]:
@@ -216,6 +215,14 @@ class Door:
         known = request.path in ([""], ["app.js"], ["app.css"], ["state"], ["files"], ["models"], ["check"],
                                  ["comparison"])  # fmt: skip
         raise RefusedError(405 if known else 404, "there is nothing here" if not known else "not in this way")
+
+    def _wrong(self, wanted: Mapping[str, Any]) -> str:
+        """What is wrong with what is asked for; nothing where it could be made."""
+        try:
+            self._desk.recipe(wanted)
+        except FtlmError as error:
+            return view.page_words(self._desk.without_paths(str(error)))
+        return ""
 
     async def _upload(self, request: Request) -> Answer:
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/octet-stream":
