@@ -374,21 +374,43 @@ def test_a_file_is_told_as_ftlm_open_tells_it(used, content, tmp_path):
     assert [len(ftlm.equation(o["structure"]).outputs) for o in file.told["offers"]] == [1] * 5
 
 
+def scripted(page, key, content, folder):
+    """What the script of a model prints; its files are those of the page to the last bit."""
+    status, headers, script = page.own("GET", f"models/{key}/script")
+    assert status == 200
+    assert re.fullmatch(r'attachment; filename="lag-\d-script.py"', headers["content-disposition"])
+    (folder / "lag.csv").write_bytes(content)
+    (folder / "script.py").write_text(script, encoding="utf-8")
+    ran = subprocess.run([sys.executable, "script.py"], cwd=folder, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert page.own("GET", f"models/{key}/model")[2] == (folder / "lag-model.json").read_text(encoding="utf-8")
+    assert page.own("GET", f"models/{key}/report")[2] == (folder / "lag-report.html").read_text(encoding="utf-8")
+    return ran.stdout
+
+
 def test_a_model_is_that_of_the_same_lines_of_python(used, content, tmp_path):
     (key,) = used.desk.models
-    status, headers, script = used.own("GET", f"models/{key}/script")
-    assert status == 200
-    assert headers["content-disposition"] == 'attachment; filename="lag-1-script.py"'
-    (tmp_path / "lag.csv").write_bytes(content)
-    (tmp_path / "script.py").write_text(script, encoding="utf-8")
-    ran = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert ran.returncode == 0, ran.stderr
-    # The words of the page are those of the script, and the files are the same to the last bit.
-    assert ran.stdout.splitlines()[0].startswith(used.desk.models[key].told["verdict"]["level"].upper())
-    assert used.own("GET", f"models/{key}/model")[2] == (tmp_path / "lag-model.json").read_text(encoding="utf-8")
-    assert used.own("GET", f"models/{key}/report")[2] == (tmp_path / "lag-report.html").read_text(encoding="utf-8")
+    printed = scripted(used, key, content, tmp_path)
+    assert printed.splitlines()[0].startswith(used.desk.models[key].told["verdict"]["level"].upper())
     model = ftlm.load_model(tmp_path / "lag-model.json")
     assert model.coefficients["a0"] == pytest.approx(-2, abs=0.1)
+
+
+def test_a_choice_is_that_of_the_same_lines_and_knows_runs_in_motion(page, content, tmp_path):
+    """What is chosen on a run from rest is validated on the part behind it, which starts in motion."""
+    page.upload("lag.csv", content)
+    (key,) = page.desk.files
+    wanted = {"estimation": key, "share": 0.25, "way": "offered", "structure": ["D y = a0 y + b0 u", "D y = b0 u"]}
+    status, _, text = page.own("POST", "models", wanted)
+    assert status == 200, text
+    page.loop(settled(page.desk))
+    (model,) = page.desk.models.values()
+    assert model.state == "made", model.error
+    assert page.desk.files[key].told["length"] == 300
+    assert model.told["fits"][0]["validation"] > 95
+    assert "Candidates" in model.told["choice"]["table"]
+    printed = scripted(page, model.key, content, tmp_path)
+    assert printed.splitlines()[0] == model.told["choice"]["reason"]
 
 
 def test_a_report_opens_where_it_reaches_nothing(used):
@@ -663,6 +685,22 @@ def test_a_process_that_works_ends_and_the_page_goes_on(page, how):
 
     page.loop(course())
     assert page.own("GET", "state")[0] == 200
+
+
+@pytest.mark.parametrize(
+    ("words", "shown"),
+    [
+        ("name it with time=COLUMN", "name it with the role “time”"),
+        ("put it on one with resample=STEP", "put it on one with the field “Put on the step”"),
+        ("resample=0.01 leaves 2 rows", "the field “Put on the step” 0.01 leaves 2 rows"),
+        ("hold them with missing='hold'", "hold them with the field “Gaps” hold"),
+        ("say which with layout=dict(sheet=NAME)", "say which with the field “Sheet”"),
+        ("name them with inputs={name: column} and outputs={name: column}", "name them with the roles below"),
+        ("give it (commands: -u NAME=COLUMN)", "give it"),
+    ],
+)
+def test_errors_speak_of_what_the_page_has(words, shown):
+    assert view.page_words(words) == shown
 
 
 def test_progress_is_told_in_shares_and_words():

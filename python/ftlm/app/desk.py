@@ -366,7 +366,10 @@ def _note(model: Model, said: Mapping[str, Any]) -> None:
         share = min(max(float(said["done"]) / float(said["total"]), 0.0), 1.0)
         passed = time.monotonic() - model.begun_phase
         model.share = share
-        model.left = left_in_words(passed * (1.0 - share) / share) if share > 0.02 and passed > 1.0 else ""
+        if share > 0.02 and passed > 1.0:
+            # What is measured takes the place of what was expected.
+            model.phase = model.phase.partition(", about")[0]
+            model.left = left_in_words(passed * (1.0 - share) / share)
 
 
 def safe_name(name: str) -> str:

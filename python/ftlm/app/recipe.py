@@ -155,7 +155,9 @@ class Recipe:
         else:
             candidates = "auto" if self.way == "auto" else wanted[0] if self.way == "inside" else wanted
             choice = select(own, candidates, progress=told)
-            result = choice.best
+            # Chosen from rest, where its run starts so; another run may not.
+            told.phase("fitting what was chosen")
+            result = identify(own, choice.winner.structure, progress=told)
         told.phase("validating")
         return Made(result, own, other, None if other is None else result.validate(other), choice, self._script(cut))
 
@@ -197,7 +199,8 @@ class Recipe:
                 lines += ["candidates = [", *(f"    {written(text)}," for text in self.structure), "]"]
             else:
                 lines.append(f"candidates = {quoted('auto') if self.way == 'auto' else written(self.structure[0])}")
-            lines += ["choice = ftlm.select(run, candidates)", "print(choice.reason)", "result = choice.best"]
+            lines += ["choice = ftlm.select(run, candidates)", "print(choice.reason)"]
+            lines.append("result = ftlm.identify(run, choice.winner.structure)")
         tried = cut is not None or self.validation is not None
         lines.append("print(result.summary(result.validate(other)))" if tried else "print(result.summary())")
         lines.append(f"result.model.save({quoted(stem + '-model.json')})")

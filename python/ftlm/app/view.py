@@ -20,13 +20,27 @@ from ftlm.paint.lines import chart_css
 from ftlm.paint.text import number
 
 #: Ways of Python to say something, and those of the page.
-_WORDS = (
+_FIELDS = {
+    "step": "Step", "resample": "Put on the step", "time_unit": "Unit of time", "missing": "Gaps",
+    "separator": "Between cells", "decimal": "Decimals", "skip": "Lines above the table", "header": "Lines of header",
+    "dates": "Dates", "encoding": "Encoding", "sheet": "Sheet", "slice": "From” and “To",
+}  # fmt: skip
+#: An argument of Python with its value, or with a word in capitals that stands for one.
+_ARGUMENT = re.compile(
+    r"\b(resample|time_unit|missing|step|time|slice)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b)?|layout=dict\((\w+)=[^)]*\)"
+)
+_PLAIN = (
     (re.compile(r" \(commands: [^)]*\)"), ""),
     (re.compile(r"inputs=\{name: column\} and outputs=\{name: column\}"), "the roles below"),
-    (re.compile(r"layout=dict\((\w+)=[^)]*\)"), r"the field “\1”"),
-    (re.compile(r"\b(resample|time_unit|missing|step|time)=(?:'([\w-]+)'|[A-Z]+\b)?"), r"the field “\1”"),
 )
 _ORDER = {"trust": 0, "with care": 1, "do not use": 2}
+
+
+def _field(found: re.Match[str]) -> str:
+    """What the page calls an argument, with its value."""
+    name, value = found[1] or found[4], found[2] or found[3]
+    shown = "the role “time”" if name == "time" else f"the field “{_FIELDS.get(name, name)}”"
+    return f"{shown} {value}" if value else shown
 
 
 def _read(name: str) -> str:
@@ -60,9 +74,9 @@ def style() -> str:
 
 def page_words(text: str) -> str:
     """Words of ftlm's errors, with what the page has in place of Python's arguments."""
-    for pattern, words in _WORDS:
+    for pattern, words in _PLAIN:
         text = pattern.sub(words, text)
-    return text
+    return _ARGUMENT.sub(_field, text)
 
 
 def page(desk: Desk) -> str:
