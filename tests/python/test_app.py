@@ -651,6 +651,19 @@ def test_models_wait_for_each_other_and_stop_in_any_state(page, monkeypatch):
     page.loop(course())
 
 
+def test_a_file_that_takes_long_is_on_the_page_and_can_be_removed(page, monkeypatch):
+    monkeypatch.setattr(Task, "answer", asleep)
+    monkeypatch.setattr(desks, "PATIENCE", 0.01)
+    status, _, text = page.upload("long.csv", b"t,u,y")
+    assert status == 200
+    assert "Reading" in text
+    (file,) = page.desk.files.values()
+    task = file.task
+    assert page.own("DELETE", f"files/{file.key}")[0] == 200
+    assert task._ended
+    assert list(page.desk.folder.iterdir()) == []
+
+
 def alive(pid):
     try:
         os.kill(pid, 0)

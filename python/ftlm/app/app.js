@@ -65,7 +65,7 @@ async function upload(list) {
         method: "POST", headers: { "content-type": "application/octet-stream" }, body: file,
       });
       const part = put(files, html);
-      say(`“${file.name}” is read.`);
+      if (part.dataset.version !== "0") say(`“${file.name}” is read.`);
       part.scrollIntoView({ block: "nearest" });
     } catch (error) {
       say(error.message, true);
@@ -300,7 +300,7 @@ async function look() {
   for (const [key, version] of Object.entries(state.files)) {
     const card = document.getElementById(`file-${key}`);
     if (version && (!card || Number(card.dataset.version) < version) && !files.querySelector("[aria-busy]")) {
-      put(files, await request(`files/${key}`));
+      say(`“${put(files, await request(`files/${key}`)).querySelector("h3").textContent}” is read.`);
       changed = true;
     }
   }

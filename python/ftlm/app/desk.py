@@ -10,7 +10,7 @@ import secrets
 import shutil
 import tempfile
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Coroutine, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,9 @@ from ftlm.data.structures import Structure
 #: Bytes of one file and of all, files, models kept, models that wait, and seconds that opening a file may take.
 MOST_BYTES, MOST_BYTES_IN_ALL = 256 << 20, 1 << 30
 MOST_FILES, MOST_MODELS, MOST_WAITING = 20, 40, 8
-SECONDS_TO_OPEN = 120.0
+SECONDS_TO_OPEN = 600.0
+#: Seconds after which a page is told that a file is still being read.
+PATIENCE = 2.0
 #: Files that are opened at a time.
 MOST_OPENING = 2
 #: Bytes of a file's name.
@@ -162,7 +164,7 @@ class Desk:
         return free
 
     async def take(self, name: str, size: int | None, chunks: AsyncIterator[bytes]) -> File:
-        """Keep a file that comes in pieces, and open it.
+        """Keep a file that comes in pieces, and begin to open it; most are open when this returns.
 
         Raises
         ------
@@ -187,8 +189,15 @@ class Desk:
         except BaseException:
             self.remove_file(file.key)
             raise
-        await self.open(file)
+        await asyncio.wait({self._begun(self.open(file))}, timeout=PATIENCE)
         return file
+
+    def _begun(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        """Begin work that goes on by itself, and keep hold of it."""
+        job = asyncio.create_task(work)
+        self._jobs.add(job)
+        job.add_done_callback(self._jobs.discard)
+        return job
 
     async def open(self, file: File) -> None:
         """Say what a file is, by what is asked of it; an earlier reading of it that goes on is ended."""
@@ -275,9 +284,7 @@ class Desk:
         self._count += 1
         model = Model(secrets.token_hex(8), self._count, recipe)
         self.models[model.key] = model
-        job = asyncio.create_task(self._make(model))
-        self._jobs.add(job)
-        job.add_done_callback(self._jobs.discard)
+        self._begun(self._make(model))
         return model
 
     async def _make(self, model: Model) -> None:

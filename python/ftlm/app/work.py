@@ -122,6 +122,7 @@ def _seen(found: OpenedFile) -> dict[str, Any]:
     """The run of a file: its picture, and what to know before a model is made of it."""
     if found.problem:
         return {"figures": [], "advice": [], "length": 0}
+    # The rows that were shown are those that are fitted: read once more, everything said.
     run = found.load()
     return {"figures": pictures(run), "advice": [a.sentence for a in run.advice()], "length": run.length}
 
