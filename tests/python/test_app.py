@@ -726,6 +726,12 @@ def test_progress_is_told_in_shares_and_words():
     assert re.fullmatch(r"about \d+ s left", model.left)
     desks._note(model, {"done": 5, "total": 0})
     assert model.share == 0.5
+    # Candidates are counted: more of them come up, and no share may go back.
+    desks._note(model, {"phase": "choosing a structure"})
+    desks._note(model, {"done": 9, "total": 10})
+    desks._note(model, {"done": 10, "total": 20})
+    assert model.share is None
+    assert model.left == "10 of 20 candidates known so far are fitted"
 
 
 # ----------------------------------------------------------------------------------------------------- the command

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ftlm.app.child import Task, TaskError
-from ftlm.app.recipe import Reading, Recipe, checked_structures
+from ftlm.app.recipe import CHOOSING, Reading, Recipe, checked_structures
 from ftlm.base.checks import nearest, real_number
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.progress import left_in_words
@@ -369,6 +369,9 @@ def _note(model: Model, said: Mapping[str, Any]) -> None:
     if "phase" in said:
         model.phase, model.share, model.left = str(said["phase"]), None, ""
         model.begun_phase = time.monotonic()
+    elif said.get("total") and model.phase.startswith(CHOOSING):
+        # Candidates come up as others are fitted: a share of those known so far would go back.
+        model.left = f"{said['done']} of {said['total']} candidates known so far are fitted"
     elif said.get("total"):
         share = min(max(float(said["done"]) / float(said["total"]), 0.0), 1.0)
         passed = time.monotonic() - model.begun_phase

@@ -34,6 +34,8 @@ WAYS = ("fit", "inside", "offered", "auto")
 METHODS = ("output-error", "instrumental-variables", "multi-innovation", "least-squares")
 OFFSETS = ("none", "constant", "ramp", "auto")
 LOSSES = ("squares", "huber")
+#: What is done while structures are tried.
+CHOOSING = "choosing a structure"
 #: A line of a script, as long as those of the house.
 LINE = 100
 
@@ -148,7 +150,7 @@ class Recipe:
         wanted = self.structures()
         told.phase("reading")
         own, other, cut = self._runs()
-        told.phase("choosing a structure" if self.way != "fit" else f"fitting{self._takes(own, wanted[0])}")
+        told.phase(CHOOSING if self.way != "fit" else f"fitting{self._takes(own, wanted[0])}")
         choice = None
         if self.way == "fit":
             result = identify(own, wanted[0], progress=told, **self.settings())
