@@ -9,13 +9,13 @@ import re
 #: From the ground up; folders on one storey do not import each other. What is public lies on top of all.
 STOREYS = (
     ("base",), ("paint",), ("data",), ("files", "solve"), ("judge", "fit"), ("model",), ("search", "arm"),
-    ("identification", "rig"), ("selection", "paper"), ("report",), ("cli",), (".",),
+    ("identification", "rig"), ("selection", "paper"), ("report", "app"), ("cli",), (".",),
 )  # fmt: skip
 LEVEL = {folder: level for level, folders in enumerate(STOREYS) for folder in folders}
 #: What a function may import for itself: what need not be installed, is slow to start, or is there on one system only.
 LATE = {
     "control", "fcntl", "h5py", "jinja2", "matplotlib", "msvcrt", "numpy", "pandas", "polars", "pyarrow", "pygad",
-    "python_calamine", "quanser", "resource", "rich", "scipy", "typer", "xarray",
+    "python_calamine", "quanser", "resource", "rich", "scipy", "typer", "uvicorn", "xarray",
 }  # fmt: skip
 LONGEST = 600
 FACE = 12

@@ -14,6 +14,7 @@ from ftlm.cli.command import Command
 from ftlm.cli.identify import identify, resume, search, status
 from ftlm.cli.inspect import doctor, inspect, open_
 from ftlm.cli.judge import compare, export, plot, report, resid, simulate
+from ftlm.cli.page import app as page
 from ftlm.cli.paper import demo, orders, reproduce
 from ftlm.cli.record import record
 from ftlm.cli.select import select
@@ -41,8 +42,8 @@ def version(
 
 
 for _command in (
-    demo, record, open_, inspect, identify, select, search, resume, status, compare, resid, simulate, report, reproduce,
-    orders, plot, export, doctor,
+    demo, page, record, open_, inspect, identify, select, search, resume, status, compare, resid, simulate, report,
+    reproduce, orders, plot, export, doctor,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_"), cls=Command)(_command)
 

@@ -1,0 +1,141 @@
+"""The page and its parts as HTML: everything that a file or a person says is escaped by the templates."""
+
+from __future__ import annotations
+
+import json
+import re
+from functools import cache
+from importlib import resources
+from typing import Any
+
+from jinja2 import Environment, FunctionLoader, StrictUndefined
+from markupsafe import Markup
+
+from ftlm._core import __version__
+from ftlm.app.desk import MADE, MOST_BYTES, RUNNING, Desk, File, Model
+from ftlm.app.recipe import LOSSES, METHODS, OFFSETS
+from ftlm.data.units import TIME_UNITS, UNITS
+from ftlm.files.layout import DATES, DECIMALS, SEPARATORS
+from ftlm.paint.lines import chart_css
+from ftlm.paint.text import number
+
+#: Ways of Python to say something, and those of the page.
+_FIELDS = {
+    "step": "Step", "resample": "Put on the step", "time_unit": "Unit of time", "missing": "Gaps",
+    "separator": "Between cells", "decimal": "Decimals", "skip": "Lines above the table", "header": "Lines of header",
+    "dates": "Dates", "encoding": "Encoding", "sheet": "Sheet", "slice": "From” and “To",
+}  # fmt: skip
+#: An argument of Python with its value, or with a word in capitals that stands for one.
+_ARGUMENT = re.compile(
+    r"\b(resample|time_unit|missing|step|time|slice)=(?:'([\w-]+)'|(\d[\w.+-]*\w|\d)|[A-Z]+\b)?|layout=dict\((\w+)=[^)]*\)"
+)
+_PLAIN = (
+    (re.compile(r" \(commands: [^)]*\)"), ""),
+    (re.compile(r"inputs=\{name: column\} and outputs=\{name: column\}"), "the roles below"),
+)
+_ORDER = {"trust": 0, "with care": 1, "do not use": 2}
+
+
+def _field(found: re.Match[str]) -> str:
+    """What the page calls an argument, with its value."""
+    name, value = found[1] or found[4], found[2] or found[3]
+    shown = "the role “time”" if name == "time" else f"the field “{_FIELDS.get(name, name)}”"
+    return f"{shown} {value}" if value else shown
+
+
+def _read(name: str) -> str:
+    return resources.files("ftlm.app").joinpath(name).read_text("utf-8")
+
+
+@cache
+def _templates() -> Environment:
+    environment = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, loader=FunctionLoader(_read)
+    )
+    environment.filters |= {"number": number, "page_words": page_words, "safe_markup": Markup}
+    return environment
+
+
+def _rendered(template: str, **told: Any) -> str:
+    return _templates().get_template(template).render(**told)
+
+
+@cache
+def script() -> str:
+    """The page's script."""
+    return _read("app.js")
+
+
+@cache
+def style() -> str:
+    """The page's style, with the colours of charts."""
+    return f"{_read('app.css')}\n{chart_css()}"
+
+
+def page_words(text: str) -> str:
+    """Words of ftlm's errors, with what the page has in place of Python's arguments."""
+    for pattern, words in _PLAIN:
+        text = pattern.sub(words, text)
+    return _ARGUMENT.sub(_field, text)
+
+
+def page(desk: Desk) -> str:
+    """The whole page as it is now."""
+    parts = {
+        "files": Markup("").join(Markup(file(f)) for f in desk.files.values()),  # escaped by its template
+        "models": Markup("").join(Markup(model(m)) for m in reversed(desk.models.values())),
+        "comparison": Markup(comparison(desk)),
+    }
+    return _rendered(
+        "page.html.j2", **parts, version=__version__, most=MOST_BYTES, units=[u for u in UNITS if u], methods=METHODS,
+        offsets=OFFSETS, losses=LOSSES,
+    )  # fmt: skip
+
+
+def file(shown: File) -> str:
+    """A file with its columns and what was assumed of it."""
+    told = shown.told
+    chosen = {} if told is None else told["options"]
+    facts = {
+        "name": shown.name, "run": shown.is_run, "offers": [] if told is None else told["offers"],
+        "outputs": list(chosen.get("outputs", {})),
+    }  # fmt: skip
+    return _rendered(
+        "file.html.j2", file=shown, told=told, chosen=chosen, layout=chosen.get("layout", {}), facts=json.dumps(facts),
+        separators=list(SEPARATORS), decimals=list(DECIMALS), dates=DATES, time_units=list(TIME_UNITS),
+        asked=shown.asked,
+    )  # fmt: skip
+
+
+def model(shown: Model) -> str:
+    """A model, in whatever state it is."""
+    return _rendered("model.html.j2", model=shown, told=shown.told, recipe=shown.recipe)
+
+
+def comparison(desk: Desk) -> str:
+    """Models side by side, those to be trusted first."""
+    made = [m for m in desk.models.values() if m.state == MADE and m.told is not None]
+    made.sort(key=lambda m: (_ORDER.get((m.told or {})["verdict"]["level"], 3), -_worst(m)))
+    outputs = list(dict.fromkeys(f["output"] for m in made for f in (m.told or {})["fits"]))
+    fits = {m.key: {f["output"]: f for f in (m.told or {})["fits"]} for m in made}
+    return _rendered("comparison.html.j2", models=made, outputs=outputs, fits=fits)
+
+
+def _worst(shown: Model) -> float:
+    """The worst fit of a model, on validation where it has one."""
+    fits = [f["estimation"] if f["validation"] is None else f["validation"] for f in (shown.told or {})["fits"]]
+    return min((-1e300 if f is None else float(f) for f in fits), default=-1e300)
+
+
+def state(desk: Desk) -> dict[str, Any]:
+    """What changes, for a page that asks again and again."""
+    return {
+        "files": {f.key: f.version for f in desk.files.values()},
+        "models": {
+            m.key: {
+                "version": m.version, "busy": m.is_busy, "phase": m.phase if m.state == RUNNING else m.state,
+                "share": m.share, "left": m.left,
+            }
+            for m in desk.models.values()
+        },
+    }  # fmt: skip
