@@ -19,15 +19,19 @@ if _typing.TYPE_CHECKING:
     from ftlm.data.language import equation
     from ftlm.data.lattice import Lattice, lattice
     from ftlm.data.orders import Order
+    from ftlm.data.response import FrequencyData
     from ftlm.data.run import Run
     from ftlm.data.solved import Estimate
     from ftlm.data.structures import SensorFilter, Structure
     from ftlm.files.layout import Assumption, Layout
     from ftlm.files.load import load
     from ftlm.files.opened import FileColumn, OpenedFile, open_file
+    from ftlm.files.response import load_frequency
     from ftlm.fit.genetic import Genetic
     from ftlm.fit.interval import ProfileInterval
     from ftlm.fit.recursion import Trace, multi_innovation_trace
+    from ftlm.identification.frequency import identify_frequency
+    from ftlm.identification.frequency_result import FrequencyIdentification, FrequencyValidation
     from ftlm.identification.identify import identify
     from ftlm.identification.many import Identified, identify_many
     from ftlm.identification.physical import PhysicalParameter, physical_parameters
@@ -58,16 +62,17 @@ if _typing.TYPE_CHECKING:
 
 __all__ = [
     "PARAMETERS", "Assumption", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation",
-    "Estimate", "FeedbackTest", "FileColumn", "Friction", "FtlmError", "Genetic", "Identification", "Identified",
-    "InformationCriteria", "InternalError", "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError",
-    "OpenedFile", "Order", "OutputResiduals", "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals",
-    "RigFault", "Run", "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck",
-    "Structure", "Term", "Trace", "Trial", "Validation", "Verdict", "__version__", "block_pulse_matrix", "compare",
-    "energies", "equation", "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral",
-    "haar_inverse", "haar_matrix", "haar_transform", "identify", "identify_many", "information_criteria", "lattice",
-    "link_model", "load", "load_model", "metrics", "multi_innovation_trace", "open_file", "operational_matrix",
-    "order_law", "physical_parameters", "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status",
-    "select", "simulate",
+    "Estimate", "FeedbackTest", "FileColumn", "FrequencyData", "FrequencyIdentification", "FrequencyValidation",
+    "Friction", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria", "InternalError",
+    "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError", "OpenedFile", "Order", "OutputResiduals",
+    "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run",
+    "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck", "Structure", "Term",
+    "Trace", "Trial", "Validation", "Verdict", "__version__", "block_pulse_matrix", "compare", "energies",
+    "equation", "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse",
+    "haar_matrix", "haar_transform", "identify", "identify_frequency", "identify_many", "information_criteria",
+    "lattice", "link_model", "load", "load_frequency", "load_model", "metrics", "multi_innovation_trace",
+    "open_file", "operational_matrix", "order_law", "physical_parameters", "reproduce", "resid", "resume_search",
+    "rig", "search_orders", "search_status", "select", "simulate",
 ]  # fmt: skip
 
 #: Where each name lives.
@@ -83,15 +88,19 @@ _HOMES = {
         "data.language": "equation",
         "data.lattice": "Lattice lattice",
         "data.orders": "Order",
+        "data.response": "FrequencyData",
         "data.run": "Run",
         "data.solved": "Estimate",
         "data.structures": "SensorFilter Structure",
         "files.layout": "Assumption Layout",
         "files.load": "load",
         "files.opened": "FileColumn OpenedFile open_file",
+        "files.response": "load_frequency",
         "fit.genetic": "Genetic",
         "fit.interval": "ProfileInterval",
         "fit.recursion": "Trace multi_innovation_trace",
+        "identification.frequency": "identify_frequency",
+        "identification.frequency_result": "FrequencyIdentification FrequencyValidation",
         "identification.identify": "identify",
         "identification.many": "Identified identify_many",
         "identification.physical": "PhysicalParameter physical_parameters",
@@ -117,7 +126,7 @@ _HOMES = {
 }
 #: Modules that are asked for as attributes.
 _MODULES = frozenset(
-    {"advice", "demo", "errors", "exports", "frequency", "plot", "progress", "report", "reproduction", "rig"}
+    {"advice", "demo", "errors", "exports", "frequency", "plot", "progress", "report", "reproduction", "rig", "sklearn"}
 )
 
 

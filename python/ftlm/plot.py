@@ -3,6 +3,7 @@
 from ftlm.report.plots import (  # noqa: I001 — packed, so that a face stays short
     bode, correlation, fit, impulse, landscape, models, poles, residual_series, residuals, run, step,
 )  # fmt: skip
+from ftlm.report.response_plots import nyquist, response
 
-__all__ = ["bode", "correlation", "fit", "impulse", "landscape", "models", "poles", "residual_series", "residuals",
-           "run", "step"]  # fmt: skip
+__all__ = ["bode", "correlation", "fit", "impulse", "landscape", "models", "nyquist", "poles", "residual_series",
+           "residuals", "response", "run", "step"]  # fmt: skip

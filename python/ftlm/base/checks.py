@@ -8,6 +8,9 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 
 from ftlm.base.errors import DataError, ModelError
 
+#: Environment variable that gives the threads of what does not say its own.
+THREADS = "FTLM_THREADS"
+
 
 def whole_number(value: object) -> int | None:
     """Return a value that is a whole number as an int, anything else as None; the message is the caller's."""
@@ -111,15 +114,18 @@ def available_threads() -> int:
 
 
 def check_threads(threads: int | None) -> int:
-    """Threads to use: all cores by default.
+    """Threads to use: by default what ``FTLM_THREADS`` gives, else all cores.
 
     Raises
     ------
     ModelError
-        Fewer than one or more than 1 024.
+        Fewer than one or more than 1 024, or ``FTLM_THREADS`` is no such number.
     """
     if threads is None:
-        return available_threads()
+        given = os.environ.get(THREADS, "").strip()
+        if given and not (given.isascii() and given.isdecimal() and len(given) < 5 and 1 <= int(given) <= 1024):
+            raise ModelError(f"{THREADS}={given!r} is no number of threads; give 1 to 1024, or leave it out")
+        return int(given) if given else available_threads()
     count = whole_number(threads)
     if count is None or not 1 <= count <= 1024:
         raise ModelError(f"threads = {threads!r} is outside [1, 1024]; leave it out to use all cores")

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ftlm.base.errors import DataError
+from ftlm.base.log import LOG
 
 #: Systems that tell text from bytes are to write bytes.
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
@@ -147,6 +148,7 @@ def write_atomically(path: str | os.PathLike[str], content: bytes, *, force: boo
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+    LOG.info("written: %s (%d bytes)", file, len(content))
     return file
 
 

@@ -11,6 +11,7 @@ import typer
 
 from ftlm import _core
 from ftlm.cli.command import Command
+from ftlm.cli.frequency import identify_frequency
 from ftlm.cli.identify import identify, resume, search, status
 from ftlm.cli.inspect import doctor, inspect, open_
 from ftlm.cli.judge import compare, export, plot, report, resid, simulate
@@ -23,7 +24,7 @@ app = typer.Typer(
     name="ftlm",
     help="Fractional-order models of flexible machines from measured data.",
     no_args_is_help=True,
-    add_completion=False,
+    add_completion=True,
     # Marks of rich would take the brackets of units, [s] and [A], out of every help text.
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -42,10 +43,10 @@ def version(
 
 
 for _command in (
-    demo, page, record, open_, inspect, identify, select, search, resume, status, compare, resid, simulate, report,
-    reproduce, orders, plot, export, doctor,
+    demo, page, record, open_, inspect, identify, identify_frequency, select, search, resume, status, compare, resid,
+    simulate, report, reproduce, orders, plot, export, doctor,
 ):  # fmt: skip
-    app.command(_command.__name__.rstrip("_"), cls=Command)(_command)
+    app.command(_command.__name__.rstrip("_").replace("_", "-"), cls=Command)(_command)
 
 
 def main() -> None:

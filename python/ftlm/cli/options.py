@@ -46,7 +46,7 @@ CandidateTexts = Annotated[
 ]
 LatticeStep = Annotated[float, Option("--step", help="Step of the order lattice.")]
 BlockPulses = Annotated[int | None, Option("--m", help="Block pulses a run; default 2048, or what the runs carry.")]
-Threads = Annotated[int | None, Option("--threads", help="Threads; default all cores.")]
+Threads = Annotated[int | None, Option("--threads", help="Threads; default FTLM_THREADS, or all cores.")]
 Out = Annotated[Text, Option("-o", "--out", metavar="FILE", help="Where to write.")]
 Page = Annotated[str, Option("-o", "--out", metavar="HTML", help="Page to write.")]
 Force = Annotated[bool, Option("--force", help="Overwrite files.")]

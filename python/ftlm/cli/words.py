@@ -22,6 +22,8 @@ OPTIONS = {
     "validation": "--validation",
     "loss": "--loss", "intervals": "--intervals", "missing": "--missing",
     "encoding": "--encoding", "separator": "--separator", "decimal": "--decimal", "skip": "--skip",
+    "weights": "--weights", "frequency_unit": "--frequency-unit", "magnitude_unit": "--magnitude-unit",
+    "phase_unit": "--phase-unit", "negated": "--negated",
     "header": "--header", "dates": "--dates", "sheet": "--sheet",
 }  # fmt: skip
 #: ``force=True (--force)``, where the option stands beside the argument already.
@@ -39,6 +41,7 @@ _BARE = re.compile(r"\b(innovation_length|prior_covariance|time_unit)\b(?!=)")
 def in_options(text: str) -> str:
     """Return a message in which the options of the command line stand for the arguments of Python."""
     text = text.replace("inputs={name: column}", "-u NAME=COLUMN").replace("outputs={name: column}", "-y NAME=COLUMN")
+    text = text.replace("columns={part: column}", "--column PART=COLUMN")
     text = _LAYOUT.sub(lambda found: found[1].replace(", ", " "), text).replace("layout=: ", "")
     text = text.replace("in a columns file", "in a file for --columns")
     text = _CUT.sub(lambda found: f"--slice {found[1]}:{found[2] or ''}", text)

@@ -12,6 +12,7 @@ from typing import TypeAlias, cast
 
 from ftlm.base.checks import as_mapping, listed, names_to_columns, nearest
 from ftlm.base.errors import DataError
+from ftlm.base.log import LOG
 from ftlm.data.asked import Asked
 from ftlm.data.header import Header
 from ftlm.data.names import CSV_TIME, is_run_name
@@ -130,7 +131,9 @@ def load(
     chosen = checked_missing(missing or "refuse")
     tables = tables_of(path, wanted.layout)
     options = Options(slice, resample, name, time_unit, missing, chosen)
-    return run_from(tables, wanted, options)
+    run = run_from(tables, wanted, options)
+    LOG.info("read: %s: %d rows, %s", run.name, run.length, ", ".join(run.signals))
+    return run
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from typing import Any, Literal
 from msgspec import UNSET
 
 from ftlm.base.errors import DataError, ModelError
+from ftlm.base.log import LOG
 from ftlm.base.statistics import ROUNDING
 from ftlm.data.lattice import Lattice, check_lattice, check_lattice_names
 from ftlm.data.run import Run
@@ -200,10 +201,15 @@ def identify(
             return by_genetic_algorithm(task, genetic or Genetic(), settings.norm, m, settings.threads, progress)
         return by_lattice(task, settings, m, progress, store, executor)
 
+    LOG.info("identifying %s from %s by %s", structure.name, ", ".join(r.name for r in several), method)
     fit = with_decided_offset(several, structure, estimate)
     if reference is not None:
         fit = by_reference(fit, reference, weak)
-    return judged(fit)
+    result = judged(fit)
+    LOG.info("identified: %s", result.verdict())
+    for warning in result.warnings:
+        LOG.warning("%s", warning)
+    return result
 
 
 def _check_friction(structure: Structure, method: str, reference: str | None) -> None:

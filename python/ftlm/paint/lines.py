@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,8 @@ from ftlm.paint.text import number, shortened
 HUGE = 1e300
 #: Coordinates inside the plot are whole tenths of a pixel.
 SUB = 10
+#: Diameter of a dot [px].
+DOT = 4.6
 #: Letters of a label beside its line; the legend above the narrow chart has room for more.
 MOST_LETTERS = 22
 #: (light, dark, dashes). Vermilion, blue, green, purple after Okabe and Ito, darkened to a contrast of 3:1 on white and
@@ -66,6 +68,7 @@ class _Line:
     style: int
     x: Floats
     y: Floats  # logarithms on a logarithmic axis; not a number where nothing can be drawn
+    dots: bool = False
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,7 @@ class _Chart:
 def line_chart(
     x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], *, title: str, x_label: str, y_label: str, width: int = 720,
     height: int = 260, log_x: bool = False, log_y: bool = False, caption: str = "", points: int = POINTS,
-    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (), stems: bool = False,
+    bands: Sequence[tuple[ArrayLike, ArrayLike]] = (), stems: bool = False, dots: Collection[str] = (),
 ) -> Figure:  # fmt: skip
     """Chart of one or several lines over a common axis.
 
@@ -130,6 +133,8 @@ def line_chart(
         (low, high) of a shade behind the first lines, in their order; each of shape (N,).
     stems
         Draw every value as a stem from 0 instead of a line.
+    dots
+        Names of lines that are dots where they have a value, and nothing elsewhere.
 
     Returns
     -------
@@ -141,7 +146,7 @@ def line_chart(
     DataError
         No line, or a line whose length is not that of x.
     """
-    drawn, notes = _checked(x, lines, x_label, log_x, log_y)
+    drawn, notes = _checked(x, lines, x_label, log_x, log_y, dots)
     x_low, x_high = limits([drawn[0].x[np.isfinite(drawn[0].x)]], 0.02 if stems else 0.0)
     if not (log_x or stems):
         x_low, x_high = snapped(x_low, x_high)
@@ -183,7 +188,7 @@ def _shade(line: _Line, low: ArrayLike, high: ArrayLike, log_y: bool) -> _Shade:
 
 
 def _checked(
-    x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], x_label: str, log_x: bool, log_y: bool
+    x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], x_label: str, log_x: bool, log_y: bool, dots: Collection[str]
 ) -> tuple[list[_Line], list[str]]:
     """Lines ready to draw, and in words what of them cannot be drawn."""
     if not lines:
@@ -196,7 +201,7 @@ def _checked(
         if y.ndim != 1 or y.shape != across.shape:
             raise DataError(f"line {name!r} has shape {y.shape}, x {across.shape}; give arrays of one length")
         bad = ~(np.isfinite(y) & np.isfinite(across)) | (np.abs(y) > HUGE)
-        if np.any(bad):
+        if np.any(bad) and name not in dots:
             first = across[int(np.argmax(bad))]
             where = f" (first at {x_label} = {first:.4g})" if np.isfinite(first) else ""
             notes.append(f"{name}: {np.sum(bad)} of {y.size} values are not finite{where} and leave a gap.")
@@ -209,7 +214,7 @@ def _checked(
         neutral = name.startswith(NEUTRAL)
         style = 0 if neutral else 1 + coloured % (len(LINES) - 1)
         coloured += not neutral
-        drawn.append(_Line(name, style, across, y))
+        drawn.append(_Line(name, style, across, y, name in dots))
     return drawn, notes
 
 
@@ -294,9 +299,10 @@ def _curves(chart: _Chart, plot: _Plot, points: int) -> list[Markup]:
         axis = Markup('<path fill="none" stroke="currentColor" stroke-opacity="0.55" d="M0 {:.0f}h{:.0f}"/>')
         out.append(axis.format(zero, plot.width * SUB))
     # The neutral line lies beneath the others.
-    for line in sorted(chart.lines, key=lambda item: item.style != 0):
+    for line in sorted(chart.lines, key=lambda item: item.style != 0 or item.dots):
         if d := _stem_path(line, plot) if chart.stems else _path(line, plot, points):
-            out.append(Markup('<path vector-effect="non-scaling-stroke" {} d="{}"/>').format(_stroke(line.style), d))
+            stroke = _stroke(line.style, dots=line.dots)
+            out.append(Markup('<path vector-effect="non-scaling-stroke" {} d="{}"/>').format(stroke, d))
     return [*out, Markup("</svg>")]
 
 
@@ -347,10 +353,11 @@ def _stem_path(line: _Line, plot: _Plot) -> str:
     return "".join(f"M{x} {zero}V{y}" for x, y in zip(*plot.tenths(line.x[kept], line.y[kept]), strict=True))
 
 
-def _stroke(style: int) -> Markup:
+def _stroke(style: int, *, dots: bool = False) -> Markup:
     light, _, dashes = LINES[style]
+    dashes = "" if dots else dashes
     # The measured line is wide enough to show on both sides of one that follows it exactly.
-    thickness = 3.4 if style == 0 else 1.5
+    thickness = DOT if dots else 3.4 if style == 0 else 1.5
     dash = Markup(' stroke-dasharray="{}"').format(dashes) if dashes else ""
     # The page's style sheet replaces the colour in the dark; the attribute serves wherever there is no page.
     return Markup(
@@ -373,6 +380,12 @@ def _path(line: _Line, plot: _Plot, points: int) -> str:
     return "".join(parts).replace(" -", "-")
 
 
+def _swatch(line: _Line, x: float, y: float, length: int) -> Markup:
+    """What a line looks like, beside its name."""
+    at, reach = (x + length / 2, 0) if line.dots else (x, length)
+    return Markup('<path {} d="M{:.1f} {:.1f}h{}"/>').format(_stroke(line.style, dots=line.dots), at, y, reach)
+
+
 def _end_labels(lines: list[_Line], plot: _Plot) -> list[Markup]:
     """Swatch and name beside the end of every line, moved apart where lines end together."""
     x, top, bottom = plot.left + plot.width, plot.top, plot.top + plot.height
@@ -391,7 +404,7 @@ def _end_labels(lines: list[_Line], plot: _Plot) -> list[Markup]:
             places[k] = min(places[k], places[k + 1] - LINE)
     out = []
     for i, y in zip(order, places, strict=True):
-        out.append(Markup('<path {} d="M{:.1f} {:.1f}h16"/>').format(_stroke(lines[i].style), x + 8, y))
+        out.append(_swatch(lines[i], x + 8, y, 16))
         out.append(svg_text(x + 28, y + 4, shortened(lines[i].name, MOST_LETTERS), "start"))
     return out
 
@@ -412,7 +425,7 @@ def _legend_marks(entries: list[tuple[_Line, float, int]]) -> list[Markup]:
     out = []
     for line, x, row in entries:
         y = 8.0 + LINE * row
-        out.append(Markup('<path {} d="M{:.1f} {:.1f}h20"/>').format(_stroke(line.style), x, y))
+        out.append(_swatch(line, x, y, 20))
         out.append(svg_text(x + 26, y + 4, shortened(line.name, 2 * MOST_LETTERS), "start"))
     return out
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -15,7 +14,7 @@ from ftlm.base.statistics import NORMAL_95
 from ftlm.data.run import Run
 from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.result import Identification
-from ftlm.judge.charts import pulse_times, with_unit
+from ftlm.judge.charts import pulse_times
 from ftlm.judge.comparison import Comparison
 from ftlm.judge.residuals import Residuals
 from ftlm.model.charts import Answer, bode_curves, pole_points, response_frequencies
@@ -23,58 +22,11 @@ from ftlm.model.model import Model
 from ftlm.paint.heat import Landscape
 from ftlm.paint.lines import LINES
 from ftlm.paint.text import symbol
+from ftlm.report.canvas import ROW, axes_for, label_of, plain
 from ftlm.search.orders import landscape as scores_of
 
-#: Width of a figure, and height of one row of axes [inches]: a journal's double column.
-WIDTH, ROW = 7.0, 2.2
-#: Resolution in a notebook.
-NOTEBOOK_DPI = 110
 #: A fit has its error beneath it at this share of its height.
 BENEATH = 0.4
-
-
-def _figure(rows: int, columns: int = 1, *, row: float = ROW, **options: Any) -> tuple[Any, Any]:
-    """A figure with a grid of axes, made without pyplot so that nothing is kept or shown."""
-    try:
-        module = importlib.import_module("matplotlib.figure")
-    except ImportError:
-        raise ModelError("matplotlib is not installed; pip install 'ftlm[plot]'") from None
-
-    class Drawing(module.Figure):  # type: ignore[misc, name-defined]
-        """A figure that a notebook shows although pyplot does not know it."""
-
-        def _repr_png_(self) -> bytes:
-            data = io.BytesIO()
-            self.savefig(data, format="png", dpi=NOTEBOOK_DPI)
-            return data.getvalue()
-
-    figure = Drawing(figsize=(WIDTH, max(row * rows, 2.0)), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False, **options)
-
-
-def _axes(ax: Any, rows: int, columns: int = 1, **options: Any) -> tuple[Any, Any]:
-    """The axes that were given, or those of a new figure: (figure, grid of rows by columns)."""
-    if ax is None:
-        return _figure(rows, columns, **options)
-    given = np.atleast_1d(np.asarray(ax, dtype=object)).ravel()
-    strange = [type(a).__name__ for a in given if not hasattr(a, "plot") or not hasattr(a, "figure")]
-    if strange:
-        raise ModelError(f"ax holds {strange[0]}, which is no matplotlib axes; give what subplots returns")
-    if given.size != rows * columns:
-        raise ModelError(
-            f"this picture has {rows * columns} axes ({rows} by {columns}), and ax has {given.size}; give as many, "
-            f"such as subplots({rows}, {columns})[1], or leave ax out"
-        )
-    return given[0].figure, given.reshape(rows, columns)
-
-
-def _plain(text: str) -> str:
-    """Text that matplotlib does not take for mathematics, whatever a name holds."""
-    return text.replace("$", r"\$")
-
-
-def _unit(name: str, units: Mapping[str, str]) -> str:
-    return _plain(with_unit(symbol(name), units, name))
 
 
 def fit(
@@ -129,7 +81,7 @@ def fit(
         drawn += [(k, name, kind) for name in comparison.output_error for kind in ("fit", "residual")]
         drawn += [(k, name, "input") for name in (shown[k].inputs if inputs else ())]
     heights = [BENEATH if kind == "residual" else 1.0 if kind == "fit" else 0.7 for _, _, kind in drawn]
-    figure, axes = _axes(ax, len(drawn), row=ROW * 0.75, height_ratios=heights)
+    figure, axes = axes_for(ax, len(drawn), row=ROW * 0.75, height_ratios=heights)
     upper = None
     for axis, (k, name, kind) in zip(axes[:, 0], drawn, strict=True):
         if kind == "input":
@@ -146,8 +98,8 @@ def fit(
             # A run that runs away would flatten what it is to be compared with.
             height = float(np.ptp(measured)) or 1.0
             low, high = float(np.min(measured)) - 0.5 * height, float(np.max(measured)) + 0.5 * height
-            axis.set(ylim=(low, high), ylabel=_unit(name, units))
-            axis.set_title(_plain(run), fontsize="medium", loc="left")
+            axis.set(ylim=(low, high), ylabel=label_of(name, units))
+            axis.set_title(plain(run), fontsize="medium", loc="left")
             axis.legend(loc="upper right", fontsize="small", ncols=2)
             axis.tick_params(labelbottom=False)
             continue
@@ -173,7 +125,7 @@ def _line_of(axis: Any, run: Run, name: str) -> None:
     held = run.intersample.get(name) == "zoh"
     axis.plot(run.time, run[name], color=LINES[2 if name in run.inputs else 0][0], linewidth=1.0,
               drawstyle="steps-post" if held else "default")  # fmt: skip
-    axis.set(ylabel=_unit(name, run.units), xlabel="time [s]")
+    axis.set(ylabel=label_of(name, run.units), xlabel="time [s]")
     axis.grid(visible=True, alpha=0.3)
 
 
@@ -200,10 +152,10 @@ def run(run: Run, *, ax: Any = None) -> Any:
     if not isinstance(run, Run):
         raise ModelError(f"run is {type(run).__name__}; give a run, such as ftlm.load returns")
     names = [*run.outputs, *run.inputs]
-    figure, axes = _axes(ax, len(names), row=ROW * 0.6)
+    figure, axes = axes_for(ax, len(names), row=ROW * 0.6)
     for axis, name in zip(axes[:, 0], names, strict=True):
         _line_of(axis, run, name)
-    axes[0, 0].set_title(_plain(run.name), fontsize="medium", loc="left")
+    axes[0, 0].set_title(plain(run.name), fontsize="medium", loc="left")
     return figure
 
 
@@ -234,7 +186,7 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
         raise ModelError(f"tests is {type(found).__name__}; give what resid returns, or an identification")
     drawn = {output: [("itself", part.whiteness), *part.inputs.items()] for output, part in found.outputs.items()}
     columns = max(map(len, drawn.values()))
-    figure, axes = _axes(ax, len(drawn), columns)
+    figure, axes = axes_for(ax, len(drawn), columns)
     for row, (output, correlations) in zip(axes, drawn.items(), strict=True):
         for axis, (name, test) in zip(row, correlations, strict=False):
             keep = test.lags != 0 if name == "itself" else np.ones(test.lags.size, dtype=bool)
@@ -242,7 +194,7 @@ def residuals(tests: Residuals | Identification, *, ax: Any = None) -> Any:
             axis.vlines(test.lags[keep], 0, test.values[keep], color=LINES[1][0], linewidth=1.2)
             axis.axhline(0, color=LINES[0][0], linewidth=0.6)
             other = name if name == "itself" else symbol(name)
-            axis.set_title(_plain(f"{symbol(output)} with {other}: {test.verdict}"), fontsize="small")
+            axis.set_title(plain(f"{symbol(output)} with {other}: {test.verdict}"), fontsize="small")
             axis.set_xlabel("lag [samples]")
         row[0].set_ylabel("correlation")
         for axis in row[len(correlations) :]:
@@ -287,7 +239,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
         found = scores_of(result.task.runs, part, result.searches[name], result.task.lattice_of(part))
     if not isinstance(found, Landscape):
         raise ModelError(f"result is {type(found).__name__}; give an identification or a landscape")
-    figure, axes = _axes(ax, 1, row=3.2)
+    figure, axes = axes_for(ax, 1, row=3.2)
     axis = axes[0, 0]
     scores = np.where(np.isfinite(found.scores) & (found.scores > 0), found.scores, np.nan)
     if np.all(np.isnan(scores)):
@@ -298,7 +250,7 @@ def landscape(result: Identification | Landscape, output: str | None = None, *, 
     row, column = divmod(int(np.nanargmin(scores)), scores.shape[1])
     ring = {"markersize": 9, "fillstyle": "none", "color": LINES[1][0], "markeredgewidth": 2}
     axis.plot(found.x[column], found.y[row], "o", **ring)
-    xlabel, ylabel = (_plain(f"order {symbol(name)}") for name in found.names)
+    xlabel, ylabel = (plain(f"order {symbol(name)}") for name in found.names)
     axis.set(xlabel=xlabel, ylabel=ylabel)
     figure.colorbar(drawn, ax=axis, label=f"{found.score} (grey: no candidate, or diverged)")
     return figure
@@ -333,7 +285,7 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
         raise ModelError(f"model is {type(found).__name__}; give a model or an identification")
     omega = response_frequencies(found) if w is None else np.asarray(w, dtype=np.float64)
     curves = bode_curves(found, omega)
-    figure, axes = _axes(ax, max(len(curves), 1), 2)
+    figure, axes = axes_for(ax, max(len(curves), 1), 2)
     for i, curve in enumerate(curves):
         sides = ((curve.gain, curve.gain_spread, "gain [dB]"), (curve.phase, curve.phase_spread, "phase [degrees]"))
         for axis, (values, spread, label) in zip(axes[i], sides, strict=True):
@@ -342,7 +294,7 @@ def bode(model: Model | Identification, w: ArrayLike | None = None, *, ax: Any =
                 axis.fill_between(omega, values - spread, values + spread, color=LINES[1][0], alpha=0.25, linewidth=0)
             axis.set(ylabel=label, xlabel="frequency [rad/s]")
             axis.grid(visible=True, alpha=0.3)
-            axis.set_title(_plain(f"{symbol(curve.output)} from {symbol(curve.input)}"), fontsize="small")
+            axis.set_title(plain(f"{symbol(curve.output)} from {symbol(curve.input)}"), fontsize="small")
     return figure
 
 
@@ -377,7 +329,7 @@ def poles(model: Model | Identification, *, ax: Any = None) -> Any:
     q, points = pole_points(found)
     if not points.size:
         raise ModelError("this model has no poles to draw: it has friction, or it only integrates")
-    figure, axes = _axes(ax, 1, row=4.0)
+    figure, axes = axes_for(ax, 1, row=4.0)
     axis = axes[0, 0]
     reach = 1.18 * float(np.max(np.abs(points)))
     angle = np.linspace(-q * np.pi / 2, q * np.pi / 2, 61)
@@ -427,7 +379,7 @@ def impulse(model: Model | Identification, time: ArrayLike | None = None, *, ax:
 
 
 def _answered(found: Answer, ax: Any) -> Any:
-    figure, axes = _axes(ax, len(found.outputs), max(len(found.inputs), 1))
+    figure, axes = axes_for(ax, len(found.outputs), max(len(found.inputs), 1))
     for i, output in enumerate(found.outputs):
         for j, signal in enumerate(found.inputs):
             axis, values = axes[i, j], found.values[i, j]
@@ -435,8 +387,8 @@ def _answered(found: Answer, ax: Any) -> Any:
             if found.deviation is not None:
                 half = NORMAL_95 * found.deviation[i, j]
                 axis.fill_between(found.time, values - half, values + half, color=LINES[1][0], alpha=0.25, linewidth=0)
-            axis.set(xlabel="time [s]", ylabel=_unit(output, found.units))
-            axis.set_title(_plain(f"{found.kind} of {symbol(signal)}"), fontsize="small")
+            axis.set(xlabel="time [s]", ylabel=label_of(output, found.units))
+            axis.set_title(plain(f"{found.kind} of {symbol(signal)}"), fontsize="small")
             axis.grid(visible=True, alpha=0.3)
     return figure
 
@@ -465,10 +417,10 @@ def correlation(result: Identification, *, ax: Any = None) -> Any:
     if result.joint is None:
         raise ModelError(f"method {result.method!r} gives no joint covariance; identify by method='output-error'")
     names, values = result.joint.names, result.joint.correlation
-    figure, axes = _axes(ax, 1, row=4.0)
+    figure, axes = axes_for(ax, 1, row=4.0)
     axis = axes[0, 0]
     drawn = axis.imshow(values, vmin=-1, vmax=1, cmap="RdBu_r")
-    labels = [_plain(symbol(n)) for n in names]
+    labels = [plain(symbol(n)) for n in names]
     axis.set_xticks(range(len(names)), labels)
     axis.set_yticks(range(len(names)), labels)
     for i, j in np.ndindex(values.shape):
@@ -504,15 +456,15 @@ def residual_series(result: Identification | Comparison, *, ax: Any = None) -> A
         raise ModelError(f"result is {type(result).__name__}; give an identification or a comparison")
     units = result.model.units if isinstance(result, Identification) else {}
     pairs = [(k, name) for k in range(len(comparison.per_run)) for name in comparison.output_error]
-    figure, axes = _axes(ax, len(pairs), 2, **({} if ax is not None else {"width_ratios": [2.0, 1.0]}))
+    figure, axes = axes_for(ax, len(pairs), 2, **({} if ax is not None else {"width_ratios": [2.0, 1.0]}))
     for (left, right), (k, name) in zip(axes, pairs, strict=True):
         missed = comparison.measured[name][k] - comparison.simulated[name][k]
         there = missed[np.isfinite(missed)]
         left.plot(pulse_times(comparison, k), missed, color=LINES[2][0], linewidth=0.7)
-        left.set(xlabel="time [s]", ylabel=_unit(name, units))
-        left.set_title(_plain(f"residual, {comparison.per_run[k][0]}"), fontsize="small", loc="left")
+        left.set(xlabel="time [s]", ylabel=label_of(name, units))
+        left.set_title(plain(f"residual, {comparison.per_run[k][0]}"), fontsize="small", loc="left")
         right.hist(there, bins=31, color=LINES[2][0], alpha=0.7)
-        right.set(xlabel=_unit(name, units), ylabel="samples")
+        right.set(xlabel=label_of(name, units), ylabel="samples")
         right.locator_params(axis="x", nbins=3)
     return figure
 
@@ -548,15 +500,15 @@ def models(compared: Mapping[str, Comparison], *, ax: Any = None) -> Any:
             raise ModelError(
                 f"{name!r} has the outputs {', '.join(comparison.output_error)}, the first {', '.join(outputs)}"
             )
-    figure, axes = _axes(ax, 1, row=max(ROW, 0.4 * len(compared) * len(outputs)))
+    figure, axes = axes_for(ax, 1, row=max(ROW, 0.4 * len(compared) * len(outputs)))
     axis, height = axes[0, 0], 0.8 / len(outputs)
     for i, output in enumerate(outputs):
         places = np.arange(len(compared)) + (i - (len(outputs) - 1) / 2) * height
         fits = [c.output_error[output].fit for c in compared.values()]
         bars = axis.barh(places, np.clip(np.nan_to_num(fits, nan=0.0), 0.0, 100.0), height, color=LINES[1 + i % 5][0],
-                         label=_plain(symbol(output)))  # fmt: skip
+                         label=plain(symbol(output)))  # fmt: skip
         axis.bar_label(bars, [f"{v:.4g}" for v in fits], fontsize="small", padding=3)
-    axis.set_yticks(range(len(compared)), [_plain(n) for n in compared])
+    axis.set_yticks(range(len(compared)), [plain(n) for n in compared])
     axis.invert_yaxis()
     axis.set(xlabel="fit of the free run [%]", xlim=(0, 112))
     if len(outputs) > 1:

@@ -1,0 +1,5 @@
+"""An estimator for scikit-learn."""
+
+from ftlm.identification.regressor import FractionalRegressor
+
+__all__ = ["FractionalRegressor"]
