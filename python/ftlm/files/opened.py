@@ -303,7 +303,8 @@ class _Opening:
                 "which columns are inputs and which are outputs, their names do not say; name them with "
                 f"inputs={{name: column}} and outputs={{name: column}}; there are {choice or 'none'}"
             )
-            others = [f"{c.name!r} ({_why(c)})" for c in every if c is not clock and not _holds(c) and c.moments is None]
+            wordy = (c for c in every if c is not clock and not _holds(c) and c.moments is None)
+            others = [f"{c.name!r} ({_why(c)})" for c in wordy]
             if others:
                 more = f" and {len(others) - _SHOWN} more" * (len(others) > _SHOWN)
                 left += f"; no column of numbers is {', '.join(others[:_SHOWN])}{more}"
