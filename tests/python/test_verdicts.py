@@ -17,7 +17,7 @@ from ftlm.paper.claims import beats, sooner, spread_in_words
 from ftlm.paper.course import Steps, Whole, seconds_of, seconds_of_all
 from ftlm.paper.panel import arrived_at, freed_of, simulated_panel
 from ftlm.paper.ran import one_angle, papers_current, printed_numbers, ran
-from ftlm.paper.rivalry import like_for_like, seeds_for
+from ftlm.paper.rivalry import like_for_like, rivals_lattice, seeds_for
 from ftlm.paper.verdicts import case, ruled
 from ftlm.paper.work import Preset, StageWork
 from ftlm.solve.operators import block_pulse_matrix
@@ -289,10 +289,11 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
     monkeypatch.setattr("ftlm.paper.work.like_for_like", like)
     monkeypatch.setattr("ftlm.paper.panel.trials_of", lambda *_: [])
     with pytest.raises(ftlm.ModelError):
-        simulated_panel(1, "whole orders", [1], 0.0, 1, step=step)
+        simulated_panel(1, "whole orders", [1], 0.0, 1, lattice=rivals_lattice(step))
     preset = Preset(ftlm.Lattice(step=step), 1, 2, alike=True)
     work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None)
     assert work.rivals(None) == {}
+    assert rivals_lattice(step, 0.01).step == step
     assert given[0] == given[1] == (ftlm.Lattice(step=max(step, 0.1), alpha=(1.95, 2.0)), None)
 
 
@@ -378,6 +379,7 @@ def test_the_time_that_is_said_beforehand_is_the_sum_of_all_steps():
     assert seconds_of_all(0.025, 1) > stage > seconds_of_all(0.1, 1)
     # Rivals' lattices are no finer than theirs.
     assert seconds_of("rivals", 0.05) == seconds_of("rivals", 0.1) > seconds_of("rivals", 0.2)
+    assert seconds_of("rivals", 0.05, 0.05) == pytest.approx(16 * seconds_of("rivals", 0.05))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -404,6 +406,8 @@ def test_arms_differ_in_what_they_are_called_for():
         ({"records": 0}, "records = 0 is no whole number from 1"),
         ({"records": 2.5}, "records = 2.5 is no whole number from 1"),
         ({"step": 0.0}, "step"),
+        ({"rivals_step": 0.0}, "step"),
+        ({"rivals_step": "0.1"}, "step"),
     ],
 )
 def test_what_cannot_be_asked_for_is_said_first(words, message):

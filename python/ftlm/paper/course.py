@@ -23,19 +23,21 @@ OF_STAGE = {
 OF_ARM = {"trials": 0, "rivals": 2, "freed": 1}
 
 
-def seconds_of(step: str, lattice_step: float) -> float:
+def seconds_of(step: str, lattice_step: float, rivals_step: float = 0.1) -> float:
     """Processor time of a step [s]; what searches lattices grows with the fourth power of their fineness."""
-    finer = {"search": 0.05 / lattice_step, "rivals": min(1.0, 0.1 / lattice_step)}
+    finer = {"search": 0.05 / lattice_step, "rivals": 0.1 / max(lattice_step, rivals_step)}
     return STEPS[step] * float(finer.get(step, 1.0) ** 4)
 
 
-def seconds_of_all(lattice_step: float, stages: int, arms: int = 0, records: int = 1) -> float:
+def seconds_of_all(
+    lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_step: float = 0.1
+) -> float:  # fmt: skip
     """Processor time of all of it [s]: stages of one run, so many arms besides, records of each and of the first."""
     counts = dict(OF_STAGE)
     for step, count in OF_ARM.items():
         counts[step] = counts.get(step, 0) + arms * count
     counts["trials"] += (arms + 1) * records - 1
-    return stages * sum(count * seconds_of(step, lattice_step) for step, count in counts.items())
+    return stages * sum(count * seconds_of(step, lattice_step, rivals_step) for step, count in counts.items())
 
 
 class Whole:

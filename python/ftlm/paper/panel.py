@@ -23,7 +23,7 @@ from ftlm.judge.metrics import finite, metrics
 from ftlm.paper import printed
 from ftlm.paper.arm import ARMS, StageNumber, demo_run
 from ftlm.paper.records import PAIR, PRIORS, TRACE_EVERY, Stage
-from ftlm.paper.rivalry import LikeForLike, like_for_like, rivals_lattice
+from ftlm.paper.rivalry import LikeForLike, like_for_like
 from ftlm.paper.thinning import thinned
 from ftlm.search.orders import search_orders
 from ftlm.solve.free_run import explicit_euler
@@ -273,10 +273,10 @@ def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads:
 
 def simulated_panel(
     stage: StageNumber, arm: str, seeds: Sequence[int], noise: float, threads: int | None, *,
-    genetic: Genetic | None = None, step: float | None = None, begin: Callable[[str], None] = lambda _: None,
+    genetic: Genetic | None = None, lattice: Lattice | None = None, begin: Callable[[str], None] = lambda _: None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Panel:  # fmt: skip
-    """One stage on one simulated arm; with a step contests and joint fits as well, on the first record.
+    """One stage on one simulated arm; with the rivals' lattice contests and joint fits as well, on the first record.
 
     Before each step `begin` is called with what it is, a key of `ftlm.paper.course.STEPS`.
     """
@@ -287,9 +287,8 @@ def simulated_panel(
         run = demo_run("square", noise=noise, seed=seed, parameters=ARMS[arm])
         begin("trials")
         trials += trials_of(stage, run, arm, seed, threads)
-        if step is None or seed != seeds[0]:
+        if lattice is None or seed != seeds[0]:
             continue
-        lattice = rivals_lattice(step)
         structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
         own = run.select(list(structure.signals))
         for output in structure.outputs:

@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from ftlm.arm.link import flexible_link
-from ftlm.base.checks import listed, nearest, whole_number
+from ftlm.base.checks import check_threads, listed, nearest, real_number, whole_number
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import check_folder, write_atomically
+from ftlm.base.pace import expected
+from ftlm.base.progress import left_in_words
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.fit.genetic import Genetic
@@ -28,6 +30,7 @@ from ftlm.paper.panel import Panel, panel_of, simulated_panel
 from ftlm.paper.ran import Ran, ran
 from ftlm.paper.recomputed import Recomputed
 from ftlm.paper.records import TRACE_EVERY, Stage
+from ftlm.paper.rivalry import CONTEST_STEP, rivals_lattice
 from ftlm.paper.work import Preset, StageWork
 
 #: Rows that an order search keeps; the tables need the best alone.
@@ -137,7 +140,8 @@ def slug(label: str) -> str:
 
 def reproduce(
     square: Run | None = None, sine: Run | None = None, *, step: float = 0.05, noise: float = 1e-4, seed: int = 1,
-    genetic: Genetic | None = None, arms: Sequence[str] | None = None, records: int = 3, threads: int | None = None,
+    genetic: Genetic | None = None, rivals_step: float = CONTEST_STEP, arms: Sequence[str] | None = None,
+    records: int = 3, threads: int | None = None,
     say: Callable[[str], None] = lambda _: None, progress: Callable[[int, int], None] | None = None,
 ) -> Reproduction:  # fmt: skip
     """Recompute section 5 of the paper, on the virtual rig or on runs of one's own.
@@ -156,7 +160,9 @@ def reproduce(
     genetic
         Seeds and evaluations of the genetic algorithm and of differential evolution; by default ten seeds, or as many
         as 20 000 evaluations an angle allow, each with as many evaluations as the lattice that they are compared with
-        has candidates; its step is 0.1 at least.
+        has candidates.
+    rivals_step
+        Smallest step of that lattice, on every arm; the paper's 0.05 takes sixteen times as long.
     arms
         Simulated arms that verdicts are computed on besides the first: keys of `ARMS`, by default all. Of a measured
         run nothing is simulated.
@@ -181,18 +187,19 @@ def reproduce(
     """
     simulated = square is None
     others, lattice = _others(arms, records), Lattice(step=step)
-    lattice.values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
+    for each in (step, real_number("rivals_step", rivals_step)):
+        Lattice(step=each).values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
     if square is None:
         if sine is not None:
             raise ModelError("a sine run is given without a square run; give both, or neither")
         say("recording both stages on the virtual rig, under a square and a sine current")
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     numbers = stages_of(square, sine)
-    seconds = (
-        seconds_of_all(step, len(numbers), len(others), records) if simulated else seconds_of_all(step, len(numbers))
-    )
-    say(f"this takes about {seconds:.0f} s of processor time")
-    preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True)
+    more = (len(others), records) if simulated else ()
+    seconds = seconds_of_all(step, len(numbers), *more, rivals_step=rivals_step)
+    about = left_in_words(expected(seconds, min(check_threads(threads), len(STAGES)))).removesuffix(" left")
+    say(f"this takes {about}")
+    preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True, rivals_step=rivals_step)
     own = MAIN if simulated else MEASURED
     seeds = [seed + k for k in range(records)]
     run, other = square, sine
@@ -215,11 +222,11 @@ def reproduce(
             of_more = seeds[1:] if arm == MAIN else seeds
 
             def begin(name: str) -> None:
-                steps.begin(seconds_of(name, step))
+                steps.begin(seconds_of(name, step, rivals_step))
 
             return simulated_panel(
-                number, arm, of_more, noise, threads, genetic=genetic, step=None if arm == MAIN else step, begin=begin,
-                progress=steps,
+                number, arm, of_more, noise, threads, genetic=genetic, begin=begin, progress=steps,
+                lattice=None if arm == MAIN else rivals_lattice(step, rivals_step),
             )  # fmt: skip
 
         return job

@@ -18,8 +18,8 @@ from ftlm.solve.records import prepare
 
 #: Most seeds, fewest, and how many evaluations of one rival on one angle all seeds together may come to.
 MOST_SEEDS, FEWEST_SEEDS, EVALUATIONS = 10, 3, 20_000
-#: Smallest step of the rivals' lattice, on every arm: the paper's has 60 000 candidates an angle, as many evaluations a
-#: seed, and would take minutes.
+#: Smallest step of the rivals' lattice, on every arm, unless another is asked for: the paper's has 60 000 candidates an
+#: angle, as many evaluations a seed, and takes minutes.
 CONTEST_STEP = 0.1
 
 
@@ -34,9 +34,9 @@ class LikeForLike:
     evolution: GeneticRun
 
 
-def rivals_lattice(step: float) -> Lattice:
+def rivals_lattice(step: float, smallest: float = CONTEST_STEP) -> Lattice:
     """The lattice of the genetic comparison, where the orders' own has this step."""
-    return Lattice(step=max(step, CONTEST_STEP), alpha=RIVAL_ALPHA)
+    return Lattice(step=max(step, smallest), alpha=RIVAL_ALPHA)
 
 
 def seeds_for(candidates: int) -> tuple[int, ...]:

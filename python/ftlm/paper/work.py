@@ -11,13 +11,17 @@ import numpy as np
 from ftlm import _core
 from ftlm.arm.link import flexible_link, link_model, order_law
 from ftlm.arm.parameters import whole_order
+from ftlm.base.checks import check_threads
 from ftlm.base.errors import ConvergenceError, ModelError
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.genetic import Genetic, GeneticRun
+from ftlm.fit.problem import FreeProblem
 from ftlm.fit.recursion import Trace, multi_innovation_trace
-from ftlm.identification.identify import identify
+from ftlm.identification.estimate import by_output_error
+from ftlm.identification.identify import identify, judged
+from ftlm.identification.judged import Task
 from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.result import Identification
 from ftlm.judge.charts import pulse_times
@@ -29,7 +33,7 @@ from ftlm.paper import printed
 from ftlm.paper.arm import StageNumber
 from ftlm.paper.course import Steps, seconds_of
 from ftlm.paper.records import PAIR, WEAK_PRIOR, Candidate, Derived, Rival, Stage
-from ftlm.paper.rivalry import like_for_like, rivals_lattice
+from ftlm.paper.rivalry import CONTEST_STEP, like_for_like, rivals_lattice
 from ftlm.paper.thinning import thinned
 from ftlm.search.orders import search_orders
 from ftlm.search.result import SearchResult
@@ -60,6 +64,7 @@ class Preset:
     # Whether all models are judged alike, on the paper's pulses (a sum over other pulses is another number) and from
     # the currents alone as well, or each as its method worked.
     alike: bool
+    rivals_step: float = CONTEST_STEP  # of the lattice that the rivals are held against
 
 
 @dataclass
@@ -97,7 +102,7 @@ class StageWork:
         """Say what comes next, and how much of the whole it is."""
         self.say(words)
         if isinstance(self.progress, Steps):
-            self.progress.begin(seconds_of(step, self.preset.lattice.step))
+            self.progress.begin(seconds_of(step, self.preset.lattice.step, self.preset.rivals_step))
 
     def reproduced(self, genetic: Genetic | None) -> Stage:
         """Everything that section 5 says of a stage."""
@@ -110,7 +115,9 @@ class StageWork:
         candidates |= self.searches()
         candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
         candidates["output error"] = self.best("output error", self.coupled)
-        candidates["published, output error"] = self.best("published, output error", self.published)
+        candidates["published, output error"] = self.best(
+            "published, output error", self.published, near=candidates["output error"].model
+        )
         self.begin(f"stage {self.number}: convergence", "traces")
         traces: dict[str, dict[int, Trace]] = {}
         weak: dict[str, dict[int, Trace]] = {}
@@ -258,7 +265,9 @@ class StageWork:
             lattice=Lattice(step=step, orders=axes), keep=self.preset.keep,
         )  # fmt: skip
 
-    def joint(self, label: str, structure: Structure, words: str, rows: int | None = None) -> Candidate:
+    def joint(
+        self, label: str, structure: Structure, words: str, rows: int | None = None, near: Model | None = None
+    ) -> Candidate:  # fmt: skip
         """Joint output error on the run as it is, or on every so many rows of it."""
         step = "published" if structure is self.published else "output error" if rows is None else "whole orders"
         self.begin(f"stage {self.number}: {words}", step)
@@ -273,24 +282,38 @@ class StageWork:
                 "on the same block pulses of the whole run"
             )
             run = thinned(run, every)
-        # Of the published form standard errors alone are looked at.
-        intervals = "quadratic" if structure is self.published else "auto"
-        return self.identified(label, run, structure, intervals=intervals)
+        if near is None:
+            return self.identified(label, run, structure)
+        # Of the published form standard errors alone are looked at. Its automatic starts end in optima of their own,
+        # which rounding chooses between; the numbers of (14)-(15) lead to the one that leaves the noise.
+        begin = self.published_values(near)
+        if not self.simulated:
+            try:
+                return self.identified(label, run, structure, intervals="quadratic", start=begin)
+            except ModelError:
+                # Out of the bounds that (22)-(25) have.
+                return self.identified(label, run, structure, intervals="quadratic")
+        fit = by_output_error(
+            Task((run,), structure), None, check_threads(self.threads), self.progress, intervals="quadratic",
+            begin=begin, alone=True,
+        )  # fmt: skip
+        result = judged(fit)
+        return self.candidate(label, result.model, result)
 
     def best(
         self, label: str, structure: Structure, what: str = "free orders",
-        rows: int | None = None,
+        rows: int | None = None, near: Model | None = None,
     ) -> Candidate:  # fmt: skip
         """Joint output error from the current alone, or driven by the measured other angle where that has no start."""
         words = f"{what}{', (22)–(25)' * (structure is self.published)}, "
         try:
-            return self.joint(label, structure, f"{words}by output error", rows)
+            return self.joint(label, structure, f"{words}by output error", rows, near)
         except ConvergenceError as error:
             self.notes.append(
                 f"stage {self.number}, {label}: from the current alone, {error}; that row is driven by the measured "
                 "other angle instead"
             )
-        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error", rows)
+        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error", rows, near)
 
     def traces(self, candidates: Mapping[str, Candidate], prior: float = 1.0) -> dict[str, dict[int, Trace]]:
         """Convergence of every equation with every p, at the orders of the model of that p."""
@@ -308,7 +331,7 @@ class StageWork:
 
     def rivals(self, genetic: Genetic | None) -> dict[str, Rival]:
         """Genetic algorithm, differential evolution and lattice on one equation each, like for like."""
-        lattice = rivals_lattice(self.preset.lattice.step)
+        lattice = rivals_lattice(self.preset.lattice.step, self.preset.rivals_step)
         found = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
@@ -352,8 +375,8 @@ class StageWork:
             norm="l2",
         )  # fmt: skip
 
-    def derived(self, model: Model) -> Derived:
-        """The deflection by (14)-(15), and with the same numbers by (22)-(25) as published."""
+    def in_published_form(self, model: Model) -> Model:
+        """The numbers of (14)-(15) in the equations (22)-(25), which drop a derivative of the current."""
         h, d = self.number * 2 - 1, self.number * 2
         output = self.measured.outputs[1]
         known = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
@@ -365,12 +388,24 @@ class StageWork:
             stage=self.number, form="published", orders=orders, coefficients=known,
             coupling=model.structure.coupling,
         )  # fmt: skip
-        other = replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
+        return replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
+
+    def published_values(self, model: Model) -> dict[str, float]:
+        """The numbers of (14)-(15) as those that are free in (22)-(25) under their laws."""
+        other = self.in_published_form(model)
+        known = {**other.orders, **other.coefficients}
+        h, d = f"a{self.number * 2 - 1}", f"a{self.number * 2}"
+        free = FreeProblem.of(replace(self.published, initial="rest")).names
+        return {n: v for n, v in known.items() if n in free} | {f"r{self.number}": -known[d] / known[h]}
+
+    def derived(self, model: Model) -> Derived:
+        """The deflection by (14)-(15), and with the same numbers by (22)-(25) as published."""
+        output, other = self.measured.outputs[1], self.in_published_form(model)
         whole, published = (compare_means(m, self.on) for m in (model, other))
         drive = f"I{self.number}"
         current = _core.pulse_means(self.on[drive], whole.m, self.on.intersample[drive] == "zoh")
         return Derived(
-            output, order_law(self.number, "derived")["input"].at(orders), pulse_times(whole), current,
+            output, order_law(self.number, "derived")["input"].at(other.orders), pulse_times(whole), current,
             whole.measured[output][0], published.simulated[output][0], whole.simulated[output][0],
         )  # fmt: skip
 
