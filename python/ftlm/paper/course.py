@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable, Mapping
 
 from ftlm.base.progress import Course, Stoppable
+from ftlm.paper.rivalry import CONTEST_STEP, seeds_for
 
 #: Processor time of each step of a stage [s], as two at a time take it on two cores: searches at the step of the
 #: paper's lattice, rivals at that of theirs, fits on the virtual rig's 5000 rows.
@@ -15,6 +16,8 @@ STEPS: Mapping[str, float] = {
 }  # fmt: skip
 
 
+#: Of the rivals' lattice at its usual step.
+CANDIDATES = 3800
 #: What a stage of the run that is identified from takes, once each unless said, and one of another arm.
 OF_STAGE = {
     "whole orders": 1, "search": 5, "instrumental": 1, "output error": 1, "published": 1, "traces": 1, "rivals": 2,
@@ -23,14 +26,17 @@ OF_STAGE = {
 OF_ARM = {"trials": 0, "rivals": 2, "freed": 1}
 
 
-def seconds_of(step: str, lattice_step: float, rivals_step: float = 0.1) -> float:
+def seconds_of(step: str, lattice_step: float, rivals_step: float = CONTEST_STEP) -> float:
     """Processor time of a step [s]; what searches lattices grows with the fourth power of their fineness."""
-    finer = {"search": 0.05 / lattice_step, "rivals": 0.1 / max(lattice_step, rivals_step)}
-    return STEPS[step] * float(finer.get(step, 1.0) ** 4)
+    if step == "rivals":
+        candidates = round(CANDIDATES * (CONTEST_STEP / max(lattice_step, rivals_step)) ** 4)
+        evaluations = candidates * len(seeds_for(candidates))
+        return STEPS[step] * evaluations / (CANDIDATES * len(seeds_for(CANDIDATES)))
+    return STEPS[step] * float((0.05 / lattice_step) ** 4 if step == "search" else 1.0)
 
 
 def seconds_of_all(
-    lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_step: float = 0.1
+    lattice_step: float, stages: int, arms: int = 0, records: int = 1, *, rivals_step: float = CONTEST_STEP
 ) -> float:  # fmt: skip
     """Processor time of all of it [s]: stages of one run, so many arms besides, records of each and of the first."""
     counts = dict(OF_STAGE)

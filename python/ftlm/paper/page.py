@@ -234,10 +234,10 @@ def _runs_section(found: Recomputed) -> Section:
         f"M = {first.candidates['p = 7'].estimation.m} block pulses, order lattice in steps of {found.lattice.step:g}, "
         f"α from {found.lattice.alpha[0]:g} to {found.lattice.alpha[1]:g}, K₀ = 1, rows in Haar coordinates from "
         f"coarse to fine. Convergence is computed at every {TRACE_EVERY}nd step. Instrumental variables are searched "
-        "two steps around the orders of least squares. With K₀ = 1 deflections hardly move, so that no bound excludes a "
-        f"candidate: on lattices finer than {COARSE:g} they are searched in steps of that, then around the {BEST} best. "
-        "Equations (22)–(25) are fitted by output error from the numbers of (14)–(15); automatic starts end in optima "
-        "that rounding chooses between.",
+        "two steps around the orders of least squares. With K₀ = 1 deflections hardly move, and no bound excludes a "
+        f"candidate: lattices finer than {COARSE:g} are searched in steps of that for them, then around the {BEST} "
+        "best. Equations (22)–(25) are fitted by output error from the numbers of (14)–(15); automatic starts end in "
+        "optima that rounding chooses between.",
         "Explicit Euler steps at the step of the run, 0.002 s on the virtual rig, as in the paper.",
         *found.notes,
     ]
