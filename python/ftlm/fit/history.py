@@ -40,8 +40,9 @@ def fit_any_start(
 
     def fitted(initial: Initial) -> JointFit:
         asked = replace(structure, initial=initial)
-        only = known[0] if alone else None
-        return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss, known=known, start=only)
+        if alone:
+            return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss, start=known[0])
+        return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss, known=known)
 
     joint = fitted(start)
     if structure.initial != "auto" or not has_memory(structure) or structure.has_friction:
