@@ -8,11 +8,12 @@ from collections.abc import Callable, Mapping
 from ftlm.base.progress import Course, Stoppable
 from ftlm.paper.rivalry import CONTEST_STEP, seeds_for
 
-#: Processor time of each step of a stage [s], as two at a time take it on two cores: searches at the step of the
-#: paper's lattice, rivals at that of theirs, fits on the virtual rig's 5000 rows.
+#: What each step of a stage takes one core of the machine that base/pace.py knows [s]: searches at the step of the
+#: paper's lattice, rivals at that of theirs, fits on the virtual rig's 5000 rows. Three quarters of what they took
+#: beside other work.
 STEPS: Mapping[str, float] = {
-    "whole orders": 2.0, "search": 2.4, "instrumental": 2.5, "output error": 7.5, "published": 5.0, "traces": 1.0,
-    "rivals": 4.0, "equation": 0.1, "landscape": 3.0, "printed": 0.6, "trials": 3.0, "freed": 5.0,
+    "whole orders": 1.5, "search": 1.4, "instrumental": 2.0, "output error": 5.8, "published": 1.5, "traces": 0.8,
+    "rivals": 2.7, "equation": 0.1, "landscape": 2.4, "printed": 0.4, "trials": 2.0, "freed": 4.0,
 }  # fmt: skip
 
 
