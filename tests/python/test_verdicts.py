@@ -365,6 +365,11 @@ def test_the_share_that_is_done_is_of_the_whole_never_falls_and_ends_at_its_end(
     two.begin(0.0)
     assert told[-1] == 1.0
     assert told == sorted(told)
+    short = []
+    left_out = Whole(10.0, lambda done, of: short.append((done, of)))
+    Steps(left_out, stop).begin(1.0)
+    left_out.end()
+    assert short[-1] == (1000, 1000)
     stop.set()
     with pytest.raises(KeyboardInterrupt):
         two.begin(1.0)

@@ -76,6 +76,10 @@ class Whole:
             self._done += seconds
             self._course.at((self._done + sum(self._under_way.values())) / self._seconds)
 
+    def end(self) -> None:
+        """All is done, whatever was left out on the way."""
+        self._course.at(1.0)
+
 
 class Steps(Stoppable):
     """One worker's steps, one after the other: what searches and fits are to call with (done, total).

@@ -285,7 +285,9 @@ def side_by_side(
         return result
 
     if workers == 1:
-        return [done_by(job) for job in jobs]
+        found = [done_by(job) for job in jobs]
+        whole.end()
+        return found
     with ThreadPoolExecutor(workers, thread_name_prefix="ftlm-stage") as pool:
         under_way = [pool.submit(done_by, job) for job in jobs]
         try:
@@ -298,7 +300,9 @@ def side_by_side(
             for future in under_way:
                 future.cancel()
         # Where one has failed the others end in KeyboardInterrupt, which says nothing.
-        return [f.result() for f in under_way if f in done]
+        ended = [f.result() for f in under_way if f in done]
+    whole.end()
+    return ended
 
 
 def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:
