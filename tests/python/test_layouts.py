@@ -1,5 +1,6 @@
 """How text and sheets are laid out: what is found, what is said, what is refused because it could be two things."""
 
+import datetime
 import gzip
 import io
 import shlex
@@ -420,6 +421,8 @@ def test_a_reader_that_is_missing_is_named_with_its_line(tmp_path, monkeypatch, 
         ("u,y\n0,1\n#N/A,2\n2,3\n4,5\n", "line 3 begins with #"),
         ("u\ty\n0\t1\n\t\n2\t3\n4\t5\n", "empty cell"),
         ("y,u\nNone,0\n1,1\n2,5\n3,4\n", "'None'"),
+        ("u\ty\n\t\n0\t1\n2\t3\n4\t5\n", "line 2: empty cell"),
+        ("u\ty\nV\tmm\n\t\n0\t1\n2\t3\n4\t5\n", "line 3: empty cell"),
     ],
 )
 def test_no_row_vanishes(tmp_path, content, wanted):
@@ -456,3 +459,81 @@ def test_no_escape_reaches_the_terminal(tmp_path):
     shown = str(ftlm.open_file(write(tmp_path, content), inputs={"u": "u\x1b[31m"}, outputs={"y": "y"}))
     assert "\x1b" not in shown
     assert "next:" not in shown
+
+
+def test_an_empty_row_of_a_sheet_below_its_names_is_left_out_and_said(tmp_path):
+    run = ftlm.load(sheet(tmp_path, [HEAD, [None, None, None], *BODY]), **SIGNALS)
+    assert (run.length, run.step) == (9, 0.1)
+    assert any("line 2, right below the header, is empty and left out" in w for w in run.warnings)
+    opened = ftlm.open_file(tmp_path / "x.xlsx", **SIGNALS)
+    assert opened.load().warnings == ()
+
+
+@pytest.mark.parametrize("title", ["time [ms]", "t", "time [min]"])
+def test_a_cell_that_holds_a_duration_has_its_unit_in_itself(tmp_path, title):
+    span = [datetime.timedelta(milliseconds=10 * k) for k in range(9)]
+    lines = [[title, "u", "y"], *([t, k % 3, k] for k, t in enumerate(span))]
+    run = ftlm.load(sheet(tmp_path, lines), **SIGNALS)
+    assert run.step == pytest.approx(0.01)
+    assert "time counted from 'PT0.000000S' on" in run.warnings
+    messages(["time_unit='ms'", "holds dates"], lambda: ftlm.load(tmp_path / "x.xlsx", **SIGNALS, time_unit="ms"))
+
+
+def test_durations_in_words_of_iso_8601():
+    found = text.Moments.read(["-PT0.5S", "PT0S", "PT90000.25S"])
+    assert found.seconds("t", None).tolist() == [0.0, 0.5, 90000.75]
+    assert text.Moments.read(["PT1S", "12:00"]) is None
+
+
+DATED = {
+    "12/02/2024,13/02/2024,14/02/2024,15/02/2024": "dmy",
+    "02/12/2024,02/13/2024,02/14/2024,02/15/2024": "mdy",
+    "01.02.2024,02.02.2024,03.02.2024,04.02.2024": "dmy",
+    "2024-02-01,2024-02-02,2024-02-03,2024-02-04": "",
+    "01.02.2024 10:00,01.02.2024 10:01,01.02.2024 10:02,01.02.2024 10:03": "",
+}
+
+
+@pytest.mark.parametrize("dates", DATED)
+def test_the_order_of_dates_that_was_inferred_is_said_and_an_option(tmp_path, dates):
+    path = write(tmp_path, "date,u,y\n" + "".join(f"{d},{k % 3},{k}\n" for k, d in enumerate(dates.split(","))))
+    order, opened = DATED[dates], ftlm.open_file(path, **SIGNALS)
+    assert [a.value for a in opened.assumed if a.option == "dates"] == [order] * bool(order)
+    assert opened.options.get("layout", ftlm.Layout()).dates == (order or None)
+    run = ftlm.load(path, **SIGNALS)
+    assert any("dates begin with" in w for w in run.warnings) is bool(order)
+    said = opened.load()
+    assert said.step == run.step
+    assert not any("dates begin with" in w for w in said.warnings)
+    assert shlex.split(opened.command("inspect"))[-2:] == (["--dates", order] if order else ["-y", "y"])
+
+
+@pytest.mark.parametrize(
+    ("title", "assumed"), [("t", True), ("time", True), ("Zeit", True), ("t_s", False), ("time [ms]", False),
+                           ("seconds", False)],
+)  # fmt: skip
+def test_seconds_that_nobody_stated_are_said_and_an_option(tmp_path, title, assumed):
+    opened = ftlm.open_file(write(tmp_path, f"{title},u,y\n" + rows()), **SIGNALS)
+    assert any(a.option == "time_unit" for a in opened.assumed) is assumed
+    assert opened.options.get("time_unit") == ("s" if assumed else None)
+    assert opened.load().step == opened.step
+    # The default need not be typed.
+    assert "--time-unit" not in opened.command()
+
+
+@pytest.mark.parametrize("first", ["12 hours", "24 hours", "another piece"])
+def test_clocks_of_12_and_of_24_hours_in_one_column_are_refused(tmp_path, monkeypatch, first):
+    stamps = ["9:58 AM", "9:59 AM", "10:00", "10:01"]
+    stamps = stamps[::-1] if first == "24 hours" else stamps
+    if first == "another piece":
+        # A piece ends between the two, so that each of them is written in one way.
+        monkeypatch.setattr(text, "_BLOCK", 21)
+        monkeypatch.setattr(text, "_SAMPLE", 1)
+    content = "time,u,y\n" + "".join(f"{stamp},{k},{k}\n" for k, stamp in enumerate(stamps))
+    words = ["written in several ways"] if first == "another piece" else [stamps[2], stamps[0], "written in two ways"]
+    messages(["'time'", *words], lambda: read(tmp_path, content))
+
+
+def test_a_column_of_marks_for_missing_numbers_is_named(tmp_path):
+    path = write(tmp_path, "t,u,y\n" + "".join(f"{k},N/A,{k}\n" for k in range(5)))
+    assert "no column of numbers is 'u' (line 2: 'N/A' is not a number)" in ftlm.open_file(path).problem

@@ -79,9 +79,13 @@ def test_a_large_run_does_not_hide_that_a_small_one_is_lost(found, other):
 
 
 def test_a_validation_that_leaves_much_more_is_with_care(found, checked):
-    worse = replace(checked, output_error={"y": replace(checked.output_error["y"], nr=0.15, fit=85.0)})
-    judged = found.verdict(worse)
+    far = replace(checked, output_error={"y": replace(checked.output_error["y"], nr=0.15, fit=85.0)})
+    judged = found.verdict(far)
     assert (judged.level, judged.reason.endswith("85 % on validation")) == ("with care", True)
+    for own, left, level in ((1.0, 9.5, "with care"), (1.0, 4.9, "trust"), (3.0, 9.5, "trust"), (1.2, 5.9, "trust")):
+        fitted = replace(found.comparison, output_error={"y": replace(found.output_error["y"], fit=100.0 - own)})
+        less = replace(checked, output_error={"y": replace(checked.output_error["y"], nr=left / 100, fit=100.0 - left)})
+        assert worse(found, comparison=fitted).verdict(less).level == level, (own, left)
 
 
 @pytest.mark.parametrize(
@@ -362,6 +366,16 @@ def test_a_saved_model_is_judged_by_what_its_file_knows(found, other, run, tmp_p
     assert saved_verdict(warned, [saved.compare(other)]).reason == (
         "an order or a number is on its bound: order alpha = 2 is on its bound"
     )
+    # Residuals next to nothing decide as little as they do in a result.
+    for word in (
+        "y: residuals are not white (Ljung-Box 60, 99 % limit 40)",
+        "u answers what y did a closed loop",
+    ):
+        for fit, level in ((99.95, "trust"), (99.0, "with care")):
+            red = replace_estimate(saved, fit={"y": fit}, warnings=(word,))
+            checked = saved.compare(other)
+            exact = replace(checked, output_error={"y": replace(checked.output_error["y"], fit=99.9, nr=0.001)})
+            assert saved_verdict(red, [exact]).level == level, (word, fit)
     better = replace_estimate(saved, fit={"y": 130.0})
     assert "falls from 130 to" in saved_verdict(better, [saved.compare(other)]).reason
     grown = ftlm.Model(ftlm.equation("D y = 0.3 y + u"))

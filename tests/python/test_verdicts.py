@@ -1,5 +1,6 @@
 """What verdicts are made of: the rule, the rivals, printed models run, the tables as the paper computed them."""
 
+import threading
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,10 +14,12 @@ from ftlm.paper import printed
 from ftlm.paper.arm import ARMS, MAIN, demo_run
 from ftlm.paper.asprinted import SCAN, as_printed, implied_spreads, papers_record
 from ftlm.paper.claims import beats, sooner, spread_in_words
-from ftlm.paper.panel import arrived_at, simulated_panel
+from ftlm.paper.course import Steps, Whole, seconds_of, seconds_of_all
+from ftlm.paper.panel import arrived_at, freed_of, simulated_panel
 from ftlm.paper.ran import one_angle, papers_current, printed_numbers, ran
-from ftlm.paper.rivalry import like_for_like, seeds_for
+from ftlm.paper.rivalry import like_for_like, rivals_lattice, seeds_for
 from ftlm.paper.verdicts import case, ruled
+from ftlm.paper.work import Preset, StageWork
 from ftlm.solve.operators import block_pulse_matrix
 from ftlm.solve.records import prepare
 
@@ -274,27 +277,115 @@ def test_multi_innovation_is_held_against_the_median_seed():
     assert beats(3.0, seeds * 4) == beats(3.0, seeds)
 
 
-def test_rivals_have_as_many_seeds_on_every_arm(monkeypatch):
-    given = {}
+@pytest.mark.parametrize("step", [0.05, 0.25])
+def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch, step):
+    given = []
 
-    def like(run, single, lattice, asked, *, seeds, threads):
-        given[single.outputs[0]] = seeds
-        return SimpleNamespace(
-            lattice={}, candidates=1, genetic=SimpleNamespace(errors={}), evolution=SimpleNamespace(errors={})
-        )
+    def like(run, single, lattice, asked, **_):
+        given.append((lattice, asked))
+        raise ftlm.ModelError("enough")
 
     monkeypatch.setattr("ftlm.paper.panel.like_for_like", like)
+    monkeypatch.setattr("ftlm.paper.work.like_for_like", like)
     monkeypatch.setattr("ftlm.paper.panel.trials_of", lambda *_: [])
-    monkeypatch.setattr("ftlm.paper.panel.freed_of", lambda *_: None)
-    wanted = {"theta11": (0, 1, 2, 3), "theta12": (0, 1)}
-    simulated_panel([1], "whole orders", [1], 0.0, 1, step=0.25, rival_seeds=wanted)
-    assert given == wanted
+    with pytest.raises(ftlm.ModelError):
+        simulated_panel(1, "whole orders", [1], 0.0, 1, lattice=rivals_lattice(step))
+    preset = Preset(ftlm.Lattice(step=step), 1, 2, alike=True)
+    work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None)
+    assert work.rivals(None) == {}
+    assert rivals_lattice(step, 0.01).step == step
+    assert given[0] == given[1] == (ftlm.Lattice(step=max(step, 0.1), alpha=(1.95, 2.0)), None)
 
 
 def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():
     assert seeds_for(224) == tuple(range(10))
+    assert len(seeds_for(3800)) == 5
     assert seeds_for(61_620) == (0, 1, 2)
-    assert len(seeds_for(30_000)) == 6
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# What is not computed twice
+
+
+def test_a_lattice_that_no_bound_prunes_is_searched_coarsely_first(monkeypatch):
+    monkeypatch.setattr("ftlm.paper.work.COARSE", 0.4)
+    run, lattice = demo_run("square"), ftlm.Lattice(step=0.2)
+    work = StageWork(1, run, None, Preset(lattice, 1, 2, alike=True), 1, lambda _: None, None)
+    options = {"coefficients": "multi-innovation", "innovation_length": 3}
+    seen = []
+    monkeypatch.setattr(
+        "ftlm.paper.work.search_orders", lambda *a, **k: seen.append(a[2].step) or ftlm.search_orders(*a, **k)
+    )
+    found = work.searched("p = 3", lattice, **options)
+    # The hub once; the deflection in steps of 0.4, then around the ten best.
+    assert seen == [0.2, 0.4, *[0.2] * 10]
+    for output in ("theta11", "theta12"):
+        single = work.measured.equation(output)
+        every = ftlm.search_orders(work.on, single, lattice, keep=1, threads=1, **options)
+        mine = found.estimation.output_error[output].error
+        assert every.score <= mine * (1 + 1e-9)
+        assert mine < 1.01 * every.score
+        if output == "theta11":
+            assert {n: found.model.orders[n] for n in every.orders} == every.orders
+
+
+def test_fits_to_simulated_arms_ask_once_not_what_was_before(monkeypatch):
+    seen = []
+
+    def identify(run, structure, **_):
+        seen.append(structure.initial)
+        raise ftlm.ConvergenceError("enough")
+
+    monkeypatch.setattr("ftlm.paper.panel.identify", identify)
+    with pytest.raises(ftlm.ConvergenceError):
+        freed_of(1, demo_run("square"), "fractional", 1)
+    preset = Preset(ftlm.Lattice(step=0.25), 1, 2, alike=True)
+    for simulated, initial in ((True, "rest"), (False, "auto")):
+        work = StageWork(1, demo_run("square"), None, preset, 1, lambda _: None, None, simulated=simulated)
+        seen += [work.coupled.initial, work.published.initial]
+        assert seen[-2:] == [initial, initial]
+    assert seen[0] == "rest"
+
+
+def test_the_share_that_is_done_is_of_the_whole_never_falls_and_ends_at_its_end():
+    told, stop = [], threading.Event()
+    whole = Whole(10.0, lambda done, of: told.append(done / of))
+    one, two = Steps(whole, stop), Steps(whole, stop)
+    one.begin(4.0)
+    two.begin(6.0)
+    one(1, 2)
+    assert told[-1] == pytest.approx(0.2)
+    two(100, 100)
+    assert told[-1] == pytest.approx(0.8)
+    # A second search of the same step counts anew.
+    one(0, 5)
+    one(5, 5)
+    assert told[-1] <= 1.0
+    one.begin(0.0)
+    two.begin(0.0)
+    assert told[-1] == 1.0
+    assert told == sorted(told)
+    short = []
+    left_out = Whole(10.0, lambda done, of: short.append((done, of)))
+    Steps(left_out, stop).begin(1.0)
+    left_out.end()
+    assert short[-1] == (1000, 1000)
+    stop.set()
+    with pytest.raises(KeyboardInterrupt):
+        two.begin(1.0)
+    with pytest.raises(KeyboardInterrupt):
+        one(1, 2)
+
+
+def test_the_time_that_is_said_beforehand_is_the_sum_of_all_steps():
+    stage = seconds_of_all(0.05, 1)
+    assert seconds_of_all(0.05, 2) == 2 * stage
+    assert seconds_of_all(0.05, 1, arms=1) > stage + seconds_of("freed", 0.05)
+    assert seconds_of_all(0.025, 1) > stage > seconds_of_all(0.1, 1)
+    # Rivals' lattices are no finer than theirs.
+    assert seconds_of("rivals", 0.05) == seconds_of("rivals", 0.1) > seconds_of("rivals", 0.2)
+    # Sixteen times the evaluations a seed, three seeds for five.
+    assert seconds_of("rivals", 0.05, 0.05) == pytest.approx(16 * 3 / 5 * seconds_of("rivals", 0.05))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -321,6 +412,8 @@ def test_arms_differ_in_what_they_are_called_for():
         ({"records": 0}, "records = 0 is no whole number from 1"),
         ({"records": 2.5}, "records = 2.5 is no whole number from 1"),
         ({"step": 0.0}, "step"),
+        ({"rivals_step": 0.0}, "step"),
+        ({"rivals_step": "0.1"}, "step"),
     ],
 )
 def test_what_cannot_be_asked_for_is_said_first(words, message):

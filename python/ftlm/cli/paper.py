@@ -31,6 +31,7 @@ from ftlm.paper.demo import run_demo
 from ftlm.paper.demo_page import demo_details, demo_page, demo_text
 from ftlm.paper.page import reproduction_text
 from ftlm.paper.reproduction import ALWAYS_SAVED
+from ftlm.paper.rivalry import CONTEST_STEP
 from ftlm.paper.unseen import orders_on_unseen_runs
 from ftlm.paper.unseen_page import unseen_page, unseen_text
 
@@ -80,6 +81,9 @@ def reproduce(
         Texts, Option("--arms", metavar="ARM", help="Simulated arm that verdicts are computed on; several, or all.")
     ] = None,
     records: Annotated[int, Option(min=1, help="Records of each, whose noise differs.")] = 3,
+    rivals_step: Annotated[
+        float, Option("--rivals-step", help="Smallest step of the lattice that the genetic algorithm is held against.")
+    ] = CONTEST_STEP,
     genetic: GeneticOptions, threads: Threads = None, force: Force = False, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Recompute the tables and figures of the paper, on the virtual rig or on measured runs, as one page."""
@@ -91,8 +95,8 @@ def reproduce(
     measured = reading.runs([f for f in (square, sine) if f is not None], apart=True)
     with Progress("", quiet=as_json) as progress:
         result = reproduction.reproduce(
-            *measured, step=step, noise=noise, seed=seed, genetic=genetic.settings(), arms=arms, records=records,
-            threads=threads, say=progress.say, progress=progress,
+            *measured, step=step, noise=noise, seed=seed, genetic=genetic.settings(), rivals_step=rivals_step,
+            arms=arms, records=records, threads=threads, say=progress.say, progress=progress,
         )  # fmt: skip
         progress.say("writing the page")
         files = [result.page(out, force=force), *(result.save(save, force=force) if save is not None else [])]

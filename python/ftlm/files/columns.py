@@ -182,6 +182,16 @@ class Pool:
         return [], ""
 
 
+def order_of_dates(clock: Column, dates: str | None) -> Assumption | None:
+    """What was assumed of the order of day and month in a column of dates."""
+    order = "" if clock.moments is None else clock.moments.inferred(dates)
+    if clock.moments is None or not order:
+        return None
+    first = "day" if order == "dmy" else "month"
+    words = f"dates begin with the {first}, as in {clock.moments.first!r}"
+    return Assumption("dates", order, words, "layout=dict(dates=ORDER)")
+
+
 def _check_agreement(one: Column, other: Column) -> None:
     names = f"time: the columns {one.name!r} of {one.source.name} and {other.name!r} of {other.source.name}"
     if one.moments is not None and other.moments is not None:

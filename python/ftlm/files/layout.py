@@ -123,7 +123,7 @@ class Assumption:
     otherwise : str
         How to say something else.
     counts : bool
-        Whether numbers, or which rows there are, depend on it: the run says so.
+        Whether numbers, or which rows there are, depend on it and the file decided it: the run says so.
     """
 
     option: str

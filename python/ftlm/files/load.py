@@ -21,7 +21,7 @@ from ftlm.data.run import Run, built
 from ftlm.data.units import header_time, time_unit_of
 from ftlm.files.apart import kind_of, read_apart
 from ftlm.files.cells import stated_unit
-from ftlm.files.columns import Column, FileTable, Pool
+from ftlm.files.columns import Column, FileTable, Pool, order_of_dates
 from ftlm.files.layout import OF_SHEETS, OF_TEXT, Layout
 from ftlm.files.text import LONGEST_HEADER, read_text
 
@@ -225,6 +225,8 @@ def _clock(wanted: Wanted, pool: Pool, used: list[Column], options: Options) -> 
     if given is not None:
         raise DataError(f"time_unit={given!r} is the unit of numbers, and {label} holds dates or times of day")
     seconds = column.moments.seconds(label, wanted.layout.dates)
+    order = order_of_dates(column, wanted.layout.dates)
+    facts += () if order is None else (str(order),)
     facts += (f"time counted from {column.moments.first!r} on",)
     return _Clock(seconds, "s", label, column.name, facts)
 

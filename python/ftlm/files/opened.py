@@ -16,12 +16,15 @@ from ftlm.base.errors import DataError
 from ftlm.data.names import CSV_TIME
 from ftlm.data.readings import checked_missing
 from ftlm.data.run import Run
-from ftlm.files.columns import Column, FileTable, Pool
+from ftlm.data.units import header_time
+from ftlm.files.columns import Column, FileTable, Pool, order_of_dates
 from ftlm.files.layout import Assumption, Layout
-from ftlm.files.load import Options, PathLike, Wanted, load, run_from, tables_of, wanted_of
+from ftlm.files.load import Options, PathLike, Wanted, header_of, load, run_from, tables_of, wanted_of
 from ftlm.files.roles import guessed_roles, known_unit, signal_names
 
 _SHOWN = 40
+#: Names of a time that state its unit by themselves.
+_SECONDS = frozenset(("seconds", "second", "sec", "secs", "sekunden"))
 #: What the error of a column says of its first bad cell.
 _IN_LINE = re.compile(r"line \d+: .*?(?=, first at)")
 
@@ -150,12 +153,14 @@ class OpenedFile:
     def _flags(self) -> list[str]:
         """Options of the command line."""
         told = self.options
+        # What every reader finds by itself and what is so by default may stay unsaid.
+        plain = {a.option for a in self.assumed if not a.counts and a.option != "time"}
         words = []
         for key, option in (
             ("time", "--time"), ("step", "--sampling"), ("time_unit", "--time-unit"), ("resample", "--resample"),
             ("missing", "--missing"),
         ):  # fmt: skip
-            if key in told:
+            if key in told and key not in plain:
                 words += [option, str(told[key])]
         if "slice" in told:
             words += ["--slice", ":".join("" if end is None else repr(end) for end in told["slice"])]
@@ -163,8 +168,6 @@ class OpenedFile:
             bare = key in ("inputs", "outputs")
             pairs = (name if bare and name == value else f"{name}={value}" for name, value in told.get(key, {}).items())
             words += [w for pair in pairs for w in (option, pair)]
-        # What every reader finds by itself and no number depends on may stay unsaid.
-        plain = {a.option for a in self.assumed if not a.counts}
         told_layout: Layout = told.get("layout", Layout())
         words += [w for k, v in told_layout.to_dict().items() if k not in plain for w in (f"--{k}", str(v))]
         return words
@@ -231,12 +234,13 @@ class _Opening:
         table, wanted = self.table, self.wanted
         every = self.pool.columns
         clock, assumed, problem = self._time(every)
+        of_clock = () if clock is None else self._of_clock(clock)
         roles, said, open_roles = self._roles(every, clock)
-        assumed = (*table.assumed, *assumed, *said)
+        assumed = (*table.assumed, *assumed, *of_clock, *said)
         step, notes = None, tuple[str, ...]()
         if not problem:
             problem = open_roles
-        options = self._options(clock)
+        options = self._options(clock, of_clock)
         if not problem:
             try:
                 run = run_from([table], wanted, self.asked)
@@ -297,11 +301,30 @@ class _Opening:
             choice = listed((c.name for c in every if c is not clock and _holds(c)), 20)
             left = (
                 "which columns are inputs and which are outputs, their names do not say; name them with "
-                f"inputs={{name: column}} and outputs={{name: column}}; there are {choice}"
+                f"inputs={{name: column}} and outputs={{name: column}}; there are {choice or 'none'}"
             )
+            wordy = (c for c in every if c is not clock and not _holds(c) and c.moments is None)
+            others = [f"{c.name!r} ({_why(c)})" for c in wordy]
+            if others:
+                more = f" and {len(others) - _SHOWN} more" * (len(others) > _SHOWN)
+                left += f"; no column of numbers is {', '.join(others[:_SHOWN])}{more}"
         return roles, tuple(said), left
 
-    def _options(self, clock: Column | None) -> dict[str, Any]:
+    def _of_clock(self, clock: Column) -> tuple[Assumption, ...]:
+        """What was assumed of the numbers or dates of the time."""
+        if self.table.header is not None:
+            return ()
+        if clock.moments is not None:
+            order = order_of_dates(clock, self.wanted.layout.dates)
+            return () if order is None else (order,)
+        name = header_of(clock)
+        known = header_time(name)[1] is not None or name.casefold() in _SECONDS
+        if self.asked.time_unit is not None or known or clock.problem is not None:
+            return ()
+        words = f"the numbers of {clock.name!r} are seconds, as no unit is stated"
+        return (Assumption("time_unit", "s", words, "time_unit=UNIT", False),)
+
+    def _options(self, clock: Column | None, of_clock: tuple[Assumption, ...]) -> dict[str, Any]:
         """What says all of it to `load`."""
         wanted = self.wanted
         options: dict[str, Any] = {"step": wanted.step} if wanted.step is not None else {}
@@ -320,6 +343,11 @@ class _Opening:
                 options[key] = dict(getattr(wanted, key))
         said = {*wanted.layout.to_dict(), *(a.option for a in self.table.assumed)}
         layout = Layout.of({key: value for key, value in self.table.layout.to_dict().items() if key in said})
+        for assumption in of_clock:
+            if assumption.option == "dates":
+                layout = layout.under(Layout(dates=str(assumption.value)))
+            else:
+                options[assumption.option] = assumption.value
         return options | ({"layout": layout} if layout != Layout() else {})
 
 
@@ -328,14 +356,20 @@ def _holds(column: Column) -> bool:
     return column.problem is None or column.blank
 
 
+def _why(column: Column) -> str:
+    """Its first cell that is no number, and in which line."""
+    found = _IN_LINE.search(str(column.problem))
+    return "" if found is None else found[0]
+
+
 def _shown(column: Column, roles: Mapping[str, tuple[str, str]]) -> FileColumn:
     role, signal = roles.get(column.name, ("", ""))
     unit, values = column.stated, column.values
     if column.moments is not None:
         return FileColumn(column.name, role, signal, unit, None, None, None, f"from {column.moments.first}")
     if values is None or not values.size or not _holds(column):
-        why = _IN_LINE.search(str(column.problem))
-        words = "no numbers" if why is None else f"no numbers ({why[0]})"
+        why = _why(column)
+        words = "no numbers" if not why else f"no numbers ({why})"
         return FileColumn(column.name, role, signal, unit, None, None, None, words)
     there = values[~np.isnan(values)]
     if not there.size:

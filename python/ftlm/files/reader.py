@@ -417,7 +417,9 @@ def cell_text(cell: Any) -> str:
     if isinstance(cell, int | float):
         return repr(cell)
     if isinstance(cell, datetime.timedelta):
-        return repr(cell.total_seconds())
+        # A time that passed has its unit in itself, which a number would take from the header.
+        seconds, rest = divmod(abs(cell) // datetime.timedelta(microseconds=1), 1_000_000)
+        return f"{'-' if cell < datetime.timedelta() else ''}PT{seconds}.{rest:06}S"
     if isinstance(cell, datetime.datetime):
         return cell.isoformat(sep=" ")
     if isinstance(cell, datetime.date | datetime.time):

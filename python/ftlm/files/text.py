@@ -45,6 +45,7 @@ class _Trouble:
     comma: bool
     moments: bool = False
     sheet: bool = False
+    other: str = ""
 
     def error(self, column: str, source: str) -> DataError:
         thing = f"{source}: column {column!r}, line {self.line}"
@@ -60,6 +61,9 @@ class _Trouble:
         elif DECIMAL_COMMA.fullmatch(text):
             what = f"{shown} has a decimal comma"
             way_out = "write all numbers alike, or say layout=dict(decimal='comma') where all of them have commas"
+        elif self.other:
+            what = f"{shown} and {self.other!r} are dates or times of day written in two ways"
+            way_out = "write all alike"
         elif self.moments:
             what = f"{shown} stands among numbers" if is_moment(text) else f"{shown} stands among dates or times of day"
         else:
@@ -141,6 +145,7 @@ def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: s
     if not sample:
         raise DataError(f"{source}: the file is empty, 0 rows; choose a file that holds a record")
     found = find_table(sample, layout, source, own=header is not None, sheet=sheet is not None)
+    found = _with_gaps(found, begun, sample, layout, sheet=sheet is not None)
     rows = _Rows(found, sheet is not None)
     for first, lines in itertools.chain(begun, blocks):
         _take(rows, first, lines, mark, source)
@@ -153,6 +158,29 @@ def parse_text(path: Path, stream: BinaryIO | _Limited, layout: Layout, sheet: s
     if found.names is None:
         assumed = tuple(_with_remark(a, remark, found.width) for a in assumed)
     return FileTable(path, columns, True, header, layout=what.under(found.layout), assumed=assumed, kind=kind)
+
+
+def _with_gaps(
+    found: Found, begun: list[tuple[int, list[str]]], sample: list[tuple[int, str]], layout: Layout, *, sheet: bool
+) -> Found:  # fmt: skip
+    """The table with the rows of empty cells that stand right below its names; a sheet's are said and left out."""
+    if found.separator != "\t" or found.names is None:
+        return found
+    above = max((at for at, _ in sample if at < found.begin), default=0)
+    lines = ((at, line) for first, part in begun for at, line in enumerate(part, first))
+    between = itertools.takewhile(lambda pair: pair[0] < found.begin, lines)
+    gaps = [at for at, line in between if at > above and not line.strip() and line.count("\t") == found.width - 1]
+    if not gaps or found.width == 1:
+        return found
+    if not sheet:
+        return replace(found, begin=gaps[0])
+    if layout.header is not None:
+        return found
+    words = f"line {gaps[0]}, right below the header, is empty and left out"
+    if len(gaps) > 1:
+        words = f"lines {gaps[0]} to {gaps[-1]}, right below the header, are empty and left out"
+    header = 1 if found.units is None else 2
+    return replace(found, assumed=(*found.assumed, Assumption("header", header, words, "layout=dict(header=1)")))
 
 
 def _with_remark(assumption: Assumption, remark: str, width: int) -> Assumption:
@@ -381,6 +409,9 @@ def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], v
     if dated and 2 * len(dated) > len(column):
         # Among dates it is the numbers that are wrong.
         bad = [row for row in range(len(column)) if not is_moment(column[row])] or bad
+    # Where all are moments, the first that is written otherwise than the first of all.
+    ways = [row for row in bad if Moments.read([column[0], column[row]]) is None] if len(dated) == len(column) else []
+    bad = ways or bad
     blank = all(not column[row].strip() for row in bad)
     if blank and not dated:
         values[:, index] = [number(cell, comma=comma) if cell.strip() else np.nan for cell in column]
@@ -388,7 +419,7 @@ def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], v
     if known is None:
         rows.troubles[index] = _Trouble(
             lines[bad[0]], rows.count + bad[0], column[bad[0]], len(bad), blank and not dated, comma, bool(dated),
-            rows.sheet,
+            rows.sheet, column[0].strip()[:40] if ways else "",
         )  # fmt: skip
     else:
         known.count += len(bad)

@@ -28,9 +28,11 @@ RARE = 0.01
 def fit_any_start(
     runs: Sequence[Run], structure: Structure, start: Initial, *, threads: int = 1,
     progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
-    known: Sequence[Mapping[str, float]] = (),
+    known: Sequence[Mapping[str, float]] = (), alone: bool = False,
 ) -> JointFit:  # fmt: skip
     """Fit a structure on runs whose initial terms look like `start`, and decide by the fit where it leaves them open.
+
+    Alone, the first of what is known is the only start.
 
     A fit with a history is kept unless Caputo's terms leave residuals that are as good; a fit from rest unless a
     history makes them much better. Which terms were fitted is in the result.
@@ -38,6 +40,8 @@ def fit_any_start(
 
     def fitted(initial: Initial) -> JointFit:
         asked = replace(structure, initial=initial)
+        if alone:
+            return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss, start=known[0])
         return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss, known=known)
 
     joint = fitted(start)

@@ -107,9 +107,12 @@ def loss_setting(joint: JointFit) -> dict[str, Any]:
 def by_output_error(
     task: Task, m: int | None, threads: int, progress: Told, answers: Sequence[Run] | None = None,
     loss: Loss = "squares", intervals: Intervals = "auto", begin: Solved | Mapping[str, float] | None = None,
-    more: Mapping[str, float] | None = None,
+    more: Mapping[str, float] | None = None, alone: bool = False,
 ) -> Fit:  # fmt: skip
-    """Orders and coefficients together by joint output error; answers of the inputs to a reference are instruments."""
+    """Orders and coefficients together by joint output error; answers of the inputs to a reference are instruments.
+
+    Alone, what begins is the only start, which somebody knows to be near.
+    """
     # An order with one value is known.
     known = {n: v[0] for n, v in task.structure.order_values.items() if len(v) == 1}
     structure = task.structure.with_orders(known)
@@ -130,6 +133,7 @@ def by_output_error(
         progress=course.until(0.7, 0.9),
         loss=loss,
         known=begins,
+        alone=alone,
     )
     course.at(0.7)
     problem = FreeProblem.of(replace(structure, initial=joint.initial))

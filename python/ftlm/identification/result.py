@@ -235,7 +235,8 @@ class Identification(Judged):
         equation says that an output equals itself.
 
         *With care*: a fit that falls by 20 points on validation, over all runs or on one, or leaves there more than a
-        tenth and three times as much as on its own runs; residuals that follow an input; a closed loop with
+        tenth and three times as much as on its own runs, or more than a twentieth and five times as much; residuals
+        that follow an input; a closed loop with
         coloured residuals; residuals that are not white (all three no smaller than a thousandth of the output); a fit
         that did not stand still; a number that nothing tells, or a coefficient known to no more than half of itself, an
         order to no more than 0.25; growth that cannot be told; an

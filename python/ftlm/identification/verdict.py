@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
@@ -11,7 +12,7 @@ from markupsafe import Markup
 
 from ftlm.identification.judged import Judged
 from ftlm.judge.comparison import LOST, USELESS, Comparison
-from ftlm.judge.concerns import BAD, CARE, KINDS, Kind, concerns
+from ftlm.judge.concerns import BAD, CARE, KINDS, Kind, concerns, kind_of
 from ftlm.judge.metrics import Metrics
 from ftlm.judge.residuals import NEGLIGIBLE
 from ftlm.model.model import Model
@@ -22,8 +23,9 @@ NOT_TRIED = "no run that it was not fitted to has been tried"
 #: A coefficient that is known to no more than this share of itself, an order to no more than this: half of what its
 #: 95 % interval spans is then as large as itself, or as the steps of 0.5 in which mechanisms differ.
 VAGUE_SHARE, VAGUE_ORDER = 0.5, 0.25
-#: A validation leaves far more than estimation did where it is this many times as much, and more than so many percent.
-MORE_LEFT, LITTLE_LEFT = 3.0, 10.0
+#: A validation leaves far more than estimation did where it is this many times as much, and more than so many percent;
+#: the less it is in all, the more of it may be noise beside a smaller signal.
+FAR_MORE = ((3.0, 10.0), (5.0, 5.0))
 _KINDS = {kind.name: kind for kind in KINDS}
 
 
@@ -141,7 +143,7 @@ def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
         before = {n: f for n, f in known.fit.items() if f is not None}
         for comparison in validation:
             found += _lost(before, comparison)
-        for concern in concerns(known.warnings):
+        for concern in concerns([w for w in known.warnings if not _of_noise(w, before)]):
             if concern.kind.level in (BAD, CARE) and concern.kind.name not in ("unstable", "unseen"):
                 reason = f"{concern.kind.what}: {_first(concern.warnings[0])}"
                 found.append(_Against(concern.kind.level, reason, concern.kind.remedy))
@@ -246,10 +248,18 @@ def _lost(before: Mapping[str, float], validation: Comparison) -> Iterator[_Agai
             if output not in before:
                 continue
             left, own = 100.0 - figures.fit, 100.0 - before[output]
-            if not (left <= own + LOST and (left <= MORE_LEFT * own or left <= LITTLE_LEFT)):
+            if not (left <= own + LOST and all(left <= times * own or left <= little for times, little in FAR_MORE)):
                 words = f"the fit of {output} falls from {before[output]:.3g} to {figures.fit:.3g} % on validation{run}"
                 yield _Against(CARE, words, _KINDS["lost"].remedy)
                 return
+
+
+def _of_noise(warning: str, fits: Mapping[str, float]) -> bool:
+    """Whether a warning is of residuals that are next to nothing, which decide as little as they do in a result."""
+    if kind_of(warning).name not in ("residuals", "loop"):
+        return False
+    named = [o for o in fits if re.search(rf"(?<!\w){re.escape(o)}(?!\w)", warning)]
+    return bool(named) and all(100.0 - fits[o] <= 100.0 * NEGLIGIBLE for o in named)
 
 
 def _residuals(result: Judged) -> Iterator[_Against]:

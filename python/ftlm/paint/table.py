@@ -44,6 +44,8 @@ class Table:
         Sentence below the table.
     wrap
         Whether text in cells breaks into lines; otherwise every row is one line.
+    stacked
+        Whether the cells of a row, which wrap, stand below one another where the screen is narrow.
     """
 
     title: str
@@ -53,6 +55,7 @@ class Table:
     headings: Mapping[int, str] = field(default_factory=dict)
     note: str = ""
     wrap: bool = False
+    stacked: bool = False
 
     @property
     def is_numeric(self) -> list[bool]:
@@ -84,6 +87,7 @@ class Table:
         classes = [Markup(' class="{}"').format(c) if c else Markup("") for c in self._classes()]
         # The title stands outside of what scrolls, so that it wraps; the label tells it to those who listen.
         dense = " dense" if len(self.columns) >= DENSE else " wrap" if self.wrap else ""
+        dense += " stacked" if self.stacked else ""
         out = [Markup('<div class="table{}"><p class="title">{}</p>').format(dense, self.title)]
         out.append(Markup('<div class="scroll" role="group" tabindex="0" aria-label="{}">').format(self.title))
         out.append(Markup('<table aria-label="{}"><thead>').format(self.title))

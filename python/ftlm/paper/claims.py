@@ -157,7 +157,7 @@ def _of_trials(trials: Sequence[Trial], holding: Sequence[bool]) -> list[Case]:
 def _held(ruling: Ruling) -> str:
     """How many cases, and how they fall on the levels of what decides."""
     name = "K0 = " if ruling.factors[:1] == ("K0",) else ""
-    parts = ", ".join(f"{name}{level}: {held} of {count}" for level, count, held in ruling.levels)
+    parts = "; ".join(f"{name}{level}: {held} of {count}" for level, count, held in ruling.levels)
     return f"{ruling.held} of {ruling.cases} cases" + (f"; {parts}" if parts else "")
 
 

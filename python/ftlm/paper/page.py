@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -21,11 +22,12 @@ from ftlm.paint.figure import Figure
 from ftlm.paint.heat import heat_map
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
-from ftlm.paint.text import Cell, Exact, number, symbol
+from ftlm.paint.text import SUPERSCRIPTS, Cell, Exact, number, symbol
 from ftlm.paper import figures, tables
 from ftlm.paper.claims import claims, spread_in_words
 from ftlm.paper.recomputed import Recomputed
 from ftlm.paper.records import TRACE_EVERY, Stage
+from ftlm.paper.work import BEST, COARSE
 from ftlm.search.result import search_summary
 
 PAPER = (
@@ -48,23 +50,30 @@ def stage_section(
     )  # fmt: skip
 
 
+def typeset(words: str) -> str:
+    """Words with numbers as a page sets them: powers of ten, a minus, K₀."""
+    powers = re.sub(r"(?<=\d)e([+-]\d+)\b", lambda e: f"·10{str(int(e[1])).translate(SUPERSCRIPTS)}", words)
+    return re.sub(r"(?<![\w.])-(?=\d)", "−", powers).replace("K0", "K₀")
+
+
 def _verdict_section(found: Recomputed) -> Section:
     """A line for each verdict, and the numbers behind a fold."""
     told = claims(found)
     rows: list[list[Cell]] = [
         [
-            c.claim,
-            Markup("<strong>{}</strong>").format(c.verdict),
+            typeset(c.claim),
+            Markup("<strong>{}</strong>").format(typeset(c.verdict)),
             figures.share_picture(c.ruling),
-            c.brief.replace(" -", " −"),
+            typeset(c.brief),
         ]
         for c in told
     ]
     verdict = Markup('<span class="verdict"><strong>{}</strong><span class="note">{}: {}</span></span>')
     behind = [
-        verdict.format(c.claim, c.verdict[0].upper() + c.verdict[1:], c.evidence[0].upper() + c.evidence[1:])
+        verdict.format(typeset(c.claim), *(typeset(t[0].upper() + t[1:]) for t in (c.verdict, c.evidence)))
         for c in told
     ]
+    heads = "the paper's claim", "verdict", "cases", "shown by"
     missing = "No second run was given: nothing is validated, Figure 10 is left out."
     note = (
         "A verdict is computed from all its cases: arms, records, angles, both ends of K₀, whatever it depends on. It "
@@ -73,7 +82,7 @@ def _verdict_section(found: Recomputed) -> Section:
     )
     return Section(
         "What holds and what does not",
-        tables=[Table("Verdicts", ("the paper's claim", "verdict", "cases", "shown by"), rows, note=note, wrap=True)],
+        tables=[Table("Verdicts", heads, rows, note=note, wrap=True, stacked=True)],
         warnings=[missing] * (found.sine is None), fold="The numbers behind every verdict", folded_paragraphs=behind,
         folded=[tables.panel_table(found), tables.whole_table(found)],
     )  # fmt: skip
@@ -123,9 +132,16 @@ def _stage_section(found: Recomputed, stage: Stage) -> Section:
         f"As it should be, stage {number} (Table {3 + number})",
         [words, *equations], figures=figures.stage_figures(stage, simulated=found.simulated),
         fold=f"Table {3 + number}, estimates with intervals, fits" + (", warnings" if warned else ""),
-        folded_paragraphs=[f"Warning: {w}." for w in warned],
-        folded=[tables.model_table(stage, title), estimates, tables.fits_table(stage)],
+        folded=[
+            tables.model_table(stage, title), estimates, tables.fits_table(stage),
+            *([_warnings_table(number, warned)] if warned else []),
+        ],
     )  # fmt: skip
+
+
+def _warnings_table(stage: int, warned: Sequence[str]) -> Table:
+    rows = [[Markup("{}").format(models), typeset(words)] for models, _, words in (w.partition(": ") for w in warned)]
+    return Table(f"Warnings of the fits of stage {stage}", ("model", "warning"), rows, wrap=True)
 
 
 def _rival_section(found: Recomputed) -> Section:
@@ -216,9 +232,12 @@ def _runs_section(found: Recomputed) -> Section:
     first = next(iter(found.stages.values()))
     notes = [
         f"M = {first.candidates['p = 7'].estimation.m} block pulses, order lattice in steps of {found.lattice.step:g}, "
-        f"α from {found.lattice.alpha[0]:g} to {found.lattice.alpha[1]:g}, K0 = 1, rows in Haar coordinates from "
+        f"α from {found.lattice.alpha[0]:g} to {found.lattice.alpha[1]:g}, K₀ = 1, rows in Haar coordinates from "
         f"coarse to fine. Convergence is computed at every {TRACE_EVERY}nd step. Instrumental variables are searched "
-        "two steps around the orders of least squares.",
+        "two steps around the orders of least squares. With K₀ = 1 deflections hardly move, and no bound excludes a "
+        f"candidate: lattices finer than {COARSE:g} are searched in steps of that for them, then around the {BEST} "
+        "best. Equations (22)–(25) are fitted by output error from the numbers of (14)–(15); automatic starts end in "
+        "optima that rounding chooses between.",
         "Explicit Euler steps at the step of the run, 0.002 s on the virtual rig, as in the paper.",
         *found.notes,
     ]
@@ -254,7 +273,9 @@ def reproduction_page(found: Recomputed, path: str | os.PathLike[str], *, force:
     names = " and ".join(f"“{run.name}”" for run in found.runs)
     origin = "a simulated arm whose links hang on their hubs, truth known," if found.simulated else f"the runs {names},"
     strongest = next((c for c in claims(found) if c.claim.startswith("The printed models, under")), None)
-    shown = "" if strongest is None else f"The printed models, run under the paper's current: {strongest.brief}. "
+    shown = (
+        "" if strongest is None else f"The printed models, run under the paper's current: {typeset(strongest.brief)}. "
+    )
     lead = (
         f"Section 5 of the paper, recomputed on {origin} beside what the paper prints. {shown}Numbers in rows marked "
         f"“printed” are the paper's; every other number, figure and verdict on this page is computed. {PAPER}."

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,7 +22,7 @@ from ftlm.judge.comparison import Comparison, compare_means
 from ftlm.judge.metrics import finite, metrics
 from ftlm.paper import printed
 from ftlm.paper.arm import ARMS, StageNumber, demo_run
-from ftlm.paper.records import PAIR, PRIORS, RIVAL_ALPHA, TRACE_EVERY, Stage
+from ftlm.paper.records import PAIR, PRIORS, TRACE_EVERY, Stage
 from ftlm.paper.rivalry import LikeForLike, like_for_like
 from ftlm.paper.thinning import thinned
 from ftlm.search.orders import search_orders
@@ -33,9 +33,8 @@ from ftlm.solve.records import default_m
 ARRIVED = 0.02
 #: Joint fits of the panel take one of so many rows: 8 ms on the virtual rig, a fifteenth of the fastest link's period.
 EVERY = 4
-#: Step of the panel's order lattices, and the smallest one of its genetic comparisons: what the paper's has, 60 000
-#: candidates an angle, would take minutes on every arm.
-PANEL_STEP, CONTEST_STEP = 0.25, 0.1
+#: Step of the panel's order lattices.
+PANEL_STEP = 0.25
 
 
 @dataclass(frozen=True)
@@ -221,21 +220,24 @@ def contest(made: LikeForLike, output: str, arm: str, step: float) -> Contest:
     return Contest(arm, output, made.candidates, step, lattice, made.genetic.errors, made.evolution.errors)
 
 
-def freed_of(stage: StageNumber, square: Run, arm: str, threads: int | None) -> Freed:
-    """Whole and free orders of one stage, on one of so many rows.
+def freed_of(
+    stage: StageNumber, square: Run, arm: str, threads: int | None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Freed:  # fmt: skip
+    """Whole and free orders of one stage of a simulated arm, which starts at rest, on one of so many rows.
 
     Raises
     ------
     ConvergenceError
         No start of one of the fits converged.
     """
-    structure = flexible_link(stage=stage, coupling="simulated")
+    structure = replace(flexible_link(stage=stage, coupling="simulated"), initial="rest")
     own = square.select(list(structure.signals))
     run = thinned(own, EVERY)
     whole = structure.with_orders({n: whole_order(n) for n in structure.order_names})
     # Whole orders on an arm that has none let coefficients go where their squares are no numbers.
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        fits = [identify(run, item, threads=threads) for item in (whole, structure)]
+        fits = [identify(run, item, threads=threads, progress=progress) for item in (whole, structure)]
     m = default_m([own], power_of_two=True)
     coarse, fine = (compare_means(replace(fit.model, m=m), own) for fit in fits)
     return _freed(arm, stage, coarse, fine, fits[1])
@@ -270,30 +272,31 @@ def panel_of(stages: Sequence[Stage], square: Run, arm: str, seed: int, threads:
 
 
 def simulated_panel(
-    stages: Sequence[StageNumber], arm: str, seeds: Sequence[int], noise: float, threads: int | None, *,
-    genetic: Genetic | None = None, step: float | None = None, rival_seeds: Mapping[str, Sequence[int]] | None = None,
+    stage: StageNumber, arm: str, seeds: Sequence[int], noise: float, threads: int | None, *,
+    genetic: Genetic | None = None, lattice: Lattice | None = None, begin: Callable[[str], None] = lambda _: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Panel:  # fmt: skip
-    """All stages on one simulated arm; with a step contests and joint fits as well, on the first record.
+    """One stage on one simulated arm; with the rivals' lattice contests and joint fits as well, on the first record.
 
-    Rivals have these seeds by angle where none are asked for: verdicts compare what every arm had as often.
+    Before each step `begin` is called with what it is, a key of `ftlm.paper.course.STEPS`.
     """
     trials: list[Trial] = []
     contests: list[Contest] = []
     freed: list[Freed] = []
     for seed in seeds:
         run = demo_run("square", noise=noise, seed=seed, parameters=ARMS[arm])
-        for stage in stages:
-            trials += trials_of(stage, run, arm, seed, threads)
-            if step is None or seed != seeds[0]:
-                continue
-            lattice = Lattice(step=max(step, CONTEST_STEP), alpha=RIVAL_ALPHA)
-            structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
-            own = run.select(list(structure.signals))
-            for output in structure.outputs:
-                made = like_for_like(
-                    own, structure.equation(output), lattice, genetic, seeds=(rival_seeds or {}).get(output),
-                    threads=threads,
-                )  # fmt: skip
-                contests.append(contest(made, output, arm, lattice.step))
-            freed.append(freed_of(stage, run, arm, threads))
+        begin("trials")
+        trials += trials_of(stage, run, arm, seed, threads)
+        if lattice is None or seed != seeds[0]:
+            continue
+        structure = flexible_link(stage=stage, form="published", coupling="measured", laws=())
+        own = run.select(list(structure.signals))
+        for output in structure.outputs:
+            begin("rivals")
+            made = like_for_like(
+                own, structure.equation(output), lattice, genetic, threads=threads, progress=progress
+            )  # fmt: skip
+            contests.append(contest(made, output, arm, lattice.step))
+        begin("freed")
+        freed.append(freed_of(stage, run, arm, threads, progress))
     return Panel(tuple(trials), tuple(contests), tuple(freed))

@@ -7,27 +7,30 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ftlm.arm.link import flexible_link
-from ftlm.base.checks import listed, nearest, whole_number
+from ftlm.base.checks import check_threads, listed, nearest, real_number, whole_number
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import check_folder, write_atomically
-from ftlm.base.progress import Progress, Stoppable
+from ftlm.base.pace import expected
+from ftlm.base.progress import left_in_words
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.fit.genetic import Genetic
 from ftlm.model.model import Model
 from ftlm.paper.arm import ARMS, MAIN, STAGES, StageNumber, demo_run
-from ftlm.paper.asprinted import as_printed
+from ftlm.paper.asprinted import AsPrinted, as_printed
 from ftlm.paper.claims import Claim, claims
+from ftlm.paper.course import Steps, Whole, seconds_of, seconds_of_all
 from ftlm.paper.page import reproduction_page
-from ftlm.paper.panel import panel_of, simulated_panel
-from ftlm.paper.ran import ran
+from ftlm.paper.panel import Panel, panel_of, simulated_panel
+from ftlm.paper.ran import Ran, ran
 from ftlm.paper.recomputed import Recomputed
 from ftlm.paper.records import TRACE_EVERY, Stage
+from ftlm.paper.rivalry import CONTEST_STEP, rivals_lattice
 from ftlm.paper.work import Preset, StageWork
 
 #: Rows that an order search keeps; the tables need the best alone.
@@ -37,10 +40,6 @@ TABLES = "tables.json"
 #: What verdicts call the runs that were given.
 MEASURED = "as measured"
 ALWAYS_SAVED = ("square.csv", "sine.csv", TABLES)
-#: Processor time of a stage but for its searches, of a stage on one more arm, and of a stage's searches and rivals on a
-#: lattice of step 0.05, whose size grows with the fourth power [s]; measured on two cores that others kept busy, which
-#: doubles it.
-EACH_STAGE, EACH_ARM, SEARCHES = 45.0, 19.0, 108.0
 #: Seconds between two looks for Ctrl-C.
 LOOK = 0.1
 
@@ -141,7 +140,8 @@ def slug(label: str) -> str:
 
 def reproduce(
     square: Run | None = None, sine: Run | None = None, *, step: float = 0.05, noise: float = 1e-4, seed: int = 1,
-    genetic: Genetic | None = None, arms: Sequence[str] | None = None, records: int = 3, threads: int | None = None,
+    genetic: Genetic | None = None, rivals_step: float = CONTEST_STEP, arms: Sequence[str] | None = None,
+    records: int = 3, threads: int | None = None,
     say: Callable[[str], None] = lambda _: None, progress: Callable[[int, int], None] | None = None,
 ) -> Reproduction:  # fmt: skip
     """Recompute section 5 of the paper, on the virtual rig or on runs of one's own.
@@ -159,19 +159,21 @@ def reproduce(
         Of the virtual rig's angles, see :func:`ftlm.demo.demo_run`.
     genetic
         Seeds and evaluations of the genetic algorithm and of differential evolution; by default ten seeds, or as many
-        as 200 000 evaluations an angle allow, each with as many evaluations as the lattice that they are compared with
+        as 20 000 evaluations an angle allow, each with as many evaluations as the lattice that they are compared with
         has candidates.
+    rivals_step
+        Smallest step of that lattice, on every arm; the paper's 0.05 takes sixteen times as long.
     arms
         Simulated arms that verdicts are computed on besides the first: keys of `ARMS`, by default all. Of a measured
         run nothing is simulated.
     records
         Records of each of them, whose noise differs.
     threads
-        Threads of each stage; both stages are computed at the same time unless this is 1.
+        Threads of each stage; two stages or arms are computed at the same time unless this is 1.
     say
         Called with a line about what happens next, from the thread of a stage.
     progress
-        See :func:`ftlm.search_orders`; called from the thread of a stage.
+        Called with (parts done, parts in all) of the whole, from the thread of a stage; the parts are of equal time.
 
     Returns
     -------
@@ -185,45 +187,77 @@ def reproduce(
     """
     simulated = square is None
     others, lattice = _others(arms, records), Lattice(step=step)
-    lattice.values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
+    for each in (step, real_number("rivals_step", rivals_step)):
+        Lattice(step=each).values(flexible_link(stage=1, form="published", coupling="measured", laws=()))
     if square is None:
         if sine is not None:
             raise ModelError("a sine run is given without a square run; give both, or neither")
         say("recording both stages on the virtual rig, under a square and a sine current")
         square, sine = (demo_run(shape, noise=noise, seed=seed) for shape in ("square", "sine"))
     numbers = stages_of(square, sine)
-    seconds = processor_seconds(step, len(numbers), len(others) if simulated else 0)
-    say(f"this takes up to {seconds:.0f} s of processor time")
-    preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True)
-    works = [StageWork(n, square, sine, preset, threads, say, progress) for n in numbers]
-    one_by_one = len(works) == 1 or threads == 1
-    made = [w.reproduced(genetic) for w in works] if one_by_one else side_by_side(works, genetic)
-    stages: dict[int, Stage] = {s.number: s for s in made}
-    say("the paper's printed models under its own current, and its tables as it computed them")
-    ran_models = [row for n in numbers for row in ran(n, threads)]
-    printed_reading = as_printed([o for n in numbers for o in stages[n].outputs])
+    more = (len(others), records) if simulated else ()
+    seconds = seconds_of_all(step, len(numbers), *more, rivals_step=rivals_step)
+    about = left_in_words(expected(seconds, min(check_threads(threads), len(STAGES)))).removesuffix(" left")
+    say(f"this takes {about}")
+    preset = Preset(lattice, KEEP, TRACE_EVERY, alike=True, rivals_step=rivals_step)
     own = MAIN if simulated else MEASURED
-    say("verdicts: both ends of K0")
-    panel = panel_of(made, square, own, seed, threads)
-    if simulated:
-        rival_seeds = {c.output: tuple(c.genetic) for c in panel.contests}
-        seeds = [seed + k for k in range(records)]
-        panel = panel.beside(simulated_panel(numbers, own, seeds[1:], noise, threads))
-        for arm in others:
-            say(f"verdicts: the arm “{arm}”")
-            more = simulated_panel(
-                numbers, arm, seeds, noise, threads, genetic=genetic, step=step, rival_seeds=rival_seeds
-            )
-            panel = panel.beside(more)
-    notes = dict.fromkeys(note for work in works for note in work.notes)
+    seeds = [seed + k for k in range(records)]
+    run, other = square, sine
+
+    def stage_of(number: StageNumber) -> Job:
+        def job(steps: Steps) -> Made:
+            work = StageWork(number, run, other, preset, threads, say, steps, simulated=simulated)
+            stage = work.reproduced(genetic)
+            work.begin(f"stage {number}: the paper's printed models under its own current", "printed")
+            rows = ran(number, threads)
+            work.begin(f"stage {number}: verdicts, both ends of K0", "trials")
+            panel = panel_of([stage], run, own, seed, threads)
+            return Made(stage, rows, as_printed(stage.outputs), panel, work.notes)
+
+        return job
+
+    def panel_on(arm: str, number: StageNumber) -> Job:
+        def job(steps: Steps) -> Panel:
+            say(f"verdicts: the arm “{arm}”, stage {number}")
+            of_more = seeds[1:] if arm == MAIN else seeds
+
+            def begin(name: str) -> None:
+                steps.begin(seconds_of(name, step, rivals_step))
+
+            return simulated_panel(
+                number, arm, of_more, noise, threads, genetic=genetic, begin=begin, progress=steps,
+                lattice=None if arm == MAIN else rivals_lattice(step, rivals_step),
+            )  # fmt: skip
+
+        return job
+
+    pairs = [(arm, n) for arm in ([MAIN, *others] if simulated else []) for n in numbers]
+    jobs: list[Job] = [*(stage_of(n) for n in numbers), *(panel_on(*pair) for pair in pairs)]
+    ended = side_by_side(jobs, 1 if threads == 1 else len(STAGES), seconds, progress)
+    made: list[Made] = [m for m in ended if isinstance(m, Made)]
+    panel = Panel()
+    for part in (*(m.panel for m in made), *(p for p in ended if isinstance(p, Panel))):
+        panel = panel.beside(part)
     return Reproduction(
-        square, sine, simulated, stages, lattice, tuple(notes), panel, tuple(ran_models), printed_reading
+        square, sine, simulated, {m.stage.number: m.stage for m in made}, lattice,
+        tuple(dict.fromkeys(note for m in made for note in m.notes)), panel, tuple(row for m in made for row in m.rows),
+        {output: part for m in made for output, part in m.printed.items()},
     )  # fmt: skip
 
 
-def processor_seconds(step: float, stages: int, arms: int) -> float:
-    """Processor time that all of it takes [s], by what it took where it was measured."""
-    return stages * (EACH_STAGE + EACH_ARM * arms + SEARCHES * (0.05 / step) ** 4)
+@dataclass(frozen=True)
+class Made:
+    """What was made of one stage of the run that everything is identified from."""
+
+    stage: Stage
+    rows: list[Ran]
+    printed: dict[str, AsPrinted]
+    panel: Panel
+    notes: list[str]
+
+
+#: What a worker does, told where to say how far it is.
+Job = Callable[[Steps], Made | Panel]
 
 
 def _others(arms: Sequence[str] | None, records: int) -> list[str]:
@@ -238,35 +272,37 @@ def _others(arms: Sequence[str] | None, records: int) -> list[str]:
     return [name for name in (ARMS if arms is None else dict.fromkeys(arms)) if name != MAIN]
 
 
-def side_by_side(works: Sequence[StageWork], genetic: Genetic | None) -> list[Stage]:
-    """All stages at once: while one fits on one core, another uses the rest."""
-    stop = threading.Event()
-    with ExitStack() as stack:
-        for work in works:
-            bar = work.progress
-            if isinstance(bar, Progress):
-                bar = stack.enter_context(bar.beside())
-                work.say = _both(work.say, bar.name)
-            work.progress = Stoppable(bar, stop)
-        pool = stack.enter_context(ThreadPoolExecutor(len(works), thread_name_prefix="ftlm-stage"))
-        under_way = [pool.submit(work.reproduced, genetic) for work in works]
+def side_by_side(
+    jobs: Sequence[Job], workers: int, seconds: float, progress: Callable[[int, int], None] | None
+) -> list[Made | Panel]:
+    """What all jobs come to, so many of them at the same time: while one fits on one core, another uses the rest."""
+    stop, whole = threading.Event(), Whole(seconds, progress)
+
+    def done_by(job: Job) -> Made | Panel:
+        steps = Steps(whole, stop)
+        result = job(steps)
+        steps.begin(0.0)
+        return result
+
+    if workers == 1:
+        found = [done_by(job) for job in jobs]
+        whole.end()
+        return found
+    with ThreadPoolExecutor(workers, thread_name_prefix="ftlm-stage") as pool:
+        under_way = [pool.submit(done_by, job) for job in jobs]
         try:
-            done: set[Future[Stage]] = set()
+            done: set[Future[Made | Panel]] = set()
             # A wait without an end would not be interrupted by Ctrl-C everywhere.
-            while len(done) < len(works) and not any(f.exception() for f in done):
+            while len(done) < len(jobs) and not any(f.exception() for f in done):
                 done, _ = wait(under_way, timeout=LOOK, return_when=FIRST_EXCEPTION)
         finally:
             stop.set()
+            for future in under_way:
+                future.cancel()
         # Where one has failed the others end in KeyboardInterrupt, which says nothing.
-        return [f.result() for f in under_way if f in done]
-
-
-def _both(first: Callable[[str], None], second: Callable[[str], None]) -> Callable[[str], None]:
-    def told(line: str) -> None:
-        first(line)
-        second(line)
-
-    return told
+        ended = [f.result() for f in under_way if f in done]
+    whole.end()
+    return ended
 
 
 def stages_of(square: Run, sine: Run | None) -> list[StageNumber]:

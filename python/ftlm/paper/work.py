@@ -11,13 +11,17 @@ import numpy as np
 from ftlm import _core
 from ftlm.arm.link import flexible_link, link_model, order_law
 from ftlm.arm.parameters import whole_order
+from ftlm.base.checks import check_threads
 from ftlm.base.errors import ConvergenceError, ModelError
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.genetic import Genetic, GeneticRun
+from ftlm.fit.problem import FreeProblem
 from ftlm.fit.recursion import Trace, multi_innovation_trace
-from ftlm.identification.identify import identify
+from ftlm.identification.estimate import by_output_error
+from ftlm.identification.identify import identify, judged
+from ftlm.identification.judged import Task
 from ftlm.identification.landscape import output_error_landscape
 from ftlm.identification.result import Identification
 from ftlm.judge.charts import pulse_times
@@ -27,8 +31,9 @@ from ftlm.model.model import Model
 from ftlm.paint.heat import Landscape
 from ftlm.paper import printed
 from ftlm.paper.arm import StageNumber
-from ftlm.paper.records import PAIR, RIVAL_ALPHA, WEAK_PRIOR, Candidate, Derived, Rival, Stage
-from ftlm.paper.rivalry import like_for_like
+from ftlm.paper.course import Steps, seconds_of
+from ftlm.paper.records import PAIR, WEAK_PRIOR, Candidate, Derived, Rival, Stage
+from ftlm.paper.rivalry import CONTEST_STEP, like_for_like, rivals_lattice
 from ftlm.paper.thinning import thinned
 from ftlm.search.orders import search_orders
 from ftlm.search.result import SearchResult
@@ -42,6 +47,9 @@ AROUND = 2
 #: Runs with more rows than the first are thinned to at most the second for joint fits, whose cost and whose grid's
 #: refinement grow with the rows; the arm's modes are two decades below the rate that is left.
 MOST_ROWS, JOINT_ROWS = 6000, 2500
+#: On finer lattices than this those orders of multi-innovation that no bound excludes are searched in steps of this
+#: first, then in the lattice's own steps around so many of the best.
+COARSE, BEST = 0.1, 10
 #: Whole orders that are none leave residuals that no row more makes smaller.
 WHOLE_ROWS = 1250
 
@@ -56,6 +64,7 @@ class Preset:
     # Whether all models are judged alike, on the paper's pulses (a sum over other pulses is another number) and from
     # the currents alone as well, or each as its method worked.
     alike: bool
+    rivals_step: float = CONTEST_STEP  # of the lattice that the rivals are held against
 
 
 @dataclass
@@ -70,6 +79,8 @@ class StageWork:
     say: Callable[[str], None]
     progress: Callable[[int, int], None] | None
     notes: list[str] = field(default_factory=list)
+    # Whether the runs are simulated, from rest: nobody need find out what was before.
+    simulated: bool = False
 
     def __post_init__(self) -> None:
         # The paper's own structure, for what its tables are set beside, and the arm as it is.
@@ -79,11 +90,19 @@ class StageWork:
         own = list(self.measured.signals)
         self.on = self.square.select(own)
         self.off = None if self.sine is None else self.sine.select(own)
-        if not starts_at_rest(self.on, self.measured):
+        if self.simulated:
+            self.published, self.coupled = (replace(s, initial="rest") for s in (self.published, self.coupled))
+        elif not starts_at_rest(self.on, self.measured):
             # The paper's equation errors have few terms; ten powers of t more would be combinations of them.
             self.measured, self.published, self.coupled = (
                 replace(s, initial="caputo") for s in (self.measured, self.published, self.coupled)
             )
+
+    def begin(self, words: str, step: str) -> None:
+        """Say what comes next, and how much of the whole it is."""
+        self.say(words)
+        if isinstance(self.progress, Steps):
+            self.progress.begin(seconds_of(step, self.preset.lattice.step, self.preset.rivals_step))
 
     def reproduced(self, genetic: Genetic | None) -> Stage:
         """Everything that section 5 says of a stage."""
@@ -96,7 +115,10 @@ class StageWork:
         candidates |= self.searches()
         candidates["instrumental variables"] = self.instrumental(candidates["least squares"])
         candidates["output error"] = self.best("output error", self.coupled)
-        candidates["published, output error"] = self.best("published, output error", self.published)
+        candidates["published, output error"] = self.best(
+            "published, output error", self.published, near=candidates["output error"].model
+        )
+        self.begin(f"stage {self.number}: convergence", "traces")
         traces: dict[str, dict[int, Trace]] = {}
         weak: dict[str, dict[int, Trace]] = {}
         if prepare([self.on], self.measured, None, power_of_two=True)[0].initial == "rest":
@@ -121,7 +143,7 @@ class StageWork:
 
     def landscape(self, result: Identification | None) -> Landscape | None:
         """Around the joint fit, along the two orders that the run tells apart least."""
-        self.say(f"stage {self.number}: the landscape of its orders")
+        self.begin(f"stage {self.number}: the landscape of its orders", "landscape")
         return None if result is None or result.joint is None else output_error_landscape(result)
 
     def candidate(self, label: str, model: Model, result: Identification | None = None) -> Candidate:
@@ -182,7 +204,7 @@ class StageWork:
         kinds["least squares"] = {"coefficients": "least-squares"}
         found = {}
         for label, options in kinds.items():
-            self.say(f"stage {self.number}: searching the orders of both equations, {label}")
+            self.begin(f"stage {self.number}: orders on the lattice, {label}", "search")
             if self.preset.alike:
                 found[label] = self.searched(label, self.preset.lattice, **options)
                 continue
@@ -199,7 +221,7 @@ class StageWork:
         for output in self.measured.outputs:
             single = self.measured.equation(output)
             own = replace(lattice, orders={n: v for n, v in lattice.orders.items() if n in single.order_names})
-            best = search_orders(self.on, single, own, keep=1, threads=self.threads, progress=self.progress, **options)
+            best = self._best_orders(single, own, options)
             orders |= best.orders
             coefficients |= best.coefficients
         known = self.measured.with_orders(orders).with_coefficients(coefficients)
@@ -207,23 +229,48 @@ class StageWork:
         about = {"origin": label, "run": self.on.name}
         return self.candidate(label, Model(known, orders=orders, units=units, about=about))
 
+    def _best_orders(self, single: Structure, own: Lattice, options: Mapping[str, Any]) -> SearchResult:
+        """The best candidate of a lattice.
+
+        With K0 = 1 a deflection hardly moves: all candidates' errors are close to that of no motion, no bound excludes
+        one, and each would have to be run to its end.
+        """
+
+        def searched(lattice: Lattice, keep: int) -> SearchResult:
+            return search_orders(
+                self.on, single, lattice, keep=keep, threads=self.threads, progress=self.progress, **options
+            )
+
+        own_terms = sum(t.signal == single.outputs[0] for t in single.equations[0].terms)
+        heavy = own_terms > 1 and options.get("coefficients") == "multi-innovation"
+        if not (heavy and own.step < COARSE and not own.orders):
+            return searched(own, 1)
+        ends = [
+            searched(replace(own, orders=around(row.orders, own, single)), 1)
+            for row in searched(replace(own, step=COARSE), BEST).table
+        ]
+        return min(ends, key=lambda end: end.score)
+
     def instrumental(self, start: Candidate) -> Candidate:
         """Instrumental variables on the part of the lattice around the orders of another model."""
-        self.say(f"stage {self.number}: searching the orders by instrumental variables")
+        self.begin(f"stage {self.number}: orders by instrumental variables", "instrumental")
         step, top = self.preset.lattice.step, self.preset.lattice.alpha[1]
         axes = {}
         for name, value in start.model.orders.items():
-            around = 1 if name.startswith("alpha") else AROUND
-            near = [round(value + k * step, 9) for k in range(-around, around + 1)]
+            steps = 1 if name.startswith("alpha") else AROUND
+            near = [round(value + k * step, 9) for k in range(-steps, steps + 1)]
             axes[name] = [v for v in near if 0 <= v <= top]
         return self.identified(
             "instrumental variables", self.on, self.measured, method="instrumental-variables",
             lattice=Lattice(step=step, orders=axes), keep=self.preset.keep,
         )  # fmt: skip
 
-    def joint(self, label: str, structure: Structure, words: str, rows: int | None = None) -> Candidate:
+    def joint(
+        self, label: str, structure: Structure, words: str, rows: int | None = None, near: Model | None = None
+    ) -> Candidate:  # fmt: skip
         """Joint output error on the run as it is, or on every so many rows of it."""
-        self.say(f"stage {self.number}: {words}")
+        step = "published" if structure is self.published else "output error" if rows is None else "whole orders"
+        self.begin(f"stage {self.number}: {words}", step)
         run = self.on
         if rows is not None and run.length >= 2 * rows:
             run = thinned(run, run.length // rows)
@@ -235,24 +282,38 @@ class StageWork:
                 "on the same block pulses of the whole run"
             )
             run = thinned(run, every)
-        # Of the published form standard errors alone are looked at.
-        intervals = "quadratic" if structure is self.published else "auto"
-        return self.identified(label, run, structure, intervals=intervals)
+        if near is None:
+            return self.identified(label, run, structure)
+        # Of the published form standard errors alone are looked at. Its automatic starts end in optima of their own,
+        # which rounding chooses between; the numbers of (14)-(15) lead to the one that leaves the noise.
+        begin = self.published_values(near)
+        if not self.simulated:
+            try:
+                return self.identified(label, run, structure, intervals="quadratic", start=begin)
+            except ModelError:
+                # Out of the bounds that (22)-(25) have.
+                return self.identified(label, run, structure, intervals="quadratic")
+        fit = by_output_error(
+            Task((run,), structure), None, check_threads(self.threads), self.progress, intervals="quadratic",
+            begin=begin, alone=True,
+        )  # fmt: skip
+        result = judged(fit)
+        return self.candidate(label, result.model, result)
 
     def best(
-        self, label: str, structure: Structure, what: str = "all orders and coefficients together",
-        rows: int | None = None,
+        self, label: str, structure: Structure, what: str = "free orders",
+        rows: int | None = None, near: Model | None = None,
     ) -> Candidate:  # fmt: skip
         """Joint output error from the current alone, or driven by the measured other angle where that has no start."""
-        words = f"{what}{' in the published form' * (structure is self.published)}, "
+        words = f"{what}{', (22)–(25)' * (structure is self.published)}, "
         try:
-            return self.joint(label, structure, f"{words}from the current alone, by output error", rows)
+            return self.joint(label, structure, f"{words}by output error", rows, near)
         except ConvergenceError as error:
             self.notes.append(
                 f"stage {self.number}, {label}: from the current alone, {error}; that row is driven by the measured "
                 "other angle instead"
             )
-        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error", rows)
+        return self.joint(label, replace(structure, coupling="measured"), f"{words}by output error", rows, near)
 
     def traces(self, candidates: Mapping[str, Candidate], prior: float = 1.0) -> dict[str, dict[int, Trace]]:
         """Convergence of every equation with every p, at the orders of the model of that p."""
@@ -270,11 +331,11 @@ class StageWork:
 
     def rivals(self, genetic: Genetic | None) -> dict[str, Rival]:
         """Genetic algorithm, differential evolution and lattice on one equation each, like for like."""
-        lattice = Lattice(step=self.preset.lattice.step, alpha=RIVAL_ALPHA)
+        lattice = rivals_lattice(self.preset.lattice.step, self.preset.rivals_step)
         found = {}
         for output in self.measured.outputs:
             single = self.measured.equation(output)
-            self.say(f"{output}: two rivals with as many evaluations as the lattice has candidates")
+            self.begin(f"stage {self.number}: the rivals on {output}", "rivals")
             try:
                 made = like_for_like(
                     self.on, single, lattice, genetic, threads=self.threads, progress=self.progress
@@ -308,14 +369,14 @@ class StageWork:
 
     def by_equation(self) -> Candidate:
         """Least squares at the orders whose equation error is smallest."""
-        self.say(f"stage {self.number}: searching the orders with the smallest equation error")
+        self.begin(f"stage {self.number}: orders by the equation error", "equation")
         return self.searched(
             "smallest equation error", self.preset.lattice, coefficients="least-squares", criterion="equation-error",
             norm="l2",
         )  # fmt: skip
 
-    def derived(self, model: Model) -> Derived:
-        """The deflection by (14)-(15), and with the same numbers by (22)-(25) as published."""
+    def in_published_form(self, model: Model) -> Model:
+        """The numbers of (14)-(15) in the equations (22)-(25), which drop a derivative of the current."""
         h, d = self.number * 2 - 1, self.number * 2
         output = self.measured.outputs[1]
         known = {n: model.coefficients[n] for n in (f"{c}{k}" for c in "ad" for k in (h, d))}
@@ -327,14 +388,32 @@ class StageWork:
             stage=self.number, form="published", orders=orders, coefficients=known,
             coupling=model.structure.coupling,
         )  # fmt: skip
-        other = replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
+        return replace(other, m=model.m, structure=replace(other.structure, initial=model.structure.initial))
+
+    def published_values(self, model: Model) -> dict[str, float]:
+        """The numbers of (14)-(15) as those that are free in (22)-(25) under their laws."""
+        other = self.in_published_form(model)
+        known = {**other.orders, **other.coefficients}
+        h, d = f"a{self.number * 2 - 1}", f"a{self.number * 2}"
+        free = FreeProblem.of(replace(self.published, initial="rest")).names
+        return {n: v for n, v in known.items() if n in free} | {f"r{self.number}": -known[d] / known[h]}
+
+    def derived(self, model: Model) -> Derived:
+        """The deflection by (14)-(15), and with the same numbers by (22)-(25) as published."""
+        output, other = self.measured.outputs[1], self.in_published_form(model)
         whole, published = (compare_means(m, self.on) for m in (model, other))
         drive = f"I{self.number}"
         current = _core.pulse_means(self.on[drive], whole.m, self.on.intersample[drive] == "zoh")
         return Derived(
-            output, order_law(self.number, "derived")["input"].at(orders), pulse_times(whole), current,
+            output, order_law(self.number, "derived")["input"].at(other.orders), pulse_times(whole), current,
             whole.measured[output][0], published.simulated[output][0], whole.simulated[output][0],
         )  # fmt: skip
+
+
+def around(orders: Mapping[str, float], lattice: Lattice, single: Structure) -> dict[str, list[float]]:
+    """Values of a lattice less than two of its coarse steps away from these orders."""
+    values = lattice.values(single)
+    return {n: [v for v in values[n] if abs(v - at) < 2 * COARSE - 1e-9] for n, at in orders.items()}
 
 
 def _known(item: Structure, orders: Mapping[str, float], coefficients: Mapping[str, float]) -> Model:
