@@ -14,6 +14,8 @@ use crate::search::rounds::hunt::Hunt;
 use crate::search::screen::{by_guess, screen, Open};
 use crate::search::spread::visit;
 
+/// Rows whose neighbours are followed.
+const BEST: usize = 64;
 /// Most candidates followed around the best ones.
 const FOLLOWED: usize = 1 << 14;
 /// Most directions in which neighbours are looked for: all of up to five orders, else pairs of orders.
@@ -48,12 +50,13 @@ impl Hunt<'_> {
         let mut stride = (longest / 8).max(1).next_power_of_two();
         let first = tried.len();
         while stride > 0 {
-            let before: Vec<u64> = kept.rows.iter().map(|row| row.index).collect();
+            let best = |kept: &Kept| kept.rows.iter().take(BEST).map(|row| row.index).collect::<Vec<u64>>();
+            let before = best(kept);
             let mut around: Vec<u64> = before.iter().flat_map(|&index| self.around(index, stride)).collect();
             around.retain(|&index| tried.insert(index));
             let open: Vec<Open> = around.iter().map(|&index| Open { index, bound: 0.0, guess: 0.0 }).collect();
             self.follow(&open, kept, Place::start(0), false)?;
-            if kept.rows.iter().map(|row| row.index).eq(before) {
+            if best(kept) == before {
                 stride /= 2;
             }
             if tried.len() - first > FOLLOWED {
