@@ -2,39 +2,45 @@
 
 ``python benches/boxes.py [--steps 0.05 0.02 0.01] [--write]`` prints candidates, seconds of processors and of clock,
 what became of the candidates, and the growth from each step to the next: the exponent of the candidates that the
-processor time follows. ``--psf FILE`` adds a measured run (CSV) of the arm; ``--write`` appends all to
-benches/RESULTS.md.
+processor time follows. ``--psf`` adds the real arm's first link, taken to be at rest; ``--write`` appends all to
+benches/RESULTS.md and writes docs/boxes.json, from which the pages draw the growth.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import os
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import ftlm
-from results import append, heading
+from arm_measured import arm_run
+from results import append, commit, heading, machine
 from search import M, plant_a_run
 
 STEPS = (0.05, 0.02, 0.01, 0.005)
+#: From this the pages draw the growth.
+GROWTH = Path(__file__).resolve().parent.parent / "docs" / "boxes.json"
 
 
 def main() -> None:
     """Search, time, print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=float, nargs="+", default=STEPS)
-    parser.add_argument("--noise", type=float, nargs="+", default=(1e-4, 1e-3), help="deviation on both angles [rad]")
-    parser.add_argument("--psf", type=Path, help="a measured run of the arm's first stage")
+    parser.add_argument("--noise", type=float, nargs="*", default=(1e-4, 1e-3), help="deviation on both angles [rad]")
+    parser.add_argument("--psf", action="store_true", help="the measured run psf as well (FTLM_DATA)")
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     arguments = parser.parse_args()
     equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
     runs = {f"Plant A, {noise:g} rad": plant_a_run(noise, noise) for noise in arguments.noise}
-    if arguments.psf is not None:
-        runs[arguments.psf.stem] = ftlm.load(arguments.psf)
+    if arguments.psf:
+        runs["psf"] = arm_run("psf")
     lines = [heading()]
     print(lines[0], flush=True)
+    searches: list[dict[str, str | float]] = []
     for name, run in runs.items():
         before: tuple[int, float] | None = None
         for step in arguments.steps:
@@ -48,6 +54,7 @@ def main() -> None:
                 exponent = math.log(cpu / before[1]) / math.log(found.candidates / before[0])
                 grown = f", growth as candidates^{exponent:.2f}"
             before = found.candidates, cpu
+            searches.append({"run": name, "step": step, "candidates": found.candidates, "processor": round(cpu, 2)})
             best = ", ".join(f"{n} {v:g}" for n, v in found.table[0].orders.items())
             lines.append(
                 f"{name}, step {step:g}: {found.candidates} candidates, {cpu:.1f} s of processors, {wall:.1f} s, "
@@ -58,6 +65,8 @@ def main() -> None:
             print(lines[-1], flush=True)
     if arguments.write:
         append([f"- {line}" for line in lines])
+        measured = {"commit": commit(), "machine": machine(), "load": os.getloadavg()[0], "searches": searches}
+        GROWTH.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -41,7 +41,7 @@ def draw(folder: Path) -> None:
         "bode": ftlm.plot.bode(best),
         "landscape": ftlm.plot.landscape(searched),
     }
-    for name, figure in (drawn | performance()).items():
+    for name, figure in (drawn | performance() | {"boxes": boxes()}).items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
 
 
@@ -88,6 +88,26 @@ def performance() -> dict[str, Figure]:
     plot.legend()
     drawn["cost-of-operators"] = figure
     return drawn
+
+
+def boxes() -> Figure:
+    """Processor time of searches in boxes against the size of their lattice, from what the bench wrote."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
+
+    measured = json.loads((Path(__file__).parent / "boxes.json").read_text(encoding="utf-8"))
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    figure.suptitle("commit {commit}, {machine}".format(**measured), fontsize="small")
+    plot = figure.add_subplot(xscale="log", yscale="log", xlabel="candidates", ylabel="processor time [s]")
+    plot.grid(visible=True, which="major", linewidth=0.4)
+    searches = measured["searches"]
+    for name in dict.fromkeys(s["run"] for s in searches):
+        rows = sorted((s["candidates"], s["processor"]) for s in searches if s["run"] == name)
+        plot.plot(*zip(*rows, strict=True), marker="o", label=name)
+    first, last = (end(s["candidates"] for s in searches) for end in (min, max))
+    start = min(s["processor"] for s in searches)
+    plot.plot((first, last), (start, start * (last / first) ** 0.5), "k:", label="as candidates to the 0.5")
+    plot.legend()
+    return figure
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 //! What a search will hold at once, counted before any of it is made, and the one limit that it keeps to.
 //!
 //! Counted is what grows with records and lattice: columns, kernels, their products, spectra and test vectors of every
-//! equation and record, rows of the layout of an order law; tables of boxes take of what is left, or there are none. Not
-//! counted are the records themselves, and what each thread needs for one candidate: some vectors of the record's length.
+//! equation and record, rows of the layout of an order law; tables of boxes and vectors made for candidates take of what is
+//! left, or there are none. Not counted are the records themselves, and what each thread needs for one candidate: some
+//! vectors of the record's length.
 
 use crate::error::{Error, Result};
 use crate::fft::{fast_length, Bin};

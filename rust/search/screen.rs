@@ -1,6 +1,7 @@
 //! Screening: coefficients of candidates side by side, and those left open that no proved lower bound excludes.
 
 use crate::lanes::{self, WIDTH};
+use crate::search::bound::adapted::Weighted;
 use crate::search::candidate::columns::{part_of, Columns};
 use crate::search::candidate::normal::Solve;
 use crate::search::catalogue::Catalogue;
@@ -76,6 +77,9 @@ pub(crate) struct Screen<const L: usize> {
     columns: Vec<usize>,
     coefficients: Vec<f64>,
     weights: Vec<f64>,
+    own: Vec<Weighted>,
+    /// The test vector made for a candidate that excluded one last.
+    last: usize,
 }
 
 impl<const L: usize> Screen<L> {
@@ -88,6 +92,8 @@ impl<const L: usize> Screen<L> {
             columns: vec![0; width],
             coefficients: vec![0.0; width],
             weights: Vec::new(),
+            own: Vec::new(),
+            last: 0,
         }
     }
 
@@ -133,7 +139,7 @@ impl<const L: usize> Screen<L> {
         limit: f64,
         (open, singular): &mut (Vec<Open>, Vec<u64>),
     ) {
-        let Self { solve, positions, initial, columns, coefficients, weights, .. } = self;
+        let Self { solve, positions, initial, columns, coefficients, weights, own, last, .. } = self;
         let failed = catalogue.problem.equations.solve(positions, initial, solve);
         #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
         let squares = match &catalogue.problem.squares {
@@ -166,6 +172,11 @@ impl<const L: usize> Screen<L> {
             // Written so that a bound that is not a number excludes nothing.
             if bound > limit {
                 continue;
+            }
+            if let Some(adapted) = &catalogue.problem.adapted {
+                if adapted.exclude(columns, coefficients, limit, own, last) {
+                    continue;
+                }
             }
             open.push(Open { index, bound, guess });
         }

@@ -41,6 +41,11 @@ def test_boxes_keep_the_table_of_one_by_one(run, whole):
     assert sum(whole.pruned.values()) + len(whole.table) == whole.candidates
 
 
+@pytest.mark.parametrize("threads", [3, 8])
+def test_boxes_give_the_same_bits_for_more_threads(run, whole, threads):
+    assert bytes_of(search(run, threads=threads)) == bytes_of(whole)
+
+
 def test_boxes_give_the_same_bits_for_any_threads_in_a_store_and_when_cut(run, whole, tmp_path):
     path = tmp_path / "s.ftlm"
     assert bytes_of(search(run, store=path, threads=1)) == bytes_of(whole)

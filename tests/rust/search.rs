@@ -9,7 +9,7 @@ use ftlm::estimate::iv::Settings;
 use ftlm::estimate::least_squares::{self, Estimate};
 use ftlm::estimate::multi_innovation::{closed_form, Innovation, Rows};
 use ftlm::regressors::Record;
-use ftlm::search::bound::{lower_bounds, out_of_reach};
+use ftlm::search::bound::{excluded_by, lower_bounds, out_of_reach};
 use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis, MAX_CANDIDATES};
 use ftlm::search::options::{Criterion, Estimator, Norm, Options};
@@ -651,6 +651,37 @@ fn the_bound_never_exceeds_the_error() {
 }
 
 #[test]
+fn a_vector_made_for_one_equation_proves_nothing_wrong_of_another_and_all_of_its_own() {
+    let mut random = Random::new(252);
+    let (mut telling, mut own, mut finite) = (0, 0, 0);
+    for _ in 0..1500 {
+        let (record, equation) = random_candidate(&mut random);
+        // Of the same orders and somewhat other coefficients, or of any.
+        let mut made_for = random_candidate(&mut random).1;
+        let alike = random.chance(0.7);
+        if alike {
+            made_for = equation.clone();
+            made_for.coefficients.iter_mut().for_each(|c| *c *= 1.0 + 0.1 * random.normal());
+        }
+        for norm in [Norm::L1, Norm::L2] {
+            let error = raw_error(&record, &equation, norm);
+            if !error.is_finite() {
+                continue;
+            }
+            finite += 1;
+            let by = |other: &Equation, limit: f64| excluded_by(&record, other, &equation, norm, limit).unwrap();
+            assert!(!by(&made_for, error) && !by(&equation, error), "{error:e} is that of {equation:?}");
+            telling += usize::from(alike && by(&made_for, 0.5 * error));
+            own += usize::from(by(&equation, 0.999 * error));
+        }
+    }
+    println!(
+        "of {finite} errors, half is excluded by a neighbour's vector {telling} times, nearly all by its own {own}"
+    );
+    assert!(telling > 300 && own > 1000 && finite > 1500);
+}
+
+#[test]
 fn no_score_within_reach_is_excluded() {
     let mut random = Random::new(249);
     let (mut excluded, mut finite) = (0, 0);
@@ -692,6 +723,10 @@ fn bounds_refuse_what_is_no_equation() {
     assert!(matches!(lower_bounds(&record, &short, Norm::L1), Err(Error::Length { .. })));
     let missing = equation(0, 1.0, &[(7, 0.0, 1.0)]);
     assert!(matches!(lower_bounds(&record, &missing, Norm::L1), Err(Error::Structure { .. })));
+    for (made_for, equation) in [(&short, &truth()), (&truth(), &short)] {
+        assert!(matches!(excluded_by(&record, made_for, equation, Norm::L1, 1.0), Err(Error::Length { .. })));
+    }
+    assert!(matches!(excluded_by(&record, &missing, &truth(), Norm::L1, 1.0), Err(Error::Structure { .. })));
 }
 
 proptest! {

@@ -11,6 +11,7 @@ use crate::equation::{Equation, Structure};
 use crate::error::{check_length, Result};
 use crate::lanes::WIDTH;
 use crate::regressors::{Bank, Index, Key, Record};
+use crate::search::bound::adapted::Adapted;
 use crate::search::bound::probes::Probes;
 use crate::search::bound::reach::Reach;
 use crate::search::bound::vectors::POOL;
@@ -78,6 +79,44 @@ pub fn out_of_reach(
     check_length("fixed coefficients", structure.terms.len(), fixed.len())?;
     check_length("coefficients", structure.terms.len(), start.len())?;
     Ok(bound.excludes(limit, &positions, fixed, &[], start, &mut Reach::default()))
+}
+
+/// Whether the test vector made for one equation proves that another's output error at rest exceeds `limit`: Σ|y − ŷ| or
+/// Σ(y − ŷ)².
+///
+/// # Errors
+/// Orders or signals that make no equation, coefficients that are not one a term.
+///
+/// ```
+/// # use ftlm::equation::{Equation, Structure, Term};
+/// # use ftlm::search::{bound::excluded_by, options::Norm};
+/// # use ftlm::regressors::Record;
+/// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
+/// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
+/// let record = Record::new(0.1, vec![output, input], None)?;
+/// let structure = Structure { output: 0, order: 0.8, terms: vec![Term { signal: 1, order: 0.0 }] };
+/// // y is the integral of order 0.8 of u; twice that misses it by Σ|y|, three times by 2Σ|y|.
+/// let equation = |c: f64| Equation { structure: structure.clone(), coefficients: vec![c] };
+/// let error: f64 = record.signal(0).iter().map(|y| y.abs()).sum();
+/// let proved = |limit: f64| excluded_by(&record, &equation(2.0), &equation(3.0), Norm::L1, limit);
+/// assert!(proved(1.99 * error)? && !proved(2.0 * error)?);
+/// # Ok::<(), ftlm::error::Error>(())
+/// ```
+pub fn excluded_by(record: &Record, made_for: &Equation, equation: &Equation, norm: Norm, limit: f64) -> Result<bool> {
+    let mut index = Index::default();
+    let mut positions = Vec::new();
+    for Equation { structure, coefficients } in [made_for, equation] {
+        structure.check(record.len(), |_| true)?;
+        check_length("coefficients", structure.terms.len(), coefficients.len())?;
+        let keys = (0..structure.terms.len())
+            .map(|k| index.insert(Key::integral(structure.terms[k].signal, structure.integration(k))));
+        positions.push(keys.collect::<Vec<_>>());
+    }
+    let bank = Bank::new(&index, record, equation.structure.output)?;
+    let (banks, targets) = ([bank], [record.signal(equation.structure.output).to_vec()]);
+    let mut adapted = Adapted::new(&banks, &targets, norm);
+    adapted.each.extend(adapted.fit(&banks, &targets, &positions[0], &made_for.coefficients));
+    Ok(adapted.exclude(&positions[1], &equation.coefficients, limit, &mut Vec::new(), &mut 0))
 }
 
 /// The whole pool on one record, and the columns of a structure's terms.

@@ -10,6 +10,7 @@ use crate::search::boxes::cell::{Common, Slab, Stretch, MOST_OTHERS};
 use crate::search::boxes::differences::Differences;
 use crate::search::boxes::side::{Others, Side};
 use crate::search::catalogue::Catalogue;
+use crate::search::lattice::cursor::Cursor;
 use crate::search::lattice::slab;
 use crate::search::lattice::Lattice;
 use crate::search::options::{Criterion, Estimator, Norm, Options};
@@ -309,6 +310,13 @@ where
     let fixed = vec![None; lattice.width()];
     let mut catalogue = Catalogue::new(records, Cow::Borrowed(lattice), &fixed, &options, &pool)?;
     catalogue.problem = pool.install(|| catalogue.problem.with_bound(u64::MAX >> 8));
+    let mut adapted = catalogue.problem.no_adapted().0;
+    for made_for in [index, 0, lattice.count() / 2, lattice.count() - 1] {
+        let mut positions = vec![0; lattice.width()];
+        catalogue.positions(&Cursor::at(lattice, made_for), &mut positions);
+        adapted.each.extend(pool.install(|| catalogue.problem.fit(&adapted, &positions)));
+    }
+    catalogue.problem.adapted = Some(adapted);
     let slab = lattice.slab(index).filter(|_| (2..=MOST_OTHERS + 2).contains(&lattice.width()));
     let Some(slab) = slab else { return Ok(Vec::new()) };
     Ok(pool.install(|| work(&catalogue, &Boxes::new(&catalogue)?, &slab)).unwrap_or_default())

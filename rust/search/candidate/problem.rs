@@ -6,6 +6,7 @@ use crate::estimate::multi_innovation::Rows;
 use crate::haar;
 use crate::lanes::{self, WIDTH};
 use crate::regressors::{Bank, Index, Key, Record};
+use crate::search::bound::adapted::{Adapted, Fitted, Weighted};
 use crate::search::bound::lower::Bound;
 use crate::search::bound::reach::Reach;
 use crate::search::candidate::columns::Columns;
@@ -31,6 +32,8 @@ pub(crate) struct Problem {
     /// Where the equation error in squares ranks: its own Gram matrix, without weights and prior.
     pub(crate) squares: Option<Squares>,
     pub(crate) bound: Option<Bound>,
+    /// Test vectors made for candidates of the search, where these pay.
+    pub(crate) adapted: Option<Adapted>,
     refiner: Option<Refiner>,
     /// Where coefficients are refined: the banks that the bound speaks of, until it is made.
     bound_banks: Vec<Bank>,
@@ -77,8 +80,27 @@ impl lanes::Kernel for Excluding<'_> {
     }
 }
 
+/// [`Adapted::exclude`] as a kernel.
+struct Adapting<'a> {
+    adapted: &'a Adapted,
+    limit: f64,
+    terms: &'a [usize],
+    coefficients: &'a [f64],
+    own: &'a mut Vec<Weighted>,
+}
+
+impl lanes::Kernel for Adapting<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run(self) -> bool {
+        self.adapted.exclude(self.terms, self.coefficients, self.limit, self.own, &mut 0)
+    }
+}
+
 /// Memory of one thread.
 pub(crate) struct Scratch {
+    own: Vec<Weighted>,
     reach: Reach,
     start: Vec<f64>,
     one: Solve<1>,
@@ -94,6 +116,7 @@ pub(crate) struct Scratch {
 impl Default for Scratch {
     fn default() -> Self {
         Self {
+            own: Vec::new(),
             reach: Reach::default(),
             start: Vec::new(),
             one: Solve::new(),
@@ -182,6 +205,7 @@ impl Problem {
             equations: NormalEquations::new(Normal::new(&sum, width, prior), parts, fixed),
             squares: options.scored_by_products().then(|| Squares::new(unweighted, width, samples)),
             bound: None,
+            adapted: None,
             refiner,
             bound_banks,
             options: options.clone(),
@@ -216,6 +240,32 @@ impl Problem {
     /// Regressors on every record.
     pub(crate) fn banks(&self) -> &[Bank] {
         &self.banks
+    }
+
+    /// No test vectors of candidates yet, and the bytes that each will take.
+    pub(crate) fn no_adapted(&self) -> (Adapted, u64) {
+        (Adapted::new(&self.banks, &self.targets, self.options.norm), Adapted::bytes(&self.banks))
+    }
+
+    /// The test vector of the candidate with these columns and its least-squares coefficients, at rest.
+    pub(crate) fn fit(&self, adapted: &Adapted, positions: &[usize]) -> Option<Fitted> {
+        let coefficients = self.alone(positions)?;
+        adapted.fit(&self.banks, &self.targets, positions, &coefficients)
+    }
+
+    /// Whether these test vectors exclude that candidate.
+    pub(crate) fn excluded_by(&self, adapted: &Adapted, positions: &[usize], limit: f64) -> bool {
+        let Some(coefficients) = self.alone(positions) else { return false };
+        let mut own = Vec::new();
+        lanes::widest(Adapting { adapted, limit, terms: positions, coefficients: &coefficients, own: &mut own })
+    }
+
+    /// Least-squares coefficients of the candidate with these columns, at rest; none where it is singular.
+    fn alone(&self, positions: &[usize]) -> Option<Vec<f64>> {
+        let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
+        let mut one = Solve::new();
+        let [singular] = self.equations.solve(&sources, &[], &mut one);
+        (!singular).then(|| one.coefficients.iter().map(|c| c[0]).collect())
     }
 
     /// Size of the output over all records.
@@ -259,7 +309,7 @@ impl Problem {
         control: &Control,
     ) -> Verdict {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
-        let Scratch { reach, start, one, march, coefficients, weights, .. } = scratch;
+        let Scratch { own, reach, start, one, march, coefficients, weights, .. } = scratch;
         let [singular] = self.equations.solve(&sources, initial, one);
         if singular {
             return Verdict::Failed(Failure::Singular);
@@ -290,6 +340,11 @@ impl Problem {
             let (lowest, _) = lanes::widest(Bounding { bound, limit, columns });
             if lowest > limit {
                 return Verdict::Bounded(lowest);
+            }
+        }
+        if let (Some(adapted), true) = (&self.adapted, limit < f64::INFINITY) {
+            if lanes::widest(Adapting { adapted, limit, terms: positions, coefficients, own }) {
+                return Verdict::Bounded(limit);
             }
         }
         let norm = self.options.norm;

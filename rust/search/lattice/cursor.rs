@@ -55,6 +55,36 @@ impl<'a> Cursor<'a> {
         cursor
     }
 
+    /// Index of the candidate of a block whose orders have these positions in their axes, one a term; none where there is
+    /// none.
+    pub(crate) fn find(lattice: &'a Lattice, block: usize, digits: &[usize]) -> Option<u64> {
+        let mut cursor = Self::at(lattice, lattice.blocks.get(block)?.start);
+        let mut index = 0;
+        for (g, group) in lattice.groups.iter().enumerate() {
+            let count = lattice.blocks[block].slices[g].count;
+            let wanted = || group.terms.iter().map(|&term| digits[term]);
+            let (mut lo, mut hi) = (0, count);
+            while lo < hi {
+                let rank = lo + (hi - lo) / 2;
+                cursor.seek(g, rank);
+                if cursor.digits[g].iter().copied().lt(wanted()) {
+                    lo = rank + 1;
+                } else {
+                    hi = rank;
+                }
+            }
+            if lo == count {
+                return None;
+            }
+            cursor.seek(g, lo);
+            if !cursor.digits[g].iter().copied().eq(wanted()) {
+                return None;
+            }
+            index = index * count + lo;
+        }
+        Some(lattice.blocks[block].start + index)
+    }
+
     /// Puts a group at the tuple with this rank.
     fn seek(&mut self, g: usize, rank: u64) {
         let (group, slice) = (&self.lattice.groups[g], &self.lattice.blocks[self.block].slices[g]);

@@ -1,6 +1,7 @@
 //! A search over a lattice, round by round.
 
 mod hunt;
+mod nearby;
 mod plan;
 mod ready;
 mod scouts;

@@ -17,6 +17,7 @@ use crate::search::options::Options;
 use crate::search::outcome::{Counts, Kept, Outcome, Part, Row};
 use crate::search::rounds::hunt::Hunt;
 use crate::search::rounds::plan::{algorithm, round_length, rounds, waves, BOXED, FEW};
+use crate::search::rounds::scouts::Scouted;
 use crate::search::spread::visit;
 use crate::search::threads::pool;
 
@@ -94,10 +95,14 @@ impl<'a> Search<'a> {
             return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
         }
         let pay = count >= BOXED && Boxes::pay(&catalogue);
-        let (limit, which) = Hunt::new(&catalogue, None, pool, control).scout(pay)?;
+        let Scouted { limit, which, adapted } = Hunt::new(&catalogue, None, pool, control).scout(pay)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
             problem.bound = problem.bound.take().map(|bound| bound.chosen(&which));
+        }
+        if let Some((adapted, bytes)) = adapted {
+            catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(adapted.each.len() as u64));
+            catalogue.problem.adapted = Some(adapted);
         }
         let boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
         control.check_stop()?;

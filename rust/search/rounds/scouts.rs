@@ -1,8 +1,11 @@
 //! Scouts: candidates tried beforehand, all over the lattice, which give a first good score and choose the test vectors.
 
+use std::collections::HashSet;
+
 use rayon::prelude::*;
 
 use crate::error::Result;
+use crate::search::bound::adapted::Adapted;
 use crate::search::candidate::columns::Columns;
 use crate::search::candidate::normal::Solve;
 use crate::search::control::Place;
@@ -20,9 +23,20 @@ const VECTORS: usize = 16;
 /// part of the lattice excludes most of it.
 const GUESSED: u64 = 1 << 18;
 
+/// What scouts came to.
+pub(super) struct Scouted {
+    /// A first limit.
+    pub(super) limit: f64,
+    /// The test vectors to work with, the best first.
+    pub(super) which: Option<Vec<usize>>,
+    /// Those made for candidates, and the bytes of each.
+    pub(super) adapted: Option<(Adapted, u64)>,
+}
+
 impl Hunt<'_> {
-    /// A first limit, and the test vectors to work with: all of them, the best first, where `all` is true.
-    pub(super) fn scout(&mut self, all: bool) -> Result<(f64, Option<Vec<usize>>)> {
+    /// A first limit and test vectors; the neighbours of the best are followed and vectors made for candidates where
+    /// `thorough` is true.
+    pub(super) fn scout(&mut self, thorough: bool) -> Result<Scouted> {
         let catalogue = self.catalogue;
         let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
         let count = lattice.count();
@@ -72,13 +86,18 @@ impl Hunt<'_> {
         likely.truncate(keep.max(16).saturating_mul(4));
         let mut kept = Kept::new(keep, f64::INFINITY);
         self.follow(&likely, &mut kept, Place::start(0), false)?;
+        let mut made = None;
+        if thorough {
+            let mut tried: HashSet<u64> = likely.iter().map(|open| open.index).collect();
+            made = self.nearby(&mut kept, &mut tried)?;
+        }
         let limit = kept.limit;
         // Where no coefficients are known yet all test vectors count.
         let which = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
             let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
-            choose(&each, if all { bound.len() } else { VECTORS.min(bound.len()) }, limit)
+            choose(&each, VECTORS.min(bound.len()), limit)
         });
-        Ok((limit, which))
+        Ok(Scouted { limit, which, adapted: made })
     }
 }
 
