@@ -511,14 +511,11 @@ proptest! {
     }
 }
 
+/// Equation, unknown, whole order of the integral, coefficient.
+type Integral = (usize, usize, usize, f64);
+
 /// The same system by kernels and division.
-fn by_division(
-    n: usize,
-    m: usize,
-    step: f64,
-    terms: &[(usize, usize, usize, f64)],
-    sources: &[Source],
-) -> Vec<Vec<f64>> {
+fn by_division(n: usize, m: usize, step: f64, terms: &[Integral], sources: &[Source]) -> Vec<Vec<f64>> {
     let mut matrix = vec![vec![vec![0.0; m]; n]; n];
     (0..n).for_each(|i| matrix[i][i][0] = 1.0);
     for &(i, j, order, c) in terms {
