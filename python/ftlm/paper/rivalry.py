@@ -17,7 +17,7 @@ from ftlm.search.result import SearchResult
 from ftlm.solve.records import prepare
 
 #: Most seeds, fewest, and how many evaluations of one rival on one angle all seeds together may come to.
-MOST_SEEDS, FEWEST_SEEDS, EVALUATIONS = 10, 3, 20_000
+MOST_SEEDS, FEWEST_SEEDS, EVALUATIONS = 10, 3, 40_000
 #: Smallest step of the rivals' lattice, on every arm, unless another is asked for: the paper's has 60 000 candidates an
 #: angle, as many evaluations a seed, and takes minutes.
 CONTEST_STEP = 0.1
