@@ -167,6 +167,16 @@ def test_a_run_of_its_own_judges(runs):
     assert found.validation == f"{runs[1].name}, not fitted to"
 
 
+def test_what_was_chosen_from_rest_is_judged_on_a_run_in_motion(runs):
+    whole = motor(3, rows=800)
+    found = ftlm.select(whole.slice(0, 8.0), [ftlm.equation("D^2 y = d D y + a y + b u")], threads=1)
+    late = whole.slice(8.0, 16.0)
+    ours = found.best.validate(late).fit_percent["y"]
+    theirs = ftlm.identify(whole.slice(0, 8.0), found.winner.structure).validate(late).fit_percent["y"]
+    assert ours > 95.0
+    assert abs(ours - theirs) < 0.1
+
+
 def test_auto_has_an_equation_of_each_order(runs):
     made = automatic(runs)
     assert [len(s.equations[0].terms) for s in made] == [2, 3, 4, 5]

@@ -218,8 +218,13 @@ def _bic(trial: Trial) -> float:
 
 
 def _as_judged(trial: Trial, folds: Folds) -> Structure:
-    """The structure with the initial terms that it was judged with."""
-    return trial.structure if trial.joint is None else replace(trial.structure, initial=trial.joint.initial)
+    """The structure with the initial terms that it was judged with.
+
+    From rest none are needed, and none are forbidden: what it is told of next may be a run in motion.
+    """
+    if trial.joint is None or (trial.structure.initial == "auto" and trial.joint.initial == "rest"):
+        return trial.structure
+    return replace(trial.structure, initial=trial.joint.initial)
 
 
 def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
