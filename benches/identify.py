@@ -3,7 +3,7 @@
 ``python benches/identify.py [five] [three] [long]``: theta22 of both laboratories' runs at 8 ms, five coefficients
 (promise P9), the same with three free orders, and one run of 50 000 samples with a free order (P10). Each in a process
 of its own; the rival of the first is SciPy's least_squares on the two numbers of the link, all that is linear projected
-out by run (less than the five numbers that both runs share), from twenty starts. ``--samples`` sets the last's length.
+out by run (less than the five numbers that both runs share), from twenty starts..
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def long(samples: int) -> None:
     u = np.repeat(rng.choice([-1.0, 1.0], size=samples // 50 + 1), 50)[:samples]
     machine = ftlm.Model(ftlm.equation("D^1.4 y = -4 y + 2 u"))
     drive = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": np.zeros(samples)})
-    y = machine.simulate(drive, tolerance=1e-2)["y"]
+    y = machine.simulate(drive, tolerance=1e-4)["y"]
     y = y + 0.01 * np.std(y) * rng.normal(size=samples)
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y})
     before, found = peak(), []
@@ -114,7 +114,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", default=["five", "rival", "three", "long"])
-    parser.add_argument("--samples", type=int, default=50_000)
+    parser.add_argument("--samples", type=int, default=50_000, help="of the long run, up to 262 144")
     parser.add_argument("--alone", action="store_true", help="measure in this process")
     parser.add_argument("--write", action="store_true", help="append to RESULTS.md")
     asked = parser.parse_args()
