@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import ftlm
+from ftlm.demo import demo_run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,7 +28,7 @@ def example(name: str, kind: str, seed: int) -> ftlm.Run:
 
 
 def draw(folder: Path) -> None:
-    """Write every picture."""
+    """Write every picture; that of the README is kept beside this file."""
     folder.mkdir(exist_ok=True)
     square, chirp = example("square", "square", 1), example("chirp", "chirp", 2)
     structure = ftlm.equation(
@@ -40,6 +41,7 @@ def draw(folder: Path) -> None:
         "residuals": ftlm.plot.residuals(best),
         "bode": ftlm.plot.bode(best),
         "landscape": ftlm.plot.landscape(searched),
+        "unseen": unseen(),
     }
     for name, figure in (drawn | performance() | {"boxes": boxes()}).items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
@@ -107,6 +109,28 @@ def boxes() -> Figure:
     start = min(s["processor"] for s in searches)
     plot.plot((first, last), (start, start * (last / first) ** 0.5), "k:", label="as candidates to the 0.5")
     plot.legend()
+    return figure
+
+
+def unseen() -> Figure:
+    """A deflection that neither model was fitted to: the published algorithm and the default, from the same run."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
+
+    square, sine = (demo_run(kind, duration=6.0).select(["I1", "theta11", "theta12"]) for kind in ("square", "sine"))
+    link = ftlm.flexible_link(stage=1, form="published", coupling="measured", laws=())
+    published = ftlm.identify(
+        square, link, method="multi-innovation", lattice=ftlm.lattice(step=0.2, alpha=(1.4, 2.0))
+    ).validate(sine)
+    ours = ftlm.identify(square, ftlm.flexible_link(stage=1, coupling="simulated")).validate(sine)
+    thin = slice(None, None, 4)
+    figure = Figure(figsize=(7, 2.8), layout="constrained")
+    figure.suptitle("Tip deflection of a simulated arm on a run that neither model was fitted to", fontsize="small")
+    plot = figure.add_subplot(xlabel="time [s]", ylabel="deflection [rad]")
+    plot.plot(sine.time[thin], sine["theta12"][thin], color="0.7", linewidth=3, label="measured, noise of 1e-4 rad")
+    for name, fit, style in (("published algorithm", published, "C1"), ("ftlm identify", ours, "C0")):
+        words = f"{name}: {max(fit.fit_percent['theta12'], 0.0):.1f} %"
+        plot.plot(sine.time[thin], fit.simulated["theta12"][0][thin], style, linewidth=1, label=words)
+    figure.legend(fontsize="small", loc="outside lower center", ncols=3)
     return figure
 
 
