@@ -219,7 +219,7 @@ def test_empty_cells_may_be_missing(tmp_path) -> None:
     path = tmp_path / "run.csv"
     path.write_text("t,u,y\n0,1,0\n0.1,1,\n0.2,,2\n0.3,0,3\n0.4,0,4\n")
     columns = {"inputs": ["u"], "outputs": ["y"]}
-    with pytest.raises(ftlm.DataError, match=r"column 'u', line 4: empty cell, .* missing='weight' or 'hold'"):
+    with pytest.raises(ftlm.DataError, match=r"column 'u', line 4: empty cell, .* missing='weight' or missing='hold'"):
         ftlm.load(path, **columns)
     with pytest.raises(ftlm.DataError, match=r"column 'u', line 4: empty cell"):
         ftlm.load(path, missing="weight", **columns)
