@@ -77,6 +77,46 @@ def test_python_control_simulates_the_model():
     np.testing.assert_allclose(delayed[100:], one.step_response(t)[0, 0][100:], atol=5e-3)
 
 
+def test_systems_of_python_control_become_models():
+    rng = np.random.default_rng(5)
+    w = np.geomspace(0.05, 50, 40)
+    states = control.ss(
+        rng.standard_normal((4, 4)) - 3 * np.eye(4), rng.standard_normal((4, 2)), rng.standard_normal((2, 4)),
+        [[0, 0.5], [0, 0]], inputs=["force", "torque"], outputs=["x", "angle"],
+    )  # fmt: skip
+    made = ftlm.Model.from_control(states)
+    assert list(made.outputs) == ["x", "angle"]
+    np.testing.assert_allclose(made.frequency_response(w), states(1j * w), rtol=1e-9)
+    fraction = control.tf([[[2, 1], [3]]], [[[1, 0.4, 9], [2, 4]]])
+    both = ftlm.Model.from_control(fraction)
+    assert str(both).startswith("D^3 y = ")
+    np.testing.assert_allclose(both.frequency_response(w), np.reshape(fraction(1j * w), (1, 2, -1)), rtol=1e-10)
+    one = ftlm.Model.from_control(control.tf([4], [1, 5, 40]), inputs=["u"], outputs=["speed"])
+    assert str(one) == str(model("D^2 speed = -5 D speed - 40 speed + 4 u"))
+    back = one.to_control(band=(0.1, 100))
+    np.testing.assert_allclose(back(1j * w), control.tf([4], [1, 5, 40])(1j * w), rtol=1e-9)
+    # A double integrator has one term; what rounding leaves of its other coefficients is none.
+    cart = ftlm.Model.from_control(control.ss([[0, 1], [0, 0]], [[0], [1]], [[1, 0]], [[0]]))
+    assert str(cart) == str(model("D^2 y = 1 u"))
+
+
+@pytest.mark.parametrize(
+    ("system", "options", "words"),
+    [
+        (control.tf([1], [1, 0.5], 0.1), {}, "sampled"), (control.tf([3], [1]), {}, "order 0"),
+        (3.0, {}, "float is no system"), (control.tf([1, 0, 0], [1, 1]), {}, "more zeros than poles"),
+        (control.tf([0], [1, 1]), {}, "order 0"), (control.tf([1], [1, 1]), {"inputs": ["a", "b"]}, "2 given"),
+        (control.tf([1], [1, 1]), {"inputs": ["y"]}, "input and output at once"),
+        (control.tf([1], [1, 1]), {"inputs": ["a b"]}, "a b"),
+        (control.frd([1, 2, 3], [1, 2, 3]), {}, "FrequencyData"),
+        (control.tf([1], np.poly(-np.arange(1, 12))), {}, "order 11"),
+    ],
+)  # fmt: skip
+def test_systems_that_are_no_equations_are_refused(system, options, words):
+    with pytest.raises(ftlm.ModelError, match=words):
+        ftlm.Model.from_control(system, **options)
+
+
 def test_a_poor_approximation_warns_about_margins():
     with pytest.warns(UserWarning, match="a gain or phase margin smaller than that means nothing"):
         system = model(ONE).to_control(band=(1e-4, 1e4), order=1)

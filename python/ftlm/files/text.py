@@ -54,7 +54,9 @@ class _Trouble:
         way_out = "correct or remove these rows"
         if not text:
             what = "empty cell" + (", or one with an error or a formula that nobody computed" if self.sheet else "")
-            way_out = "fill or remove these rows yourself, or let them be missing with missing='weight' or missing='hold'"
+            way_out = (
+                "fill or remove these rows yourself, or let them be missing with missing='weight' or missing='hold'"
+            )
         elif self.comma and "." in text and is_number(text):
             what = f"{shown} has a point where decimals follow a comma"
             way_out = "write all numbers alike, without marks between thousands"

@@ -22,6 +22,7 @@ from ftlm.solve.free_run import simulate
 from ftlm.solve.frequency import frequency_response, step_response
 from ftlm.solve.modes import Mode, dcgain, modes
 from ftlm.solve.stability import Stability, poles, stability
+from ftlm.solve.whole_orders import structure_of
 
 
 class Model(Solved):
@@ -138,6 +139,28 @@ class Model(Solved):
             An input that saturates or has a dead zone.
         """
         return bode(self, w)
+
+    @classmethod
+    def from_control(
+        cls, system: Any, *, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None
+    ) -> Model:
+        """A continuous system of python-control as a model of whole orders, one equation an output.
+
+        Parameters
+        ----------
+        system
+            ``control.StateSpace`` or ``control.TransferFunction``. Equations show transfer behaviour: what no input
+            reaches, or no output shows, cancels in them only if it cancels exactly there.
+        inputs, outputs
+            Names of the signals; default the system's own, ``u[0]`` as ``u``, or ``u0`` beside others.
+
+        Raises
+        ------
+        ModelError
+            A sampled system, one of another kind, an output without dynamics or input, more zeros than poles, an order
+            above 10, names that are none or too few.
+        """
+        return cls(structure_of(system, inputs, outputs))
 
     def to_control(self, *, band: tuple[float, float], order: int = 5) -> Any:
         """A python-control system by Oustaloup's approximation; see :func:`ftlm.exports.to_control`."""

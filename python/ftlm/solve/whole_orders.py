@@ -1,0 +1,122 @@
+"""Continuous systems of python-control as equations of whole orders."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+from ftlm.base.errors import ModelError
+from ftlm.data.language import equation
+from ftlm.data.orders import MAX_ORDER
+from ftlm.data.structures import Structure
+
+#: Share of the largest number that went into it below which a Markov parameter is rounding.
+ROUNDING = 1e-12
+_LABEL = re.compile(r"([A-Za-z]+)\[(\d+)\]")
+
+
+def structure_of(system: Any, inputs: Sequence[str] | None = None, outputs: Sequence[str] | None = None) -> Structure:
+    """Return the equations of a python-control system; see :meth:`ftlm.Model.from_control`."""
+    if getattr(system, "dt", None) not in (0, None):
+        raise ModelError(
+            f"the system is sampled (dt = {system.dt}); an equation is of continuous time: design it there"
+        )
+    if hasattr(system, "A"):
+        parts = _of_states(*(np.asarray(getattr(system, n), dtype=float) for n in "ABCD"))
+    elif hasattr(system, "num") and hasattr(system, "den"):
+        parts = _of_fractions(system.num, system.den)
+    else:
+        raise ModelError(
+            f"{type(system).__name__} is no system of python-control with equations; for a measured response use "
+            "ftlm.FrequencyData.from_arrays"
+        )
+    signals = _names("inputs", inputs, getattr(system, "input_labels", None), len(parts[0][1]))
+    results = _names("outputs", outputs, getattr(system, "output_labels", None), len(parts))
+    twice = sorted(set(signals) & set(results))
+    if twice:
+        raise ModelError(f"{', '.join(twice)}: input and output at once; pass inputs= and outputs= with other names")
+    rows = zip(results, parts, strict=True)
+    return equation("\n".join(_written(name, signals, *part) for name, part in rows), coupling="measured")
+
+
+def _written(output: str, inputs: Sequence[str], bottom: Floats, tops: Sequence[Floats]) -> str:
+    """An equation in words: D^n y = … from a denominator and a numerator an input, highest powers first."""
+    order = bottom.size - 1
+    if not 0 < order <= MAX_ORDER:
+        raise ModelError(f"{output} is of order {order}; an equation has an order from 1 to {MAX_ORDER:g}")
+    terms = [(-c, output, order - k) for k, c in enumerate(bottom) if k > 0]
+    for name, top in zip(inputs, tops, strict=True):
+        if top.size > bottom.size:
+            raise ModelError(f"{output} from {name} has more zeros than poles; add a pole far out")
+        terms += [(c, name, top.size - 1 - k) for k, c in enumerate(top)]
+    words = [f"{float(c)!r} D^{k} {name}" for c, name, k in terms if c]
+    if not any(name != output for c, name, _ in terms if c):
+        raise ModelError(f"no input moves {output}; leave it out")
+    return f"D^{order} {output} = " + " + ".join(words).replace("+ -", "- ")
+
+
+def _of_fractions(tops: Any, bottoms: Any) -> list[tuple[Floats, list[Floats]]]:
+    """A common monic denominator of each output, and the numerators over it."""
+    found = []
+    for top, bottom in zip(tops, bottoms, strict=True):
+        own = [np.trim_zeros(np.atleast_1d(np.asarray(d, dtype=float)), "f") for d in bottom]
+        distinct: list[Floats] = []
+        for d in (d / d[0] for d in own):
+            if not any(d.size == known.size and np.array_equal(d, known) for known in distinct):
+                distinct.append(d)
+        common = _product(distinct)
+        over = []
+        for n, d in zip(top, own, strict=True):
+            rest = [known for known in distinct if not np.array_equal(known, d / d[0])]
+            values = np.trim_zeros(np.atleast_1d(np.asarray(n, dtype=float)), "f") / d[0]
+            over.append(_product([values, *rest]) if values.size else np.zeros(1))
+        found.append((common, over))
+    return found
+
+
+def _product(factors: Sequence[Floats]) -> Floats:
+    out: Floats = np.ones(1)
+    for factor in factors:
+        out = np.convolve(out, factor)
+    return out
+
+
+def _of_states(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats, list[Floats]]]:
+    """By Leverrier's recursion: C adj(sI - A) B + D det(sI - A), what rounding left above the first answer dropped."""
+    count = a.shape[0]
+    bottom, powers = [1.0], [np.eye(count)]
+    for k in range(1, count + 1):
+        moved = a @ powers[-1]
+        bottom.append(-float(np.trace(moved)) / k)
+        powers.append(moved + bottom[-1] * np.eye(count))
+    scale = max(float(np.linalg.norm(a, 2)) if count else 0.0, 1e-300)
+    found = []
+    for i in range(c.shape[0]):
+        tops = []
+        for j in range(b.shape[1]):
+            top = d[i, j] * np.array(bottom)
+            top[1:] += [float(c[i] @ p @ b[:, j]) for p in powers[:count]]
+            if d[i, j] == 0.0:
+                size = float(np.linalg.norm(c[i]) * np.linalg.norm(b[:, j]))
+                answers = [abs(float(c[i] @ np.linalg.matrix_power(a, k) @ b[:, j])) for k in range(count)]
+                seen = [k for k, v in enumerate(answers) if v > ROUNDING * size * scale**k]
+                top[: 1 + (seen[0] if seen else count)] = 0.0
+            tops.append(top)
+        found.append((np.array(bottom), tops))
+    return found
+
+
+def _names(what: str, given: Sequence[str] | None, labels: Sequence[str] | None, count: int) -> list[str]:
+    """Names of signals: as given, or the system's own, u[0] as u0, or as u where it is the only one."""
+    if given is not None:
+        names = [given] if isinstance(given, str) else list(given)
+        if len(names) != count:
+            raise ModelError(f"{what}: {len(names)} given, the system has {count}")
+        return names
+    names = list(labels) if labels else [f"{what[0]}[{k}]" for k in range(count)]
+    plain = [_LABEL.fullmatch(n) for n in names]
+    return [n if m is None else m[1] + (m[2] if count > 1 else "") for n, m in zip(names, plain, strict=True)]
