@@ -95,14 +95,14 @@ def _of_states(a: Floats, b: Floats, c: Floats, d: Floats) -> list[tuple[Floats,
         powers.append(moved + bottom[-1] * np.eye(count))
     scale = max(float(np.linalg.norm(a, 2)) if count else 0.0, 1e-300)
     found = []
-    for i in range(c.shape[0]):
+    for i, row in enumerate(c):
         tops = []
         for j in range(b.shape[1]):
             top = d[i, j] * np.array(bottom)
-            top[1:] += [float(c[i] @ p @ b[:, j]) for p in powers[:count]]
+            top[1:] += [float(row @ p @ b[:, j]) for p in powers[:count]]
             if d[i, j] == 0.0:
-                size = float(np.linalg.norm(c[i]) * np.linalg.norm(b[:, j]))
-                answers = [abs(float(c[i] @ np.linalg.matrix_power(a, k) @ b[:, j])) for k in range(count)]
+                size = float(np.linalg.norm(row) * np.linalg.norm(b[:, j]))
+                answers = [abs(float(row @ np.linalg.matrix_power(a, k) @ b[:, j])) for k in range(count)]
                 seen = [k for k, v in enumerate(answers) if v > ROUNDING * size * scale**k]
                 top[: 1 + (seen[0] if seen else count)] = 0.0
             tops.append(top)
