@@ -299,7 +299,8 @@ def test_rivals_have_the_same_lattice_and_as_many_seeds_on_every_arm(monkeypatch
 
 def test_seeds_are_ten_or_as_many_as_the_evaluations_allow():
     assert seeds_for(224) == tuple(range(10))
-    assert len(seeds_for(3800)) == 5
+    assert len(seeds_for(3800)) == 10
+    assert len(seeds_for(8000)) == 5
     assert seeds_for(61_620) == (0, 1, 2)
 
 
@@ -384,8 +385,8 @@ def test_the_time_that_is_said_beforehand_is_the_sum_of_all_steps():
     assert seconds_of_all(0.025, 1) > stage > seconds_of_all(0.1, 1)
     # Rivals' lattices are no finer than theirs.
     assert seconds_of("rivals", 0.05) == seconds_of("rivals", 0.1) > seconds_of("rivals", 0.2)
-    # Sixteen times the evaluations a seed, three seeds for five.
-    assert seconds_of("rivals", 0.05, 0.05) == pytest.approx(16 * 3 / 5 * seconds_of("rivals", 0.05))
+    # Sixteen times the evaluations a seed, three seeds for ten.
+    assert seconds_of("rivals", 0.05, 0.05) == pytest.approx(16 * 3 / 10 * seconds_of("rivals", 0.05))
 
 
 # ----------------------------------------------------------------------------------------------------------------------
