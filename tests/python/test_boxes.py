@@ -50,6 +50,7 @@ def test_boxes_give_the_same_bits_for_any_threads_in_a_store_and_when_cut(run, w
     path = tmp_path / "s.ftlm"
     assert bytes_of(search(run, store=path, threads=1)) == bytes_of(whole)
     data = path.read_bytes()
-    path.write_bytes(data[: len(data) // 2])
+    # What is searched, and where, stands first and is most of it.
+    path.write_bytes(data[: len(data) * 17 // 20])
     assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
     assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
