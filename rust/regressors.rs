@@ -103,6 +103,11 @@ impl Record {
         self.filter.is_some()
     }
 
+    /// The series of that filter.
+    pub(crate) fn filter(&self) -> Option<&[f64]> {
+        self.filter.as_deref()
+    }
+
     /// Number of pulses.
     #[must_use]
     pub fn m(&self) -> usize {

@@ -154,10 +154,15 @@ impl Division {
 
     /// Solves for whole right-hand sides.
     pub(super) fn run<S: AsRef<[f64]>>(&mut self, matrix: &[Vec<S>], inverse: &[f64], rhs: &[&[f64]]) {
+        self.run_to(self.m, matrix, inverse, rhs);
+    }
+
+    /// The same for the first terms alone, and whatever its blocks solve behind them.
+    pub(super) fn run_to<S: AsRef<[f64]>>(&mut self, terms: usize, matrix: &[Vec<S>], inverse: &[f64], rhs: &[&[f64]]) {
         for (i, b) in rhs.iter().enumerate() {
             self.add(i, 0, b);
         }
-        while self.solved < self.m {
+        while self.solved < terms {
             self.advance(inverse, |i, j, len| &matrix[i][j].as_ref()[..len]);
         }
     }

@@ -4,6 +4,7 @@ use super::division::Division;
 use super::product::Kernel;
 use crate::error::{check_length, Error, Result};
 use crate::small;
+use std::borrow::Cow;
 
 /// Quotient mod z^m, m the numerator's length; exact whether or not the divisor is stable. O(m log² m).
 ///
@@ -59,7 +60,7 @@ pub fn solve<S: AsRef<[f64]>>(matrix: &[Vec<S>], rhs: &[&[f64]]) -> Result<Vec<V
 
 /// A system of series that is solved for many right-hand sides: the spectra of its matrix are made once.
 pub struct Solver<'a> {
-    matrix: &'a [Vec<Vec<f64>>],
+    matrix: Cow<'a, [Vec<Vec<f64>>]>,
     inverse: Vec<f64>,
     division: Division,
 }
@@ -70,9 +71,21 @@ impl<'a> Solver<'a> {
     /// # Errors
     /// [`Error::LeadingZero`] where the matrix of leading coefficients is singular, [`Error::Length`].
     pub fn new(matrix: &'a [Vec<Vec<f64>>]) -> Result<Self> {
+        Self::of(Cow::Borrowed(matrix))
+    }
+
+    /// The same of a matrix that it keeps.
+    ///
+    /// # Errors
+    /// As [`Solver::new`].
+    pub fn keeping(matrix: Vec<Vec<Vec<f64>>>) -> Result<Solver<'static>> {
+        Solver::of(Cow::Owned(matrix))
+    }
+
+    fn of(matrix: Cow<'a, [Vec<Vec<f64>>]>) -> Result<Self> {
         let n = matrix.len();
         let m = matrix.first().and_then(|row| row.first()).map_or(0, Vec::len);
-        for row in matrix {
+        for row in matrix.iter() {
             check_length("row of the matrix of series", n, row.len())?;
             for series in row {
                 check_length("series", m, series.len())?;
@@ -80,22 +93,30 @@ impl<'a> Solver<'a> {
         }
         let first = |s: &Vec<f64>| s.first().copied().unwrap_or(0.0);
         let leading: Vec<f64> = matrix.iter().flat_map(|row| row.iter().map(first)).collect();
-        Ok(Self { matrix, inverse: small::inverse(&leading, n)?, division: Division::new(n, m) })
+        let inverse = small::inverse(&leading, n)?;
+        Ok(Self { matrix, inverse, division: Division::new(n, m) })
     }
 
-    /// Solves for one right-hand side of n series of m terms.
+    /// Number of terms m.
+    #[must_use]
+    pub fn terms(&self) -> usize {
+        self.division.terms()
+    }
+
+    /// Solves for one right-hand side of n series of m terms, or of fewer, as many for all.
     ///
     /// # Errors
     /// [`Error::Length`].
     pub fn solve(&mut self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         check_length("right-hand sides", self.matrix.len(), rhs.len())?;
+        let asked = rhs.first().map_or(0, Vec::len).min(self.division.terms());
         for b in rhs {
-            check_length("right-hand side", self.division.terms(), b.len())?;
+            check_length("right-hand side", asked, b.len())?;
         }
         let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
         self.division.restart();
-        self.division.run(self.matrix, &self.inverse, &borrowed);
-        Ok(self.division.quotients().to_vec())
+        self.division.run_to(asked, &self.matrix, &self.inverse, &borrowed);
+        Ok(self.division.quotients().iter().map(|quotient| quotient[..asked].to_vec()).collect())
     }
 
     /// Series of A⁻¹: `[j][i]` is what a unit pulse in the error of equation i does to unknown j. n solutions.

@@ -675,3 +675,66 @@ fn what_nothing_excites_stays_where_it_was() {
     let found = fit(&model, &experiments, &point(&[], &[-4.0, 3.0, 7.5]), Settings::default()).unwrap();
     assert_eq!(found.point.coefficients[2], 7.5);
 }
+
+/// Residuals and their slopes of a fit and of the same point evaluated by itself are the same.
+fn agree(name: &str, found: &Fit, alone: &Fit) {
+    check(&format!("{name}: residuals"), relative_distance(&found.residuals, &alone.residuals), 1e-8);
+    for (parameter, (one, other)) in found.jacobian.iter().zip(&alone.jacobian).enumerate() {
+        check(&format!("{name}: slope {parameter}"), relative_distance(one, other), 1e-5);
+    }
+}
+
+#[test]
+fn runs_on_one_grid_share_what_does_not_depend_on_the_run() {
+    let still = [vec![(0.0, 0.3)], vec![(0.0, -0.1), (1.0, 0.2)]];
+    // The first is alone on its grid, and so is the last, which is too short to share.
+    let runs = [
+        run(150, 2, &still, 0.02, 410),
+        run(150, 1, &still, 0.02, 411),
+        run(131, 1, &[], 0.02, 412),
+        run(40, 1, &[], 0.02, 413),
+    ];
+    for (coupled, initial) in [(true, Initial::Caputo), (false, Initial::Caputo), (true, Initial::Rest)] {
+        let model = two_link(coupled, initial);
+        let (orders, coefficients) = ([0.8, 0.2, 0.85], START.1);
+        let together = at(&model, &runs, &orders, &coefficients);
+        let alone: Vec<Fit> =
+            runs.iter().map(|one| at(&model, std::slice::from_ref(one), &orders, &coefficients)).collect();
+        let joined = |rows: &dyn Fn(&Fit) -> Vec<f64>| alone.iter().flat_map(rows).collect::<Vec<f64>>();
+        check("residuals", relative_distance(&together.residuals, &joined(&|fit| fit.residuals.clone())), 1e-10);
+        for parameter in 0..8 {
+            let rows = joined(&|fit| fit.jacobian[parameter].clone());
+            check(&format!("slope {parameter}"), relative_distance(&together.jacobian[parameter], &rows), 1e-9);
+        }
+        assert_eq!(together.initial.len(), 4);
+        for (one, other) in together.initial.iter().zip(&alone) {
+            check("initial terms", relative_distance(&one.concat(), &other.initial[0].concat()), 1e-8);
+        }
+    }
+}
+
+#[test]
+fn a_filter_that_all_outputs_pass_may_come_first() {
+    let still = [vec![(0.0, 0.3)], vec![(0.0, -0.1), (1.0, 0.2)]];
+    for (name, coupled, initial) in [
+        ("coupled", true, Initial::Caputo),
+        ("measured coupling", false, Initial::Caputo),
+        ("with impulses", false, Initial::Powers(vec![-1.0, 0.0])),
+        ("from rest", true, Initial::Rest),
+    ] {
+        let runs: Vec<Experiment> = [(150, 420), (131, 421)]
+            .into_iter()
+            .map(|(intervals, seed)| {
+                let run = run(intervals, 1, &still, 0.02, seed);
+                let series = (0..run.record.m()).map(|k| 0.4 * 0.6_f64.powi(i32::try_from(k).unwrap())).collect();
+                run.with_filter(series, vec![true, true]).unwrap()
+            })
+            .collect();
+        let model = two_link(coupled, initial);
+        let start = point(&[0.8, 0.2, 0.85], &START.1);
+        // More than one evaluation lets it pass first, one by itself does not.
+        let found = fit(&model, &runs, &start, Settings { evaluations: 4, ..Settings::default() }).unwrap();
+        assert!(found.evaluations > 1);
+        agree(name, &found, &at(&model, &runs, &found.point.orders, &found.point.coefficients));
+    }
+}

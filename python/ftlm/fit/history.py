@@ -14,6 +14,7 @@ from ftlm.data.run import Run
 from ftlm.data.settings import Loss
 from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Structure
+from ftlm.fit.grid import Attempt
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.motion import has_memory, history, misfit, missed, needed, together
@@ -38,44 +39,63 @@ def fit_any_start(
     history makes them much better. Which terms were fitted is in the result.
     """
 
-    def fitted(initial: Initial) -> JointFit:
+    def fitted(initial: Initial, *, refine: bool = True, raced: list[Attempt] | None = None) -> JointFit:
         asked = replace(structure, initial=initial)
-        if alone:
-            return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss, start=known[0])
-        return fit_output_error(runs, asked, threads=threads, progress=progress, loss=loss, known=known)
+        begin, beside = (known[0], ()) if alone else (None, known)
+        return fit_output_error(
+            runs, asked, threads=threads, start=begin, refine=refine, progress=progress, loss=loss, known=beside,
+            raced=raced,
+        )  # fmt: skip
 
+    decided = structure.initial != "auto" or not has_memory(structure) or structure.has_friction
+    if not decided and isinstance(start, History):
+        # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks for
+        # more terms, not for fewer.
+        raced: list[Attempt] = []
+        many = fitted(start, refine=False, raced=raced)
+        kept = _shorter(many, runs, structure, loss, refine=False)
+        if kept.growth is None and many.growth is None:
+            fine = fit_output_error(runs, replace(structure, initial=kept.initial), near=kept, loss=loss)
+            fine = replace(fine, starts=many.starts, origin=many.origin)
+            return fine if kept is not many else _shorter(fine, runs, structure, loss, refine=True)
+        # Where a free run may grow, the starts of the race are asked on every grid.
+        return _shorter(fitted(start, raced=raced), runs, structure, loss, refine=True)
     joint = fitted(start)
-    if structure.initial != "auto" or not has_memory(structure) or structure.has_friction:
+    if decided or start != "rest" or not _moved(joint, runs, structure):
         return joint
-    if start == "rest":
-        if not _moved(joint, runs, structure):
-            return joint
-        return fitted(together([history(run, structure) for run in runs]) or history(runs[0], structure))
-    return _shorter(joint, runs, structure, loss) if isinstance(start, History) else joint
+    return fitted(together([history(run, structure) for run in runs]) or history(runs[0], structure))
 
 
-def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss) -> JointFit:
+def _shorter(joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool) -> JointFit:
     """The fit with Caputo's terms where they are enough, else the one with a history."""
-    values = dict(zip(joint.names, joint.values.tolist(), strict=True))
     try:
-        few = fit_output_error(runs, replace(structure, initial="caputo"), start=values, loss=loss)
+        few = _from(joint, runs, replace(structure, initial="caputo"), loss, refine=refine)
     except FtlmError:
         # From here it has no finite free run, so it is not enough.
         return joint
     return joint if asks_for_history(few, joint, runs, structure) else few
 
 
+def _from(
+    joint: JointFit, runs: Sequence[Run], structure: Structure, loss: Loss, *, refine: bool = False
+) -> JointFit:  # fmt: skip
+    """A fit of another structure from where one ended; where it is not refined, on a grid as coarse as it allows."""
+    values = dict(zip(joint.names, joint.values.tolist(), strict=True))
+    return fit_output_error(runs, structure, start=values, loss=loss, refine=refine)
+
+
 def instead_of_history(joint: JointFit, runs: Sequence[Run], structure: Structure) -> JointFit | None:
     """A fit with Caputo's terms and a constant in each equation that leaves no more than one with a history, if any."""
     asked = replace(structure, offset="constant")
-    values = dict(zip(joint.names, joint.values.tolist(), strict=True))
     loss: Loss = "squares" if joint.robust is None else "huber"
     try:
-        few = fit_output_error(runs, replace(asked, initial="caputo"), start=values, loss=loss)
+        few = _from(joint, runs, replace(asked, initial="caputo"), loss)
+        # On the same kind of grid: what a coarse one leaves is no history.
+        many = _from(joint, runs, replace(structure, initial=joint.initial), loss)
     except FtlmError:
         return None
-    fewer = few.initial_terms < joint.initial_terms
-    return few if fewer and not asks_for_history(few, joint, runs, asked) else None
+    fewer = few.initial_terms < many.initial_terms
+    return few if fewer and not asks_for_history(few, many, runs, asked) else None
 
 
 def asks_for_history(few: JointFit, many: JointFit, runs: Sequence[Run], structure: Structure) -> bool:

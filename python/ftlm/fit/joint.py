@@ -177,13 +177,14 @@ class JointFit:
 def fit_output_error(
     runs: Sequence[Run], structure: Structure, *, threads: int = 1, start: Mapping[str, float] | None = None,
     refine: bool = True, progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
-    known: Sequence[Mapping[str, float]] = (), near: JointFit | None = None,
+    known: Sequence[Mapping[str, float]] = (), near: JointFit | None = None, raced: list[Attempt] | None = None,
 ) -> JointFit:  # fmt: skip
     """Fit all equations of a structure on all runs by output error, from an automatic start.
 
     A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
     everything free by name, and is the only one; known ones stand beside the automatic ones; `near` is a fit of the
-    same structure to nearly the same runs, to go on from on its grid and with its weights. Without `refine` the grid is
+    same structure to nearly the same runs, to go on from on its grid and with its weights. What a race reached is put
+    into `raced`, and taken from there where the same fit is made again. Without `refine` the grid is
     not refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
     all samples, not between starts.
 
@@ -215,7 +216,9 @@ def fit_output_error(
     if start is None:
         floor = float(np.mean([(noise[o] / (COARSE_SHARE * sizes[o])) ** 2 for o in outputs]))
         runners = race_with_friction if structure.has_friction else race
-        reached = runners(alike, floor, threads, course.until(0.5, 0.3))
+        reached = raced or runners(alike, floor, threads, course.until(0.5, 0.3))
+        if raced is not None:
+            raced[:] = reached
         contenders = finalists(reached) if reached else []
         contenders += [given(problem, values) for values in known]
     else:

@@ -276,7 +276,7 @@ class Valley:
     def _cost(self, i: int, values: Floats) -> float:
         """Cost at a point; infinite where it has no finite free run."""
         try:
-            return float(self._evaluated(i, values).outcome["cost"])
+            return float(self._descended(i, values, 0, EXACT).outcome["cost"])
         except FtlmError:
             return math.inf
 

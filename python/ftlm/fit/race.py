@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -27,6 +28,8 @@ VANISHED = 1e-8
 #: Starts that tell how fine the grid must be on which all compete, chosen by this many evaluations.
 PIONEERS = 3
 GLANCE = 2
+#: Behind the first, a start goes on while a lap lowers its cost by this share: what has come to rest overtakes nobody.
+ON_THE_WAY = 0.05
 #: All get as many as those ahead where the best is above the noise by this factor.
 ABOVE_FLOOR = 2.0
 #: Coarse fits that continue on all samples.
@@ -35,6 +38,8 @@ FINALISTS = 3
 CONTENDER = 3.0
 #: Two costs closer than this share are the same optimum.
 SAME_COST = 1e-3
+#: Starts whose numbers are all as near as this share are in the same place.
+SAME_PLACE = 0.02
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,13 @@ class Laps:
         self, grid: Grid, runners: Sequence[Attempt], evaluations: int, problem: FreeProblem | None = None
     ) -> list[Attempt]:
         """Where the runners get with so many evaluations, best first."""
+        ended = self.each(grid, runners, evaluations, problem)
+        return sorted((a for a in ended if a is not None), key=lambda a: a.level)
+
+    def each(
+        self, grid: Grid, runners: Sequence[Attempt], evaluations: int, problem: FreeProblem | None = None
+    ) -> list[Attempt | None]:
+        """Where each of the runners gets; None of those whose free run is not finite."""
         experiments = grid.experiments
 
         def tried(attempt: Attempt) -> Attempt | None:
@@ -62,26 +74,28 @@ class Laps:
         ended = []
         with pool(self.threads) as workers:
             for done, attempt in enumerate(workers.map(tried, runners)):
-                if attempt is not None:
-                    ended.append(attempt)
+                ended.append(attempt)
                 if self.progress is not None:
                     self.progress(min(done, self.starts - 1), self.starts)
-        return sorted(ended, key=lambda a: a.level)
+        return ended
 
 
 def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None) -> list[Attempt]:
     """Coarse fits from all starts, best first, every output weighing alike; noise alone leaves `floor` per residual."""
+    if isinstance(alike.problem.structure.initial, History):
+        return with_history(alike, floor, threads, progress)
+    return raced(alike, floor, threads, progress)[0]
+
+
+def raced(
+    alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None
+) -> tuple[list[Attempt], Grid]:
+    """The race of a problem whose initial terms are few, and the grid on which it was."""
     problem, runs = alike.problem, alike.runs
-    if isinstance(problem.structure.initial, History):
-        # What a run remembers of the time before it moves an optimum by less than lies between two: the terms of its
-        # history, many a run, wait for those that go on.
-        problem = FreeProblem.of(replace(problem.structure, initial="caputo"))
-        alike = replace(alike, problem=problem)
     starts = delayed_attempts(runs, problem, threads)
     laps = Laps(len(starts), threads, progress)
-    coarse = replace(alike, decimation=max(1, round(min(run.length - 1 for run in runs) / COARSE_SAMPLES)))
-    coarse = fine_enough(coarse, starts, laps)
-    reached = laps.run(coarse, starts, FIRST_LAP)
+    coarse, glanced = fine_enough(thinned(alike), starts, laps)
+    reached = laps.run(coarse, glanced, FIRST_LAP)
     while coarse.every < FINEST and (not reached or coarse.matters(reached[0])):
         coarse = coarse.finer
         reached = laps.run(coarse, starts, FIRST_LAP)
@@ -106,9 +120,9 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
         except ModelError:
             # At whole orders two of its terms have become one.
             continue
-        if isinstance(less, Whole):
-            # At given orders most starts lead to one optimum.
-            runners = laps.run(coarse, runners, GLANCE, less.problem)[:FINALISTS]
+        # At given orders most starts lead to one optimum.
+        going = FINALISTS if isinstance(less, Whole) else FEWEST
+        runners = one_of_each(laps.run(coarse, runners, GLANCE, less.problem))[:going]
         ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
         ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
         reached = sorted(reached + [less.embedded(a, problem) for a in ended[:1]], key=lambda a: a.level)
@@ -123,25 +137,76 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
     reached = laps.run(coarse, reached[:ahead], SECOND_LAP)
     if reached and reached[0].level > ABOVE_FLOOR * floor:
         # Noise alone would leave less: those behind may yet be on the way to where it does.
-        rest = laps.run(coarse, rest, SECOND_LAP)
+        rest = on_the_way(coarse, rest, laps)
     reached = coarse.finer.ranked(reached + rest)
     if progress is not None:
         progress(len(starts), len(starts))
-    return reached
+    return reached, coarse
 
 
-def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> Grid:
-    """A grid on which starts may compete, as far as a few of them tell.
+def with_history(
+    alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None
+) -> list[Attempt]:  # fmt: skip
+    """The same of runs in motion: the terms of their history, many a run, wait for those that go on.
+
+    What a run remembers moves most optima by less than lies between two; where it does not, the order among them is
+    that of a lap with it.
+    """
+    few = FreeProblem.of(replace(alike.problem.structure, initial="caputo"))
+    reached, coarse = raced(replace(alike, problem=few), floor, threads, progress)
+    reached, coarse = distinct(reached), replace(coarse, problem=alike.problem)
+    laps = Laps(len(reached), threads, None)
+    levels = [math.inf if a is None else a.level for a in laps.each(coarse, reached, 0)]
+    order = sorted(range(len(reached)), key=lambda i: levels[i])
+    ahead = laps.run(coarse, [reached[i] for i in order[:FEWEST]], FIRST_LAP)
+    return distinct(ahead + [reached[i] for i in sorted(order[FEWEST:])])
+
+
+def thinned(grid: Grid) -> Grid:
+    """A grid of as many samples as starts compete on."""
+    return replace(grid, decimation=max(1, round(min(run.length - 1 for run in grid.runs) / COARSE_SAMPLES)))
+
+
+def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> tuple[Grid, list[Attempt]]:
+    """A grid on which starts may compete, as far as a few of them tell, and where they are after a glance.
 
     A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its
     own: all start anew on half the step.
     """
-    while coarse.every < FINEST and len(starts) > PIONEERS:
-        reached = laps.run(coarse, laps.run(coarse, starts, GLANCE)[:PIONEERS], FIRST_LAP)
+    while True:
+        glanced = one_of_each(laps.run(coarse, starts, GLANCE))
+        if coarse.every >= FINEST or len(starts) <= PIONEERS:
+            return coarse, glanced
+        reached = laps.run(coarse, glanced[:PIONEERS], FIRST_LAP)
         if reached and not coarse.matters(reached[0]):
-            break
+            return coarse, glanced
         coarse = coarse.finer
-    return coarse
+
+
+def on_the_way(coarse: Grid, behind: Sequence[Attempt], laps: Laps) -> list[Attempt]:
+    """Where those behind end, each for as long as it is getting on, but no longer than a second lap."""
+    ended: list[Attempt] = []
+    going = list(behind)
+    for _ in range(SECOND_LAP // FIRST_LAP):
+        further: list[Attempt] = []
+        for attempt, at in zip(going, laps.each(coarse, going, FIRST_LAP), strict=True):
+            if at is not None:
+                (further if at.level < (1.0 - ON_THE_WAY) * attempt.level else ended).append(at)
+        going = further
+    return ended + going
+
+
+def one_of_each(attempts: Sequence[Attempt]) -> list[Attempt]:
+    """Attempts, best first, without those that are where an earlier one is: several lattices have the same rows."""
+    kept: list[Attempt] = []
+    for attempt in attempts:
+        here = attempt.values
+        there = next((i for i, k in enumerate(kept) if np.allclose(here, k.values, rtol=SAME_PLACE, atol=0.0)), None)
+        if there is None:
+            kept.append(attempt)
+        else:
+            kept[there] = replace(kept[there], alike=(*kept[there].alike, attempt.origin, *attempt.alike))
+    return kept
 
 
 def without_vanished(problem: FreeProblem, start: Attempt, ended: Attempt) -> Attempt:

@@ -24,8 +24,9 @@ TOLD = 1e-3
 #: How often a fit goes on from a lower optimum that its intervals came upon.
 REFITS = 2
 #: Pulses that may be spent on profiles nobody asked for, all numbers together, free runs that an end is worth beginning
-#: with, and by how much these may exceed the former.
+#: with, and by how much these may exceed the former. Where an order is free, a pulse costs so many of running sums.
 UNASKED, FEWEST, STRETCH = 6_000_000, 20, 2
+FRACTIONAL = 3
 
 
 def with_intervals(
@@ -51,6 +52,7 @@ def with_intervals(
             return joint, warnings
         names = valley.names if intervals == "profile" else bent_numbers(valley, PRINTED)
         pulses, least = joint.samples * joint.refinement, FEWEST * 2 * len(names)
+        pulses *= FRACTIONAL if joint.orders else 1
         allowed = (UNASKED - spent) // pulses
         if intervals == "auto" and least > STRETCH * allowed:
             found = Profiles({}, None, tuple(names))

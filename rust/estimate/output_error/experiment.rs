@@ -1,6 +1,7 @@
 //! One run to compare with, sample by sample.
 
 use crate::error::{check_finite, check_length, Error, Result};
+use crate::impulses::is_impulse;
 use crate::readings::{Jumps, Readings};
 use crate::regressors::Record;
 use crate::series;
@@ -26,6 +27,8 @@ pub struct Experiment {
     pub shares: Vec<Vec<f64>>,
     /// When the samples were read, where that is not at every `every`-th edge.
     pub own: Option<OwnTimes>,
+    /// Whether the signals of the record passed the filter already, and with them whatever follows from these.
+    passed: bool,
 }
 
 /// Samples at times of their own, all of which are compared.
@@ -69,7 +72,7 @@ impl Experiment {
 
     fn unchecked(record: Record, every: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Self {
         let (filter, instants, shares, own) = (None, Vec::new(), Vec::new(), None);
-        Self { record, every, samples, filter, weights, instants, shares, own }
+        Self { record, every, samples, filter, weights, instants, shares, own, passed: false }
     }
 
     /// The same experiment, some of its compared samples counting less.
@@ -142,6 +145,27 @@ impl Experiment {
         check_length("weights", self.samples.len(), self.weights.len())
     }
 
+    /// The same experiment with its signals behind the filter, where all outputs pass it: equations and filter commute, and
+    /// what drives passes it once, what answers as often as it is asked for. None where that is not so.
+    ///
+    /// # Errors
+    /// As [`Record::through`].
+    pub(super) fn passed_first(&self) -> Result<Option<Self>> {
+        match &self.filter {
+            Some((series, applies))
+                if applies.iter().all(|&a| a) && self.own.is_none() && !self.record.is_filtered() =>
+            {
+                Ok(Some(Self { record: self.record.through(series)?, passed: true, ..self.clone() }))
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// Whether an initial term of this exponent moves nothing but the filter of an output.
+    pub(super) fn moves_filter(&self, exponent: f64) -> bool {
+        is_impulse(exponent) && (self.passed || !self.record.is_filtered())
+    }
+
     /// Whether an output passes a filter before it is compared, by itself or with all of its equation.
     pub(super) fn behind_filter(&self, output: usize) -> bool {
         self.record.is_filtered() || self.filter.as_ref().is_some_and(|(_, applies)| applies[output])
@@ -211,7 +235,7 @@ impl Experiment {
         for (i, means) in response.iter().enumerate() {
             let filtered;
             let means = match &self.filter {
-                Some((filter, applies)) if applies[i] => {
+                Some((filter, applies)) if applies[i] && !self.passed => {
                     filtered = series::multiply(filter, means, means.len());
                     &filtered
                 }

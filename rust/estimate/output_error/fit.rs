@@ -240,7 +240,13 @@ pub fn fit_until(
     let mut model = model.clone();
     // Solved for, they need no coordinate that keeps a sign.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
-    let shelves = RefCell::new(experiments.iter().map(|_| Shelf::default()).collect());
+    // With free inputs, what drives is no signal of the record.
+    let passed: Option<Vec<Experiment>> = match settings.evaluations > 1 && model.inputs.is_empty() {
+        true => experiments.iter().map(Experiment::passed_first).collect::<Result<_>>()?,
+        false => None,
+    };
+    let experiments = passed.as_deref().unwrap_or(experiments);
+    let shelves = RefCell::new(Shelf::of(experiments)?);
     let clock = Clock::of(&model, experiments);
     let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
     let problem = OutputError { model: &model, experiments, start, clock, steady, linear, shelves, stop };

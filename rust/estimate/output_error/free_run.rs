@@ -3,19 +3,18 @@
 use super::corners::Corners;
 use super::experiment::Experiment;
 use super::feedthrough::{Direct, Early};
-use super::inverse::{Inverse, Solved};
+use super::inverse::{Means, Solved};
 use super::linear::best_moves;
 use super::model::{FreeModel, Point};
 use super::part::Part;
-use super::shelf::{Operator, Power, Shelf, FACTORS};
+use super::shelf::{Operator, Shelf};
 use crate::dense;
 use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimate::least_squares;
 use crate::excess::MAX_EXCESS;
-use crate::impulses::is_impulse;
 use crate::regressors::Record;
-use crate::series::{Buffers, Recursion, Solver, SumOfProducts};
+use crate::series::{Buffers, Recursion, SumOfProducts};
 use std::borrow::Cow;
 use std::rc::Rc;
 
@@ -42,7 +41,7 @@ pub(super) struct Evaluation {
 struct Free {
     equation: usize,
     samples: Vec<f64>,
-    means: Vec<Vec<f64>>,
+    means: Rc<Means>,
 }
 
 /// An experiment's free run before its initial terms are added.
@@ -111,7 +110,7 @@ impl FreeModel {
         let operators = self.operators(experiment, shelf, structures)?;
         out.exponents = (structures.iter().enumerate()).map(|(i, s)| self.exponents(experiment, i, s)).collect();
         let asked = out.exponents.iter().any(|list| !list.is_empty()) || !linear.is_empty();
-        let (response, solved) = self.response(experiment, shelf, &operators, point, &acted, asked)?;
+        let (response, solved) = self.response(experiment, shelf, &operators, point, &acted)?;
         let mut residuals = experiment.measured();
         out.size = out.size.hypot(residuals.iter().map(|v| v * v).sum::<f64>().sqrt());
         let mut sampled = experiment.sampled(&response);
@@ -133,39 +132,27 @@ impl FreeModel {
         let mut free = Vec::new();
         let mut basis = Vec::new();
         if asked {
-            let inverse = solved.inverse(record.m())?;
             let terms: Vec<(usize, f64)> =
                 out.exponents.iter().enumerate().flat_map(|(i, list)| list.iter().map(move |e| (i, *e))).collect();
-            let still = |exponent: f64| is_impulse(exponent) && !record.is_filtered();
-            let powers: Vec<Option<Rc<Power>>> =
-                terms.iter().map(|&(_, e)| (!still(e)).then(|| shelf.power(experiment, e))).collect();
-            inverse.each(
-                (structures.len(), record.m()),
-                terms.len(),
-                |place, rights| {
-                    if let Some(power) = &powers[place] {
-                        rights.add_series(terms[place].0, Cow::Borrowed(&power.series), |_| power.spectrum());
-                    }
-                    Ok(())
-                },
-                |place, means| {
-                    let (i, exponent) = terms[place];
-                    let (samples, means) = match means {
-                        None => (shelf.impulse(experiment, i, exponent), Vec::new()),
-                        Some(means) => {
-                            let mut samples = experiment.sampled(&means);
-                            if experiment.own.is_some() {
-                                let corner = Corners::of_power(experiment, i, exponent);
-                                samples.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
-                            }
-                            (samples, means)
+            let moving: Vec<(usize, f64)> =
+                terms.iter().filter(|&&(_, e)| !experiment.moves_filter(e)).copied().collect();
+            let mut answers = solved.natural(shelf, record.m(), structures.len(), &moving)?.into_iter();
+            for (i, exponent) in terms {
+                let moves = if experiment.moves_filter(exponent) { None } else { answers.next() };
+                let (samples, means) = match moves {
+                    None => (shelf.impulse(experiment, i, exponent), Rc::default()),
+                    Some(means) => {
+                        let mut samples = experiment.sampled(&cut(&means, record.m()));
+                        if experiment.own.is_some() {
+                            let corner = Corners::of_power(experiment, i, exponent);
+                            samples.iter_mut().zip(corner).for_each(|(v, c)| *v += c);
                         }
-                    };
-                    dense::extend_orthonormal(&mut basis, samples.clone(), SPANNED);
-                    free.push(Free { equation: i, samples, means });
-                    Ok(())
-                },
-            )?;
+                        (samples, means)
+                    }
+                };
+                dense::extend_orthonormal(&mut basis, samples.clone(), SPANNED);
+                free.push(Free { equation: i, samples, means });
+            }
         }
         let mut part = Part { solved, operators, response, basis, driven: Vec::new(), acted, direct, early, corners };
         part.driven = self.driven_by(experiment, shelf, &part, point, linear)?;
@@ -176,7 +163,7 @@ impl FreeModel {
     fn operators(
         &self,
         experiment: &Experiment,
-        shelf: &mut Shelf,
+        shelf: &Shelf,
         structures: &[Structure],
     ) -> Result<Vec<Vec<Rc<Operator>>>> {
         let mut operators = Vec::with_capacity(structures.len());
@@ -197,14 +184,14 @@ impl FreeModel {
                     // Reported like a step too far, so that the search shortens it.
                     return Err(Error::Diverged { what: "order of a term above alpha; the free run".into(), index: 0 });
                 }
-                row.push(shelf.operator((i, k), eta, self.turns(i, k), experiment));
+                row.push(shelf.operator((i, k), eta, self.turns(i, k)));
             }
             operators.push(row);
         }
         Ok(operators)
     }
 
-    /// Pulse means of the free run from rest, and A⁻¹, or what it is made of until it is asked for.
+    /// Pulse means of the free run from rest, and what solves the equations.
     fn response(
         &self,
         experiment: &Experiment,
@@ -212,13 +199,11 @@ impl FreeModel {
         operators: &[Vec<Rc<Operator>>],
         point: &Point,
         acted: &[(Vec<f64>, Vec<f64>)],
-        asked: bool,
-    ) -> Result<(Vec<Vec<f64>>, Solved)> {
+    ) -> Result<(Means, Rc<Solved>)> {
         let (record, n) = (&experiment.record, operators.len());
         let m = record.m();
         let coefficient = |i: usize, k: usize| self.equations[i].terms[k].2.at(&point.coefficients);
         let places = || operators.iter().enumerate().flat_map(|(i, row)| (0..row.len()).map(move |k| (i, k)));
-        let mut buffers = Buffers::default();
         let whole: Option<Vec<usize>> = operators.iter().flatten().map(|operator| operator.whole()).collect();
         if let Some(orders) = whole {
             let own = places().zip(&orders).filter_map(|((i, k), &order)| {
@@ -226,9 +211,9 @@ impl FreeModel {
                 Some((i, j, order, coefficient(i, k)))
             });
             let highest = orders.iter().copied().max().unwrap_or(0);
-            let inverse = Inverse::Sums(Recursion::new(n, highest, record.step(), &own.collect::<Vec<_>>())?);
+            let solved = Solved::of(Recursion::new(n, highest, record.step(), &own.collect::<Vec<_>>())?);
             let mut response = vec![vec![0.0; m]; n];
-            inverse.each(
+            solved.inverse()?.each(
                 (n, m),
                 1,
                 |_, rights| {
@@ -248,18 +233,18 @@ impl FreeModel {
                     Ok(())
                 },
             )?;
-            return Ok((response, Solved::of(inverse)));
+            return Ok((response, Rc::new(solved)));
         }
-        let mut matrix = vec![vec![vec![0.0; m]; n]; n];
         let mut rhs = vec![vec![0.0; m]; n];
-        let mut sum = SumOfProducts::with_length(FACTORS * m);
+        let mut sum = SumOfProducts::with_length(shelf.total);
+        let mut buffers = Buffers::default();
+        let mut bits = Vec::new();
         for (i, row) in operators.iter().enumerate() {
-            matrix[i][i][0] += 1.0;
             let mut drives = false;
             for (k, operator) in row.iter().enumerate() {
                 let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
-                if let Some(j) = self.unknown(i, signal) {
-                    matrix[i][j].iter_mut().zip(operator.kernel()).for_each(|(a, v)| *a -= c * v);
+                if self.unknown(i, signal).is_some() {
+                    bits.extend([operator.eta().to_bits(), c.to_bits()]);
                 } else if c != 0.0 {
                     drives = true;
                     sum.add(c, &operator.spectrum(false), &shelf.driver(self, experiment, signal, acted));
@@ -269,14 +254,22 @@ impl FreeModel {
                 sum.take(&mut rhs[i], &mut buffers);
             }
         }
-        // By division: exact whether or not A⁻¹ grows.
-        let mut solver = Solver::new(&matrix)?;
-        let response = solver.solve(&rhs)?;
-        if asked {
-            let inverse = Inverse::Spectra(solver.inverse_spectra(FACTORS * m)?);
-            return Ok((response, Solved::of(inverse)));
-        }
-        Ok((response, Solved::by(matrix)))
+        let solved = shelf.solved(bits, || {
+            let mut matrix = vec![vec![vec![0.0; shelf.pulses()]; n]; n];
+            for (i, row) in operators.iter().enumerate() {
+                matrix[i][i][0] += 1.0;
+                for (k, operator) in row.iter().enumerate() {
+                    if let Some(j) = self.unknown(i, self.equations[i].terms[k].0) {
+                        let c = coefficient(i, k);
+                        matrix[i][j].iter_mut().zip(operator.kernel()).for_each(|(a, v)| *a -= c * v);
+                    }
+                }
+            }
+            Solved::by(matrix)
+        })?;
+        let response = solved.divided(&rhs)?;
+        let response = response.ok_or_else(|| Error::Internal { what: "equations that nothing divides".into() })?;
+        Ok((response, solved))
     }
 
     /// Pulse means of what drives: a signal of the record, or what an actuator makes of it.
@@ -295,7 +288,7 @@ impl FreeModel {
             for (((i, means), column), x) in places.iter().zip(&columns).zip(&values) {
                 initial[*i].push(*x);
                 residuals.iter_mut().zip(column).for_each(|(e, v)| *e -= x * v);
-                for (total, more) in part.response.iter_mut().zip(means) {
+                for (total, more) in part.response.iter_mut().zip(means.iter()) {
                     total.iter_mut().zip(more).for_each(|(y, v)| *y += x * v);
                 }
             }
@@ -311,5 +304,13 @@ impl FreeModel {
         let item = &self.equations[equation];
         let of = |weights: &[f64], k: usize| weights.get(k).copied().unwrap_or(0.0);
         (0..self.order_bounds.len()).any(|k| of(&item.order.weights, k) != of(&item.terms[term].1.weights, k))
+    }
+}
+
+/// The first m pulses of every unknown.
+fn cut(means: &Means, m: usize) -> Cow<'_, [Vec<f64>]> {
+    match means.iter().all(|row| row.len() == m) {
+        true => Cow::Borrowed(means),
+        false => means.iter().map(|row| row[..m.min(row.len())].to_vec()).collect::<Vec<_>>().into(),
     }
 }

@@ -1,17 +1,18 @@
 //! A⁻¹ of the equations of one experiment, applied to any right-hand side: by products of spectra, or by running sums where
 //! every order of integration is whole and stays so.
 
-use super::shelf::{Operator, FACTORS};
-use crate::error::Result;
+use super::shelf::{Operator, Power, Shelf, FACTORS};
+use crate::error::{Error, Result};
 use crate::series::{Buffers, Kernel, Recursion, Solver, Source, SumOfProducts, ABREAST};
 use std::borrow::Cow;
-use std::cell::OnceCell;
+use std::cell::{OnceCell, RefCell};
+use std::collections::HashMap;
 use std::rc::Rc;
 
 /// A⁻¹ at a point.
 pub(super) enum Inverse {
-    /// Spectra of its entries.
-    Spectra(Vec<Vec<Kernel>>),
+    /// Spectra of its entries, and points of all series that are multiplied together.
+    Spectra { rows: Vec<Vec<Kernel>>, total: usize },
     /// Running sums, one solution a right-hand side.
     Sums(Recursion),
 }
@@ -119,33 +120,85 @@ impl<'a> Rights<'a> {
     }
 }
 
-/// What a free run leaves of A: its inverse, made when it is first asked for.
+/// Pulse means of every unknown.
+pub(super) type Means = Vec<Vec<f64>>;
+
+/// The equations A y = b at a point, for right-hand sides as long as the longest run or shorter.
 pub(super) struct Solved {
-    matrix: Vec<Vec<Vec<f64>>>,
-    made: OnceCell<Inverse>,
+    /// What divides by A; none where running sums do.
+    solver: Option<RefCell<Solver<'static>>>,
+    inverse: OnceCell<Inverse>,
+    /// Answers to initial terms, by equation and bits of the exponent, where several runs ask for them.
+    natural: RefCell<HashMap<(usize, u64), Rc<Means>>>,
 }
 
 impl Solved {
-    /// A itself, entry by entry.
-    pub(super) fn by(matrix: Vec<Vec<Vec<f64>>>) -> Self {
-        Self { matrix, made: OnceCell::new() }
-    }
-
-    /// An inverse that is there already.
-    pub(super) fn of(inverse: Inverse) -> Self {
-        Self { matrix: Vec::new(), made: OnceCell::from(inverse) }
-    }
-
-    /// A⁻¹ on m pulses.
+    /// Of A, entry by entry.
     ///
     /// # Errors
     /// As [`Solver::new`].
-    pub(super) fn inverse(&self, m: usize) -> Result<&Inverse> {
-        if let Some(made) = self.made.get() {
-            return Ok(made);
+    pub(super) fn by(matrix: Vec<Vec<Vec<f64>>>) -> Result<Self> {
+        let solver = Some(RefCell::new(Solver::keeping(matrix)?));
+        Ok(Self { solver, inverse: OnceCell::new(), natural: RefCell::default() })
+    }
+
+    /// Of running sums.
+    pub(super) fn of(sums: Recursion) -> Self {
+        Self { solver: None, inverse: OnceCell::from(Inverse::Sums(sums)), natural: RefCell::default() }
+    }
+
+    /// y by division, exact whether or not A⁻¹ grows; none where running sums solve.
+    ///
+    /// # Errors
+    /// As [`Solver::solve`].
+    pub(super) fn divided(&self, rhs: &[Vec<f64>]) -> Result<Option<Means>> {
+        self.solver.as_ref().map(|solver| solver.borrow_mut().solve(rhs)).transpose()
+    }
+
+    /// A⁻¹, its spectra for products of [`FACTORS`] series of the longest run.
+    ///
+    /// # Errors
+    /// As [`Solver::solve`].
+    pub(super) fn inverse(&self) -> Result<&Inverse> {
+        if let (None, Some(solver)) = (self.inverse.get(), &self.solver) {
+            let mut solver = solver.borrow_mut();
+            let total = FACTORS * solver.terms();
+            let rows = solver.inverse_spectra(total)?;
+            return Ok(self.inverse.get_or_init(|| Inverse::Spectra { rows, total }));
         }
-        let spectra = Solver::new(&self.matrix)?.inverse_spectra(FACTORS * m)?;
-        Ok(self.made.get_or_init(|| Inverse::Spectra(spectra)))
+        self.inverse.get().ok_or_else(|| Error::Internal { what: "equations that nothing solves".into() })
+    }
+
+    /// Answers to the powers t^e of equations, m pulses of each unknown; those of all runs are made once.
+    ///
+    /// # Errors
+    /// As [`Solver::solve`].
+    pub(super) fn natural(&self, shelf: &Shelf, m: usize, n: usize, terms: &[(usize, f64)]) -> Result<Vec<Rc<Means>>> {
+        let key = |&(i, e): &(usize, f64)| (i, e.to_bits());
+        let open: Vec<(usize, f64)> =
+            terms.iter().filter(|t| !self.natural.borrow().contains_key(&key(t))).copied().collect();
+        let length = if shelf.shared() { shelf.pulses() } else { m };
+        let powers: Vec<Rc<Power>> = open.iter().map(|&(_, e)| shelf.power(e)).collect();
+        let mut made = HashMap::new();
+        self.inverse()?.each(
+            (n, length),
+            open.len(),
+            |place, rights| {
+                let power = &powers[place];
+                rights.add_series(open[place].0, Cow::Borrowed(&power.series), |_| power.spectrum());
+                Ok(())
+            },
+            |place, means| {
+                made.insert(key(&open[place]), Rc::new(means.unwrap_or_default()));
+                Ok(())
+            },
+        )?;
+        let mut kept = self.natural.borrow_mut();
+        let answers = terms.iter().filter_map(|t| kept.get(&key(t)).or_else(|| made.get(&key(t))).cloned()).collect();
+        if shelf.shared() {
+            kept.extend(made);
+        }
+        Ok(answers)
     }
 }
 
@@ -163,10 +216,10 @@ impl Inverse {
         mut taken: impl FnMut(usize, Option<Vec<Vec<f64>>>) -> Result<()>,
     ) -> Result<()> {
         match self {
-            Self::Spectra(rows) => {
-                let mut rights =
-                    Rights::Spectra((0..n).map(|_| (false, SumOfProducts::with_length(FACTORS * m))).collect());
-                let mut target = SumOfProducts::with_length(FACTORS * m);
+            Self::Spectra { rows, total } => {
+                let sum = || (false, SumOfProducts::with_length(*total));
+                let mut rights = Rights::Spectra((0..n).map(|_| sum()).collect());
+                let mut target = SumOfProducts::with_length(*total);
                 let mut buffers = Buffers::default();
                 for place in 0..count {
                     given(place, &mut rights)?;

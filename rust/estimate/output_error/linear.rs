@@ -50,7 +50,7 @@ impl FreeModel {
         }
         let (record, n) = (&experiment.record, self.equations.len());
         let mut driven = Vec::with_capacity(coefficients.len());
-        part.solved.inverse(record.m())?.each(
+        part.solved.inverse()?.each(
             (n, record.m()),
             coefficients.len(),
             |place, rights| {

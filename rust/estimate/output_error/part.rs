@@ -11,8 +11,8 @@ use std::rc::Rc;
 
 /// What one experiment leaves behind for its sensitivities.
 pub(super) struct Part {
-    /// A of A y = b, or its inverse.
-    pub(super) solved: Solved,
+    /// What solves the equations.
+    pub(super) solved: Rc<Solved>,
     /// Of each term of each equation.
     pub(super) operators: Vec<Vec<Rc<Operator>>>,
     /// Simulated pulse means, initial terms included.

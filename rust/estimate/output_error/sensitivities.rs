@@ -5,9 +5,9 @@ use super::free_run::Evaluation;
 use super::linear::project_out;
 use super::model::{FreeModel, Point};
 use super::part::Part;
-use super::shelf::{Shelf, FACTORS};
+use super::shelf::Shelf;
 use crate::equation::AffineOrder;
-use crate::error::{check_length, Error, Result};
+use crate::error::{Error, Result};
 use crate::series::Kernel;
 use std::borrow::Cow;
 use std::rc::Rc;
@@ -55,7 +55,7 @@ impl FreeModel {
             columns[orders.len() + coefficient] = Some(driven.samples.clone());
         }
         let open: Vec<usize> = (0..columns.len()).filter(|&parameter| columns[parameter].is_none()).collect();
-        part.solved.inverse(m)?.each(
+        part.solved.inverse()?.each(
             (n, m),
             open.len(),
             |place, rights| {
@@ -70,10 +70,10 @@ impl FreeModel {
                         let operator = &part.operators[i][k];
                         if let Some(input) = parameter.checked_sub(orders.len() + coefficients.len()) {
                             let slope = &part.acted[input].1;
-                            rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || spectrum(slope));
+                            rights.add(i, weight, (operator, false), || Cow::Borrowed(slope), || shelf.spectrum(slope));
                         } else if let Some(j) = self.unknown(i, *signal) {
                             let (response, known) = (&part.response[j], &mut responses[j]);
-                            let made = || known.get_or_insert_with(|| spectrum(response)).clone();
+                            let made = || known.get_or_insert_with(|| shelf.spectrum(response)).clone();
                             rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), made);
                         } else {
                             let series = || Cow::Borrowed(self.drives(record, *signal, &part.acted));
@@ -82,8 +82,10 @@ impl FreeModel {
                         }
                     }
                     if parameter < orders.len() {
-                        if let Some(moved) = initial_slope(self, i, parameter, orders, &initial[i], experiment)? {
-                            rights.add_series(i, Cow::Owned(moved), spectrum);
+                        if let Some(moved) =
+                            initial_slope(self, (i, parameter), orders, &initial[i], (experiment, shelf))?
+                        {
+                            rights.add_series(i, Cow::Owned(moved), |series| shelf.spectrum(series));
                         }
                     }
                 }
@@ -128,19 +130,13 @@ impl FreeModel {
     }
 }
 
-/// Of a series, for products of [`FACTORS`] of them.
-fn spectrum(series: &[f64]) -> Rc<Kernel> {
-    Rc::new(Kernel::with_length(series, FACTORS * series.len()))
-}
-
 /// How the initial terms of equation i move with a free order, weighted by their coefficients; none if they do not.
 fn initial_slope(
     model: &FreeModel,
-    i: usize,
-    parameter: usize,
+    (i, parameter): (usize, usize),
     orders: &[f64],
     values: &[f64],
-    experiment: &Experiment,
+    (experiment, shelf): (&Experiment, &Shelf),
 ) -> Result<Option<Vec<f64>>> {
     // Exponents move linearly with orders, and powers of t smoothly with exponents: a central difference of the
     // powers has an error of 1e−10, far below what a Jacobian needs.
@@ -166,9 +162,10 @@ fn initial_slope(
             continue;
         }
         moved = true;
-        let (above, below) = (record.initial_term(up), record.initial_term(down));
-        check_length("initial term", above.len(), below.len())?;
-        out.iter_mut().zip(above.iter().zip(&below)).for_each(|(v, (a, b))| *v += x * (a - b) / (2.0 * SHIFT));
+        let (above, below) = (shelf.power(up), shelf.power(down));
+        out.iter_mut()
+            .zip(above.series.iter().zip(&below.series))
+            .for_each(|(v, (a, b))| *v += x * (a - b) / (2.0 * SHIFT));
     }
     Ok(moved.then_some(out))
 }

@@ -1,10 +1,14 @@
-//! What the evaluations of one search have in common: kernels of orders that stay, and their spectra.
+//! What the evaluations of one search have in common: kernels of orders that stay, their spectra, and of runs on one grid
+//! whatever does not depend on the run.
 
 use super::experiment::Experiment;
+use super::inverse::Solved;
 use super::model::FreeModel;
+use crate::error::Result;
 use crate::excess::{kernel, kernel_and_slope};
+use crate::regressors::Record;
 use crate::series::{Kernel, MAX_SUMS};
-use std::cell::OnceCell;
+use std::cell::{OnceCell, RefCell};
 use std::collections::HashMap;
 use std::rc::Rc;
 
@@ -17,6 +21,9 @@ const KEPT_PULSES: usize = 1 << 15;
 /// Powers of t that are kept of long records and of others.
 const FEW_POWERS: usize = 8;
 const MANY_POWERS: usize = 64;
+
+/// Runs of one grid are this share as long as the longest at least: shorter ones would pay for transforms of its length.
+const AS_LONG: f64 = 0.7;
 
 /// How near to a whole number an order of integration is one: the kernels differ by as much.
 const WHOLE: f64 = 1e-12;
@@ -38,6 +45,11 @@ impl Operator {
             true => kernel_and_slope(self.eta, self.m, self.step),
             false => (kernel(self.eta, self.m, self.step), Vec::new()),
         })
+    }
+
+    /// The order of the integral.
+    pub(super) fn eta(&self) -> f64 {
+        self.eta
     }
 
     /// Of the integral.
@@ -83,36 +95,122 @@ impl Power {
     }
 }
 
-/// What stays of one experiment from one evaluation to the next.
-#[derive(Default)]
-pub(super) struct Shelf {
+/// What runs of one step and one filter share: kernels, powers of t, and A⁻¹ at the last point, as long as the longest.
+struct Grid {
+    /// A record of nothing, as long as the longest.
+    bare: Record,
+    runs: usize,
     /// The last operator of each term of each equation.
     operators: HashMap<(usize, usize), Rc<Operator>>,
-    /// Spectra of signals that drive and have no free number.
-    drivers: HashMap<usize, Rc<Kernel>>,
     /// Powers of t that initial terms bring, by the bits of their exponents.
     powers: HashMap<u64, Rc<Power>>,
+    /// What the last equations were, by the bits of their own terms, and their inverse.
+    solved: Option<(Vec<u64>, Rc<Solved>)>,
+}
+
+impl Grid {
+    /// Whether an experiment is on the grid of a longer one.
+    fn holds(&self, experiment: &Experiment) -> bool {
+        let record = &experiment.record;
+        let filters = match (self.bare.filter(), record.filter()) {
+            (None, None) => true,
+            (Some(long), Some(short)) => long.starts_with(short),
+            _ => false,
+        };
+        let long = self.bare.m();
+        filters
+            && self.bare.step().to_bits() == record.step().to_bits()
+            && record.m() <= long
+            && record.m() as f64 >= AS_LONG * long as f64
+    }
+}
+
+/// What stays of one experiment from one evaluation to the next.
+pub(super) struct Shelf {
+    grid: Rc<RefCell<Grid>>,
+    /// Points of every series that is multiplied, in all factors together.
+    pub(super) total: usize,
+    /// Spectra of signals that drive and have no free number.
+    drivers: HashMap<usize, Rc<Kernel>>,
     /// Weighted samples of impulses that the filter of an output gets, by output and the bits of their exponents.
     impulses: HashMap<(usize, u64), Vec<f64>>,
 }
 
 impl Shelf {
+    /// One for each experiment; what is on one grid shares it.
+    ///
+    /// # Errors
+    /// As [`Record::new`].
+    pub(super) fn of(experiments: &[Experiment]) -> Result<Vec<Self>> {
+        let mut longest: Vec<usize> = (0..experiments.len()).collect();
+        longest.sort_by_key(|&k| std::cmp::Reverse(experiments[k].record.m()));
+        let mut grids: Vec<Rc<RefCell<Grid>>> = Vec::new();
+        let mut places: Vec<(usize, Rc<RefCell<Grid>>)> = Vec::with_capacity(experiments.len());
+        for k in longest {
+            let grid = match grids.iter().find(|grid| grid.borrow().holds(&experiments[k])) {
+                Some(known) => known.clone(),
+                None => {
+                    let record = &experiments[k].record;
+                    let bare =
+                        Record::new(record.step(), vec![vec![0.0; record.m()]], record.filter().map(<[f64]>::to_vec))?;
+                    let (operators, powers) = (HashMap::new(), HashMap::new());
+                    let grid = Rc::new(RefCell::new(Grid { bare, runs: 0, operators, powers, solved: None }));
+                    grids.push(grid.clone());
+                    grid
+                }
+            };
+            grid.borrow_mut().runs += 1;
+            places.push((k, grid));
+        }
+        places.sort_by_key(|(k, _)| *k);
+        let shelf = |(_, grid): (usize, Rc<RefCell<Grid>>)| {
+            let total = FACTORS * grid.borrow().bare.m();
+            Self { grid, total, drivers: HashMap::new(), impulses: HashMap::new() }
+        };
+        Ok(places.into_iter().map(shelf).collect())
+    }
+
+    /// Pulses of the longest run on the grid.
+    pub(super) fn pulses(&self) -> usize {
+        self.grid.borrow().bare.m()
+    }
+
+    /// Whether other runs are on the grid.
+    pub(super) fn shared(&self) -> bool {
+        self.grid.borrow().runs > 1
+    }
+
     /// The operator of a term that is integrated by `eta`; its order may be free.
-    pub(super) fn operator(
-        &mut self,
-        place: (usize, usize),
-        eta: f64,
-        free: bool,
-        experiment: &Experiment,
-    ) -> Rc<Operator> {
-        if let Some(known) = self.operators.get(&place).filter(|o| o.eta.to_bits() == eta.to_bits()) {
+    pub(super) fn operator(&self, place: (usize, usize), eta: f64, free: bool) -> Rc<Operator> {
+        let mut grid = self.grid.borrow_mut();
+        if let Some(known) = grid.operators.get(&place).filter(|o| o.eta.to_bits() == eta.to_bits()) {
             return known.clone();
         }
-        let (m, step) = (experiment.record.m(), experiment.record.step());
+        let (m, step) = (grid.bare.m(), grid.bare.step());
         let (series, spectra) = (OnceCell::new(), [OnceCell::new(), OnceCell::new()]);
         let made = Rc::new(Operator { eta, free, m, step, series, spectra });
-        self.operators.insert(place, made.clone());
+        grid.operators.insert(place, made.clone());
         made
+    }
+
+    /// The equations whose own terms have these bits, or what is made of them.
+    ///
+    /// # Errors
+    /// Those of `made`.
+    pub(super) fn solved(&self, bits: Vec<u64>, made: impl FnOnce() -> Result<Solved>) -> Result<Rc<Solved>> {
+        let known = self.grid.borrow().solved.as_ref().filter(|(known, _)| *known == bits).map(|(_, s)| s.clone());
+        match known {
+            Some(solved) => Ok(solved),
+            None => {
+                // What is past frees its memory before what follows takes its own.
+                self.grid.borrow_mut().solved = None;
+                let solved = Rc::new(made()?);
+                if self.shared() {
+                    self.grid.borrow_mut().solved = Some((bits, solved.clone()));
+                }
+                Ok(solved)
+            }
+        }
     }
 
     /// The spectrum of a signal that drives, for products of [`FACTORS`] series; of what an actuator makes of it.
@@ -123,26 +221,35 @@ impl Shelf {
         signal: usize,
         acted: &[(Vec<f64>, Vec<f64>)],
     ) -> Rc<Kernel> {
-        let total = FACTORS * experiment.record.m();
         if let Some(law) = model.law_of(signal) {
-            return Rc::new(Kernel::with_length(&acted[law].0, total));
+            return self.spectrum(&acted[law].0);
         }
-        let made = || Rc::new(Kernel::with_length(experiment.record.signal(signal), total));
         if experiment.record.m() > KEPT_PULSES {
-            return made();
+            return self.spectrum(experiment.record.signal(signal));
         }
+        let total = self.total;
+        let made = || Rc::new(Kernel::with_length(experiment.record.signal(signal), total));
         self.drivers.entry(signal).or_insert_with(made).clone()
     }
 
-    /// What an initial term t^e adds.
-    pub(super) fn power(&mut self, experiment: &Experiment, exponent: f64) -> Rc<Power> {
-        let record = &experiment.record;
+    /// Of a series, for products of [`FACTORS`] of them.
+    pub(super) fn spectrum(&self, series: &[f64]) -> Rc<Kernel> {
+        Rc::new(Kernel::with_length(series, self.total))
+    }
+
+    /// What an initial term t^e adds, as long as the longest run.
+    pub(super) fn power(&self, exponent: f64) -> Rc<Power> {
+        let mut grid = self.grid.borrow_mut();
         // Exponents that move with free orders would fill the shelf.
-        if self.powers.len() > if record.m() > KEPT_PULSES { FEW_POWERS } else { MANY_POWERS } {
-            self.powers.clear();
+        if grid.powers.len() > if grid.bare.m() > KEPT_PULSES { FEW_POWERS } else { MANY_POWERS } {
+            grid.powers.clear();
         }
-        let made = || Rc::new(Power { series: record.initial_term(exponent), spectrum: OnceCell::new() });
-        self.powers.entry(exponent.to_bits()).or_insert_with(made).clone()
+        if let Some(known) = grid.powers.get(&exponent.to_bits()) {
+            return known.clone();
+        }
+        let made = Rc::new(Power { series: grid.bare.initial_term(exponent), spectrum: OnceCell::new() });
+        grid.powers.insert(exponent.to_bits(), made.clone());
+        made
     }
 
     /// Weighted samples of an impulse, or of a derivative of one, that only the filter of an output gets.
