@@ -294,9 +294,11 @@ class Grid:
         except FtlmError:
             # Finite on one grid and not on the other: it matters.
             return True
-        moved: Floats = np.asarray(ends[1]) - np.asarray(ends[0])
-        left = max(1.0, float(np.mean(np.asarray(ends[1]) ** 2)))
-        return bool(np.mean(moved**2) > NOTICED**2 * left)
+        with np.errstate(over="ignore"):
+            moved = float(np.mean((np.asarray(ends[1]) - np.asarray(ends[0])) ** 2))
+            left = max(1.0, float(np.mean(np.asarray(ends[1]) ** 2)))
+        # Squares beyond the numbers belong to a free run that one of the grids does not carry.
+        return not math.isfinite(left) or moved > NOTICED**2 * left
 
     def ranked(self, attempts: Sequence[Attempt]) -> list[Attempt]:
         """Attempts by their cost on the grid they come from or on this finer one, whichever is the larger.

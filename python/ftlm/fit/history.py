@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -41,16 +42,13 @@ def fit_any_start(
 
     def fitted(initial: Initial, *, refine: bool = True, raced: list[Attempt] | None = None) -> JointFit:
         asked = replace(structure, initial=initial)
-        begin, beside = (known[0], ()) if alone else (None, known)
-        return fit_output_error(
-            runs, asked, threads=threads, start=begin, refine=refine, progress=progress, loss=loss, known=beside,
-            raced=raced,
-        )  # fmt: skip
+        begun = partial(fit_output_error, start=known[0]) if alone else partial(fit_output_error, known=known)
+        return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, raced=raced)
 
     decided = structure.initial != "auto" or not has_memory(structure) or structure.has_friction
     if not decided and isinstance(start, History):
-        # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks for
-        # more terms, not for fewer.
+        # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks
+        # for more terms, not for fewer.
         raced: list[Attempt] = []
         many = fitted(start, refine=False, raced=raced)
         kept = _shorter(many, runs, structure, loss, refine=False)

@@ -156,7 +156,9 @@ def by_output_error(
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
     identified = structure.with_orders(joint.orders).with_coefficients(problem.named(coefficients))
     moved = problem.number_jacobian(orders, coefficients)
-    spread = moved @ joint.covariance @ moved.T
+    with np.errstate(invalid="ignore"):
+        # Of directions that the runs do not see covariances are no numbers; then none of these is given.
+        spread = moved @ joint.covariance @ moved.T
     return Fit(
         Task(task.runs, structure), "output-error",
         solved(task, "output-error", identified.with_inputs(joint.inputs), {**known, **joint.orders}, record.m),
