@@ -15,6 +15,7 @@ from ftlm.fit.grid import experiment
 from ftlm.fit.joint import fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.simpler import lower_orders
+from ftlm.fit.twins import twin_words
 from ftlm.paper.arm import demo_plant
 
 THREE_TERMS = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
@@ -236,3 +237,19 @@ def test_only_one_equation_of_whole_orders_starts_from_a_lower_one(small_run):
     pair = ftlm.flexible_link(form="published", stage=1, laws=(), coupling="measured")
     whole = pair.with_orders({n: 2.0 if n.startswith("alpha") else 0.5 for n in pair.order_names})
     assert lower_orders(FreeProblem.of(whole), [small_run]) == []
+
+
+def test_two_signals_that_drive_alike_are_named() -> None:
+    run = three_terms(40, 0)
+    (signal,) = run.inputs
+    u = run[signal]
+    twice = ftlm.Run.from_arrays(step=run.step, inputs={"u": u, "v": -2.5 * u}, outputs={"y": run["y"]})
+    words = "v is -2.5 times u on every run, which no run tells apart: leave out the term of c or that of b, fix one of"
+    with pytest.raises(ftlm.ConvergenceError, match=words):
+        ftlm.identify(twice, ftlm.equation("D^alpha y = a1 D^mu y + a0 y + b u + c v"))
+    # At another order, or with a share that differs, they can be told apart.
+    apart = ftlm.Run.from_arrays(
+        step=run.step, inputs={"u": u, "v": u + 1e-6 * np.cos(run.time)}, outputs={"y": run["y"]}
+    )
+    assert twin_words([apart], ftlm.equation("D^alpha y = a0 y + b u + c v")) is None
+    assert twin_words([twice], ftlm.equation("D^alpha y = a0 y + b u + c D^gamma v")) is None

@@ -30,6 +30,7 @@ from ftlm.fit.problem import FreeProblem
 from ftlm.fit.race import SAME_COST, finalists, race
 from ftlm.fit.robust import Robust, huber_shares, same_shares, scales
 from ftlm.fit.steady import Growth, steadied
+from ftlm.fit.twins import twin_words
 from ftlm.fit.uncertainty import covariance, deviation
 from ftlm.solve.instants import compared_values
 
@@ -224,9 +225,8 @@ def fit_output_error(
     else:
         contenders = [given(problem, start)]
     if not contenders:
-        raise ConvergenceError(
-            f"no start of {', '.join(outputs)} has a finite free run; check the signs of the data and the bounds"
-        )
+        why = twin_words(runs, structure) or "check the signs of the data and the bounds"
+        raise ConvergenceError(f"no start of {', '.join(outputs)} has a finite free run; {why}")
     course.at(0.5)
     # Where a step passes faster than the samples see, a grid as coarse as the samples has an optimum of its own.
     while weighed.every < FINEST and weighed.matters(contenders[0]):

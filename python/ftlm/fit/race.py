@@ -13,7 +13,7 @@ from ftlm.base.threads import pool
 from ftlm.data.structures import History
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.simpler import LowerOrder, Simpler, Whole, lower_orders, simpler, whole
+from ftlm.fit.simpler import LowerOrder, Simpler, Whole, held, lower_orders, simpler, whole
 from ftlm.fit.starts import delayed_attempts
 
 #: Samples a run of the coarse fits that compare starts; the best ones continue on all samples.
@@ -103,7 +103,7 @@ def raced(
     # with a pole too fast to see.
     others: list[Simpler | LowerOrder | Whole] = [*simpler(problem), *lower_orders(problem, runs)]
     others += whole(problem, reached[0].orders) if reached else []
-    first = reached
+    first, wholes = reached, list[Attempt]()
     for less in others if reached else []:
         if isinstance(less, Simpler) and less.driven:
             # What drives is solved for at every point, with a term less as well: own terms alone are told apart, so
@@ -125,7 +125,16 @@ def raced(
         runners = one_of_each(laps.run(coarse, runners, GLANCE, less.problem))[:going]
         ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
         ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
-        reached = sorted(reached + [less.embedded(a, problem) for a in ended[:1]], key=lambda a: a.level)
+        there = [less.embedded(a, problem) for a in ended[:1]]
+        wholes += there if isinstance(less, Whole) else []
+        reached = sorted(reached + there, key=lambda a: a.level)
+    for one in held(problem) if reached else []:
+        # Nor is it to end above what it reaches with one order known: from where it is, and from whole orders.
+        runners = [one.without(a) for a in (*distinct(reached)[:FINALISTS], *distinct(first)[:FINALISTS], *wholes)]
+        runners = one_of_each(laps.run(coarse, runners, GLANCE, one.problem))[:FINALISTS]
+        ended = laps.run(coarse, runners, FIRST_LAP, one.problem)
+        there = [one.embedded(a, problem.orders[one.order]) for a in ended[:1]]
+        reached = sorted(reached + laps.run(coarse, there, 1), key=lambda a: a.level)
     if reached and problem.structure.coupling == "measured" and problem.structure.offset != "none":
         # An offset of each run hides which of the measured signals drives: also from where it ends without.
         plain = replace(alike, problem=FreeProblem.of(replace(problem.structure, offset="none")))

@@ -131,6 +131,42 @@ class Whole:
         return replace(attempt, orders=list(self.orders), origin=f"{attempt.origin}, from whole orders")
 
 
+@dataclass(frozen=True)
+class Held:
+    """A problem with one free order at the whole value that the equation would have, the others still free."""
+
+    problem: FreeProblem
+    order: int
+    value: float
+
+    def without(self, attempt: Attempt) -> Attempt:
+        """A point of the whole problem as a start of this one."""
+        orders = [v for k, v in enumerate(attempt.orders) if k != self.order]
+        return replace(attempt, orders=orders, outcome={}, alike=())
+
+    def embedded(self, attempt: Attempt, name: str) -> Attempt:
+        """The same point of the whole problem."""
+        orders = [*attempt.orders[: self.order], self.value, *attempt.orders[self.order :]]
+        return replace(attempt, orders=orders, origin=f"{attempt.origin}, from {name} = {self.value:g}")
+
+
+def held(problem: FreeProblem) -> list[Held]:
+    """Problems with one order less, where there are several: none may end below the whole one."""
+    out = []
+    for place, (name, value) in enumerate(zip(problem.orders, whole_orders(problem), strict=True)):
+        if len(problem.orders) < 2 or value != round(value):
+            continue
+        try:
+            reduced = FreeProblem.of(problem.structure.with_orders({name: value}))
+        except FtlmError:
+            # Two terms of a signal have become one.
+            continue
+        rest = tuple(n for n in problem.orders if n != name)
+        if reduced.coefficients == problem.coefficients and reduced.orders == rest:
+            out.append(Held(reduced, place, value))
+    return out
+
+
 def whole(problem: FreeProblem, near: Sequence[float]) -> list[Whole]:
     """The problem with whole orders: the usual ones, those nearest to a point, and each with one of them at another.
 

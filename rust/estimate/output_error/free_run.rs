@@ -6,8 +6,9 @@ use super::feedthrough::{Direct, Early};
 use super::inverse::{Means, Solved};
 use super::linear::best_moves;
 use super::model::{FreeModel, Point};
+use super::operator::Operator;
 use super::part::Part;
-use super::shelf::{Operator, Shelf};
+use super::shelf::Shelf;
 use crate::dense;
 use crate::equation::Structure;
 use crate::error::{Error, Result};
@@ -136,7 +137,7 @@ impl FreeModel {
                 out.exponents.iter().enumerate().flat_map(|(i, list)| list.iter().map(move |e| (i, *e))).collect();
             let moving: Vec<(usize, f64)> =
                 terms.iter().filter(|&&(_, e)| !experiment.moves_filter(e)).copied().collect();
-            let mut answers = solved.natural(shelf, record.m(), structures.len(), &moving)?.into_iter();
+            let mut answers = shelf.natural(&solved, (structures.len(), record.m()), &moving)?.into_iter();
             for (i, exponent) in terms {
                 let moves = if experiment.moves_filter(exponent) { None } else { answers.next() };
                 let (samples, means) = match moves {

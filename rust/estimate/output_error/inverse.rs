@@ -1,7 +1,7 @@
 //! A⁻¹ of the equations of one experiment, applied to any right-hand side: by products of spectra, or by running sums where
 //! every order of integration is whole and stays so.
 
-use super::shelf::{Operator, Power, Shelf, FACTORS};
+use super::operator::{Operator, Power, FACTORS};
 use crate::error::{Error, Result};
 use crate::series::{Buffers, Kernel, Recursion, Solver, Source, SumOfProducts, ABREAST};
 use std::borrow::Cow;
@@ -169,19 +169,24 @@ impl Solved {
         self.inverse.get().ok_or_else(|| Error::Internal { what: "equations that nothing solves".into() })
     }
 
-    /// Answers to the powers t^e of equations, m pulses of each unknown; those of all runs are made once.
+    /// Answers to the powers t^e of equations, m pulses of n unknowns; to be made once where they are kept.
     ///
     /// # Errors
     /// As [`Solver::solve`].
-    pub(super) fn natural(&self, shelf: &Shelf, m: usize, n: usize, terms: &[(usize, f64)]) -> Result<Vec<Rc<Means>>> {
+    pub(super) fn natural(
+        &self,
+        (n, m): (usize, usize),
+        terms: &[(usize, f64)],
+        keep: bool,
+        power: impl Fn(f64) -> Rc<Power>,
+    ) -> Result<Vec<Rc<Means>>> {
         let key = |&(i, e): &(usize, f64)| (i, e.to_bits());
         let open: Vec<(usize, f64)> =
             terms.iter().filter(|t| !self.natural.borrow().contains_key(&key(t))).copied().collect();
-        let length = if shelf.shared() { shelf.pulses() } else { m };
-        let powers: Vec<Rc<Power>> = open.iter().map(|&(_, e)| shelf.power(e)).collect();
+        let powers: Vec<Rc<Power>> = open.iter().map(|&(_, e)| power(e)).collect();
         let mut made = HashMap::new();
         self.inverse()?.each(
-            (n, length),
+            (n, m),
             open.len(),
             |place, rights| {
                 let power = &powers[place];
@@ -195,7 +200,7 @@ impl Solved {
         )?;
         let mut kept = self.natural.borrow_mut();
         let answers = terms.iter().filter_map(|t| kept.get(&key(t)).or_else(|| made.get(&key(t))).cloned()).collect();
-        if shelf.shared() {
+        if keep {
             kept.extend(made);
         }
         Ok(answers)

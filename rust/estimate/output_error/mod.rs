@@ -19,6 +19,7 @@ mod inverse;
 pub mod levenberg_marquardt;
 mod linear;
 pub mod model;
+mod operator;
 mod part;
 pub mod poles;
 mod sensitivities;

@@ -5,7 +5,7 @@ use super::experiment::Experiment;
 use super::feedthrough::{add_slope, Direct, Early};
 use super::inverse::Solved;
 use super::model::{FreeModel, Point};
-use super::shelf::Operator;
+use super::operator::Operator;
 use crate::error::Result;
 use std::rc::Rc;
 

@@ -2,21 +2,15 @@
 //! whatever does not depend on the run.
 
 use super::experiment::Experiment;
-use super::inverse::Solved;
+use super::inverse::{Means, Solved};
 use super::model::FreeModel;
+use super::operator::{Operator, Power, FACTORS, KEPT_PULSES};
 use crate::error::Result;
-use crate::excess::{kernel, kernel_and_slope};
 use crate::regressors::Record;
-use crate::series::{Kernel, MAX_SUMS};
-use std::cell::{OnceCell, RefCell};
+use crate::series::Kernel;
+use std::cell::RefCell;
 use std::collections::HashMap;
 use std::rc::Rc;
-
-/// Terms of a product of three series of m terms: spectra of this length multiply without wrapping onto the first m.
-pub(super) const FACTORS: usize = 3;
-
-/// Spectra of longer records are made anew each time: those of all terms together would be many times the record.
-const KEPT_PULSES: usize = 1 << 15;
 
 /// Powers of t that are kept of long records and of others.
 const FEW_POWERS: usize = 8;
@@ -24,76 +18,6 @@ const MANY_POWERS: usize = 64;
 
 /// Runs of one grid are this share as long as the longest at least: shorter ones would pay for transforms of its length.
 const AS_LONG: f64 = 0.7;
-
-/// How near to a whole number an order of integration is one: the kernels differ by as much.
-const WHOLE: f64 = 1e-12;
-
-/// The integral of a term: its kernel, and the kernel's derivative with respect to its order where the order is free.
-pub(super) struct Operator {
-    eta: f64,
-    free: bool,
-    m: usize,
-    step: f64,
-    /// Kernel and derivative, once they are asked for.
-    series: OnceCell<(Vec<f64>, Vec<f64>)>,
-    spectra: [OnceCell<Rc<Kernel>>; 2],
-}
-
-impl Operator {
-    fn series(&self) -> &(Vec<f64>, Vec<f64>) {
-        self.series.get_or_init(|| match self.free {
-            true => kernel_and_slope(self.eta, self.m, self.step),
-            false => (kernel(self.eta, self.m, self.step), Vec::new()),
-        })
-    }
-
-    /// The order of the integral.
-    pub(super) fn eta(&self) -> f64 {
-        self.eta
-    }
-
-    /// Of the integral.
-    pub(super) fn kernel(&self) -> &[f64] {
-        &self.series().0
-    }
-
-    /// The order of the integral where it is whole and stays so.
-    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
-    pub(super) fn whole(&self) -> Option<usize> {
-        let near = self.eta.round();
-        let stays = !self.free && (self.eta - near).abs() <= WHOLE && near >= 0.0;
-        (stays && near <= MAX_SUMS as f64).then_some(near as usize)
-    }
-
-    /// The spectrum of the kernel, or of its derivative, for products of [`FACTORS`] series.
-    pub(super) fn spectrum(&self, slope: bool) -> Rc<Kernel> {
-        let made = || {
-            let series = self.series();
-            Rc::new(Kernel::with_length(if slope { &series.1 } else { &series.0 }, FACTORS * self.m))
-        };
-        if self.m > KEPT_PULSES {
-            return made();
-        }
-        self.spectra[usize::from(slope)].get_or_init(made).clone()
-    }
-}
-
-/// What an initial term t^e adds, and its spectrum for products of [`FACTORS`] series.
-pub(super) struct Power {
-    pub(super) series: Vec<f64>,
-    spectrum: OnceCell<Rc<Kernel>>,
-}
-
-impl Power {
-    /// Its spectrum.
-    pub(super) fn spectrum(&self) -> Rc<Kernel> {
-        let made = || Rc::new(Kernel::with_length(&self.series, FACTORS * self.series.len()));
-        if self.series.len() > KEPT_PULSES {
-            return made();
-        }
-        self.spectrum.get_or_init(made).clone()
-    }
-}
 
 /// What runs of one step and one filter share: kernels, powers of t, and A⁻¹ at the last point, as long as the longest.
 struct Grid {
@@ -170,25 +94,38 @@ impl Shelf {
         Ok(places.into_iter().map(shelf).collect())
     }
 
+    /// Answers to the powers t^e of equations, each with `m` pulses of `n` unknowns or more.
+    ///
+    /// # Errors
+    /// As [`Solved::natural`].
+    pub(super) fn natural(
+        &self,
+        solved: &Solved,
+        (n, m): (usize, usize),
+        terms: &[(usize, f64)],
+    ) -> Result<Vec<Rc<Means>>> {
+        let shared = self.shared();
+        solved.natural((n, if shared { self.pulses() } else { m }), terms, shared, |exponent| self.power(exponent))
+    }
+
     /// Pulses of the longest run on the grid.
     pub(super) fn pulses(&self) -> usize {
         self.grid.borrow().bare.m()
     }
 
     /// Whether other runs are on the grid.
-    pub(super) fn shared(&self) -> bool {
+    fn shared(&self) -> bool {
         self.grid.borrow().runs > 1
     }
 
     /// The operator of a term that is integrated by `eta`; its order may be free.
     pub(super) fn operator(&self, place: (usize, usize), eta: f64, free: bool) -> Rc<Operator> {
         let mut grid = self.grid.borrow_mut();
-        if let Some(known) = grid.operators.get(&place).filter(|o| o.eta.to_bits() == eta.to_bits()) {
+        if let Some(known) = grid.operators.get(&place).filter(|o| o.eta().to_bits() == eta.to_bits()) {
             return known.clone();
         }
         let (m, step) = (grid.bare.m(), grid.bare.step());
-        let (series, spectra) = (OnceCell::new(), [OnceCell::new(), OnceCell::new()]);
-        let made = Rc::new(Operator { eta, free, m, step, series, spectra });
+        let made = Rc::new(Operator::new(eta, free, m, step));
         grid.operators.insert(place, made.clone());
         made
     }
@@ -247,7 +184,7 @@ impl Shelf {
         if let Some(known) = grid.powers.get(&exponent.to_bits()) {
             return known.clone();
         }
-        let made = Rc::new(Power { series: grid.bare.initial_term(exponent), spectrum: OnceCell::new() });
+        let made = Rc::new(Power::new(grid.bare.initial_term(exponent)));
         grid.powers.insert(exponent.to_bits(), made.clone());
         made
     }
