@@ -11,6 +11,7 @@ import numpy as np
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.base.threads import pool
 from ftlm.data.structures import History
+from ftlm.fit.clock import Clock
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.simpler import LowerOrder, Simpler, Whole, held, lower_orders, simpler, whole
@@ -128,9 +129,11 @@ def raced(
         there = [less.embedded(a, problem) for a in ended[:1]]
         wholes += there if isinstance(less, Whole) else []
         reached = sorted(reached + there, key=lambda a: a.level)
+    clock = Clock.of(problem, runs)
     for one in held(problem) if reached else []:
         # Nor is it to end above what it reaches with one order known: from where it is, and from whole orders.
-        runners = [one.without(a) for a in (*distinct(reached)[:FINALISTS], *distinct(first)[:FINALISTS], *wholes)]
+        near = (*distinct(reached)[:FINALISTS], *distinct(first)[:FINALISTS], *wholes)
+        runners = [one.without(a, problem, clock) for a in near]
         runners = one_of_each(laps.run(coarse, runners, GLANCE, one.problem))[:FINALISTS]
         ended = laps.run(coarse, runners, FIRST_LAP, one.problem)
         there = [one.embedded(a, problem.orders[one.order]) for a in ended[:1]]

@@ -9,6 +9,7 @@ from ftlm.base.errors import FtlmError
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.structures import Hints, History
+from ftlm.fit.clock import Clock
 from ftlm.fit.grid import Attempt
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.starts import whole_orders
@@ -139,10 +140,13 @@ class Held:
     order: int
     value: float
 
-    def without(self, attempt: Attempt) -> Attempt:
-        """A point of the whole problem as a start of this one."""
-        orders = [v for k, v in enumerate(attempt.orders) if k != self.order]
-        return replace(attempt, orders=orders, outcome={}, alike=())
+    def without(self, attempt: Attempt, whole: FreeProblem, clock: Clock) -> Attempt:
+        """A point of the whole problem as a start of this one: coefficients keep their numbers in the clock's unit."""
+        told = clock.told(attempt.values)
+        told[self.order] = self.value
+        orders, coefficients, inputs = whole.split(clock.untold(told).tolist())
+        del orders[self.order]
+        return replace(attempt, orders=orders, coefficients=coefficients, inputs=inputs, outcome={}, alike=())
 
     def embedded(self, attempt: Attempt, name: str) -> Attempt:
         """The same point of the whole problem."""
