@@ -14,10 +14,11 @@ use crate::search::rounds::hunt::Hunt;
 use crate::search::screen::{by_guess, screen, Open};
 use crate::search::spread::visit;
 
-/// Rows whose neighbours are followed.
+/// Rows whose neighbours are followed: few while far ones are, which only lead to where the near ones are worth it.
+const LEADING: usize = 4;
 const BEST: usize = 64;
 /// Most candidates followed around the best ones.
-const FOLLOWED: usize = 1 << 14;
+const FOLLOWED: usize = 1 << 15;
 /// Most directions in which neighbours are looked for: all of up to five orders, else pairs of orders.
 const DIRECTIONS: usize = 243;
 /// Stretches of candidates, and their length, among which the hard ones are looked for.
@@ -32,13 +33,17 @@ const MOST: u64 = 256 << 20;
 impl Hunt<'_> {
     /// Goes down from the best rows, and from what is found all over the lattice by the limit that they give; then test
     /// vectors made for candidates that the others do not exclude, and the bytes of each. None where there is no memory
-    /// for them.
+    /// for them, or no use.
     pub(super) fn nearby(&mut self, kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<Option<(Adapted, u64)>> {
         self.neighbours(kept, tried)?;
         let hard = self.hard(kept)?;
         let anew: Vec<Open> = hard.iter().filter(|open| tried.insert(open.index)).copied().collect();
         self.follow(&anew, kept, Place::start(0), false)?;
         self.neighbours(kept, tried)?;
+        // Of equation errors in squares the Gram matrix says all.
+        if self.catalogue.problem.squares.is_some() {
+            return Ok(None);
+        }
         self.adapted(kept, hard)
     }
 
@@ -50,7 +55,8 @@ impl Hunt<'_> {
         let mut stride = (longest / 8).max(1).next_power_of_two();
         let first = tried.len();
         while stride > 0 {
-            let best = |kept: &Kept| kept.rows.iter().take(BEST).map(|row| row.index).collect::<Vec<u64>>();
+            let most = if stride > 1 { LEADING } else { BEST };
+            let best = |kept: &Kept| kept.rows.iter().take(most).map(|row| row.index).collect::<Vec<u64>>();
             let before = best(kept);
             let mut around: Vec<u64> = before.iter().flat_map(|&index| self.around(index, stride)).collect();
             around.retain(|&index| tried.insert(index));
