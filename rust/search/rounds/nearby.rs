@@ -14,11 +14,11 @@ use crate::search::rounds::hunt::Hunt;
 use crate::search::screen::{by_guess, screen, Open};
 use crate::search::spread::visit;
 
-/// Rows whose neighbours are followed: few while far ones are, which only lead to where the near ones are worth it.
-const LEADING: usize = 4;
+/// Rows whose neighbours are followed.
 const BEST: usize = 64;
-/// Most candidates followed around the best ones.
-const FOLLOWED: usize = 1 << 15;
+/// Most candidates followed around the best ones: of so many one, within these ends.
+const FOLLOWED: u64 = 1 << 12;
+const FOLLOWED_ENDS: (u64, u64) = (1 << 14, 1 << 17);
 /// Most directions in which neighbours are looked for: all of up to five orders, else pairs of orders.
 const DIRECTIONS: usize = 243;
 /// Stretches of candidates, and their length, among which the hard ones are looked for.
@@ -55,8 +55,7 @@ impl Hunt<'_> {
         let mut stride = (longest / 8).max(1).next_power_of_two();
         let first = tried.len();
         while stride > 0 {
-            let most = if stride > 1 { LEADING } else { BEST };
-            let best = |kept: &Kept| kept.rows.iter().take(most).map(|row| row.index).collect::<Vec<u64>>();
+            let best = |kept: &Kept| kept.rows.iter().take(BEST).map(|row| row.index).collect::<Vec<u64>>();
             let before = best(kept);
             let mut around: Vec<u64> = before.iter().flat_map(|&index| self.around(index, stride)).collect();
             around.retain(|&index| tried.insert(index));
@@ -65,7 +64,7 @@ impl Hunt<'_> {
             if best(kept) == before {
                 stride /= 2;
             }
-            if tried.len() - first > FOLLOWED {
+            if (tried.len() - first) as u64 > (lattice.count() / FOLLOWED).clamp(FOLLOWED_ENDS.0, FOLLOWED_ENDS.1) {
                 break;
             }
         }
