@@ -16,9 +16,8 @@ use crate::search::spread::visit;
 
 /// Rows whose neighbours are followed.
 const BEST: usize = 64;
-/// Most candidates followed around the best ones: of so many one, within these ends.
-const FOLLOWED: u64 = 1 << 12;
-const FOLLOWED_ENDS: (u64, u64) = (1 << 14, 1 << 17);
+/// Most candidates followed around the best ones.
+const FOLLOWED: usize = 1 << 14;
 /// Most directions in which neighbours are looked for: all of up to five orders, else pairs of orders.
 const DIRECTIONS: usize = 243;
 /// Stretches of candidates, and their length, among which the hard ones are looked for.
@@ -64,7 +63,7 @@ impl Hunt<'_> {
             if best(kept) == before {
                 stride /= 2;
             }
-            if (tried.len() - first) as u64 > (lattice.count() / FOLLOWED).clamp(FOLLOWED_ENDS.0, FOLLOWED_ENDS.1) {
+            if tried.len() - first > FOLLOWED {
                 break;
             }
         }
