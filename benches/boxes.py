@@ -2,8 +2,9 @@
 
 ``python benches/boxes.py [--steps 0.05 0.02 0.01] [--write]`` prints candidates, seconds of processors and of clock,
 what became of the candidates, and the growth from each step to the next: the exponent of the candidates that the
-processor time follows. ``--psf`` adds the real arm's first link, taken to be at rest; ``--write`` appends all to
-benches/RESULTS.md and writes docs/boxes.json, from which the pages draw the growth.
+processor time follows. ``--psf`` adds the real arm's first link, taken to be at rest; ``--squares`` ranks by squared
+equation errors; ``--alpha 1.05 1.3`` takes a part of the lattice; ``--write`` appends all to benches/RESULTS.md and
+writes docs/boxes.json, from which the pages draw the growth.
 """
 
 from __future__ import annotations
@@ -32,12 +33,16 @@ def main() -> None:
     parser.add_argument("--steps", type=float, nargs="+", default=STEPS)
     parser.add_argument("--noise", type=float, nargs="*", default=(1e-4, 1e-3), help="deviation on both angles [rad]")
     parser.add_argument("--psf", action="store_true", help="the measured run psf as well (FTLM_DATA)")
+    parser.add_argument("--squares", action="store_true", help="rank by the equation error in squares")
+    parser.add_argument("--alpha", type=float, nargs=2, default=(1.05, 2.0), help="its interval")
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     arguments = parser.parse_args()
+    ranked: dict[str, str] = {"criterion": "equation-error", "norm": "l2"} if arguments.squares else {}
+    by = ", squared equation error" if arguments.squares else ""
     equation = replace(ftlm.flexible_link(form="published", stage=1).equation("theta12"), initial="rest")
-    runs = {f"Plant A, {noise:g} rad": plant_a_run(noise, noise) for noise in arguments.noise}
+    runs = {f"Plant A, {noise:g} rad{by}": plant_a_run(noise, noise) for noise in arguments.noise}
     if arguments.psf:
-        runs["psf"] = arm_run("psf")
+        runs[f"psf{by}"] = arm_run("psf")
     lines = [heading()]
     print(lines[0], flush=True)
     searches: list[dict[str, str | float]] = []
@@ -46,8 +51,9 @@ def main() -> None:
         for step in arguments.steps:
             wall, cpu = time.perf_counter(), time.process_time()
             found = ftlm.search_orders(
-                run, equation, ftlm.lattice(step=step, alpha=(1.05, 2.0)), coefficients="least-squares", m=M
-            )
+                run, equation, ftlm.lattice(step=step, alpha=tuple(arguments.alpha)), coefficients="least-squares", m=M,
+                **ranked,
+            )  # fmt: skip
             wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
             grown = ""
             if before is not None:
@@ -58,7 +64,8 @@ def main() -> None:
             best = ", ".join(f"{n} {v:g}" for n, v in found.table[0].orders.items())
             lines.append(
                 f"{name}, step {step:g}: {found.candidates} candidates, {cpu:.1f} s of processors, {wall:.1f} s, "
-                f"{cpu / found.candidates * 1e9:.1f} ns each{grown}; bound {found.pruned['bound']}, stopped early "
+                f"{cpu / found.candidates * 1e9:.1f} ns each{grown}; bound {found.pruned['bound']} "
+                f"({found.boxed} in boxes), stopped early "
                 f"{found.pruned['stopped early']}, beaten {found.pruned['beaten']}; best {found.table[0].score:.6g} "
                 f"({best}), last kept {found.table[-1].score:.6g}"
             )

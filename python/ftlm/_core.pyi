@@ -114,7 +114,7 @@ _Counts = TypedDict(
 
 _Part: TypeAlias = tuple[
     Sequence[tuple[int, float, Sequence[float], Sequence[Sequence[float]]]],
-    tuple[int, int, int, int, int, int, int],
+    Sequence[int],
     Sequence[tuple[int, bool]],
 ]
 _Checkpoint: TypeAlias = tuple[tuple[int, int, int, int, float, int], bool, _Part]
@@ -126,6 +126,8 @@ class _Found(TypedDict):
     #: (index, score, alpha, orders, coefficients, initial terms per record)
     rows: list[tuple[int, float, float, list[float], list[float], list[list[float]]]]
     counts: _Counts
+    #: excluded in whole boxes, among those excluded by a bound
+    boxed: int
     #: (index, alpha, orders, reason)
     failures: list[tuple[int, float, list[float], Literal["singular", "diverged"]]]
 

@@ -51,6 +51,8 @@ pub struct Counts {
     pub beaten: u64,
     /// Excluded by a lower bound of their score, without a run.
     pub bounded: u64,
+    /// Of these, those that no bound of their own was asked for: their whole box was excluded.
+    pub boxed: u64,
     /// Left before the end because their partial sum could no longer be kept.
     pub stopped: u64,
     /// Without coefficients.
@@ -129,6 +131,7 @@ impl Counts {
             (&mut self.kept, other.kept),
             (&mut self.beaten, other.beaten),
             (&mut self.bounded, other.bounded),
+            (&mut self.boxed, other.boxed),
             (&mut self.stopped, other.stopped),
             (&mut self.singular, other.singular),
             (&mut self.diverged, other.diverged),

@@ -3,18 +3,18 @@
 import pytest
 
 import ftlm
+from ftlm.paint.text import number
+from ftlm.search.result import search_summary
 from test_store import EQUATION, bytes_of
 
 #: From this many candidates on boxes screen.
 BOXED = 1 << 25
 
-pytestmark = pytest.mark.slow
 
-
-def search(run, *, alpha=(1.05, 2.0), store=None, threads=2):
+def search(run, *, alpha=(1.05, 2.0), threads=2, **options):
     equation = ftlm.equation(EQUATION, initial="rest")
-    options = {"coefficients": "least-squares", "m": 64, "threads": threads, "store": store}
-    return ftlm.search_orders(run, equation, ftlm.lattice(step=0.015, alpha=alpha), **options)
+    lattice = ftlm.lattice(step=0.015, alpha=alpha)
+    return ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=64, threads=threads, **options)
 
 
 def rows_of(found):
@@ -31,21 +31,46 @@ def whole(run):
     return search(run)
 
 
-def test_boxes_keep_the_table_of_one_by_one(run, whole):
+def check_one_by_one(run, whole, **options):
+    """The table of a search in boxes is that of two searches too small for boxes; every candidate is accounted for."""
     assert whole.candidates >= BOXED
-    parts = [search(run, alpha=alpha) for alpha in ((1.05, 1.8), (1.815, 2.0))]
+    parts = [search(run, alpha=alpha, **options) for alpha in ((1.05, 1.8), (1.815, 2.0))]
     assert sum(part.candidates for part in parts) == whole.candidates
     assert all(part.candidates < BOXED for part in parts)
     rows = sorted((row for part in parts for row in rows_of(part)), key=lambda row: row[0])
     assert rows_of(whole) == rows[: len(whole.table)]
     assert sum(whole.pruned.values()) + len(whole.table) == whole.candidates
+    assert [part.boxed for part in parts] == [0, 0]
+    assert 0 < whole.boxed <= whole.pruned["bound"]
+    assert f"{whole.pruned['bound']} bound ({whole.boxed} of them in boxes excluded whole)" in str(whole)
+    assert "of these in boxes excluded whole" in whole._repr_html_()
+    assert f"{number(whole.boxed)} are in boxes" in search_summary({"y": whole}).to_html()
 
 
+@pytest.mark.slow
+def test_boxes_keep_the_table_of_one_by_one(run, whole):
+    check_one_by_one(run, whole)
+
+
+def test_boxes_keep_the_table_of_squared_equation_errors(run, tmp_path):
+    options = {"criterion": "equation-error", "norm": "l2"}
+    path = tmp_path / "s.ftlm"
+    whole = search(run, store=path, **options)
+    check_one_by_one(run, whole, **options)
+    assert whole.boxed > whole.candidates // 4
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) * 19 // 20])
+    assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
+    assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("threads", [3, 8])
 def test_boxes_give_the_same_bits_for_more_threads(run, whole, threads):
     assert bytes_of(search(run, threads=threads)) == bytes_of(whole)
 
 
+@pytest.mark.slow
 def test_boxes_give_the_same_bits_for_any_threads_in_a_store_and_when_cut(run, whole, tmp_path):
     path = tmp_path / "s.ftlm"
     assert bytes_of(search(run, store=path, threads=1)) == bytes_of(whole)

@@ -66,7 +66,10 @@ def test_a_finished_store_under_an_order_law_is_read_to_the_bit(folder, tmp_path
     path = tmp_path / "law.ftlm"
     expected = json.loads((folder / "law.json").read_text(encoding="utf-8"))
     assert ftlm.search_status(path)["stage"].complete
-    assert json.loads(json.dumps(ftlm.resume_search(path)["stage"].to_dict())) == expected
+    found = json.loads(json.dumps(ftlm.resume_search(path)["stage"].to_dict()))
+    # Later versions tell more.
+    assert found.pop("boxed") == 0
+    assert found == expected
     assert path.read_bytes() == (folder / "law.ftlm").read_bytes()
 
 

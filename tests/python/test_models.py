@@ -299,6 +299,7 @@ def test_equation_survives_being_written_and_read(item):
         ("1.05:1.2:0.05", (1.05, 1.1, 1.15, 1.2)),
         ("0:0:1", (0.0,)),
         ("-0.1:0.1:0.1", (-0.1, 0.0, 0.1)),
+        ("1:1.000000002:1e-9", (1.0, 1.000000001, 1.000000002)),
         ("0:1:0.3", (0.0, 0.3, 0.6, 0.9)),
     ],
 )
@@ -319,6 +320,12 @@ def test_values_of_an_order(spec, values):
         ("2:1:0.1", "interval 2:1 is empty"),
         ("1:11:0.1", "= 11 is outside [-3, 10]"),
         ("0:3:1e-7", "has 3e+07 values, more than 1000000"),
+        ("1:1.000000002:5e-10", "step 5e-10 is below 1e-09, to which orders are kept; raise the step"),
+        ("0:3:1e-300", "step 1e-300 is below 1e-09, to which orders are kept; raise the step"),
+        (
+            [0.5, 0.7, 0.7000000001],
+            "values 0.7 and 0.7000000001 are one order: orders are kept to 1e-09; leave one out",
+        ),
         (11.0, "= 11 is outside [-3, 10]"),
         (math.nan, "= nan is outside [-3, 10]"),
         (math.inf, "= inf is outside [-3, 10]"),

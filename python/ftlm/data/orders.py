@@ -6,6 +6,7 @@ import ast
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TypeAlias
 
 from ftlm.base.checks import real_number
@@ -19,6 +20,8 @@ MIN_INPUT_ORDER = -3.0
 MAX_EXCESS = 1.0
 #: Highest order that a search tries of itself, where the structure holds none above it.
 SEARCHED_ORDER = 3.0
+#: Orders are kept to this; what differs by less is one order.
+RESOLUTION = 1e-9
 #: What a person writes for the values of an order, see :func:`parse_values`.
 Values: TypeAlias = float | str | Iterable[float]
 
@@ -165,7 +168,14 @@ def parse_values(name: str, spec: Values) -> float | tuple[float, ...]:
     values = [_checked(name, v) for v in numbers]
     if not values:
         raise ModelError(f"order {name} has no value; give at least one")
-    return tuple(sorted(set(values)))
+    values = sorted(set(values))
+    for low, high in pairwise(values):
+        if round(low, 9) == round(high, 9):
+            raise ModelError(
+                f"order {name}: values {shortest(low)} and {shortest(high)} are one order: orders are kept to "
+                f"{RESOLUTION:g}; leave one out"
+            )
+    return tuple(values)
 
 
 def _checked(name: str, value: float) -> float:
@@ -183,6 +193,10 @@ def grid(name: str, low: float, high: float, step: float) -> tuple[float, ...]:
     low, high, step = (real_number(f"order {name}", v) for v in (low, high, step))
     if not (math.isfinite(step) and step > 0):
         raise ModelError(f"order {name}: step {step:g} is not positive; the paper's is 0.05")
+    if step < RESOLUTION:
+        raise ModelError(
+            f"order {name}: step {step:g} is below {RESOLUTION:g}, to which orders are kept; raise the step"
+        )
     _checked(name, low)
     _checked(name, high)
     if high < low:

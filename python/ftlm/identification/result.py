@@ -285,8 +285,9 @@ class Identification(Judged):
         if self.information is not None:
             lines.append(str(self.information))
         for name, search in self.searches.items():
-            pruned = ", ".join(f"{count} {reason}" for reason, count in search.pruned.items() if count)
-            lines.append(f"order search ({name}): {search.candidates} candidates, {len(search.table)} kept, {pruned}")
+            lines.append(
+                f"order search ({name}): {search.candidates} candidates, {len(search.table)} kept{search.left_out}"
+            )
         lines += _initial_in_words(self.comparison)
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)

@@ -82,8 +82,8 @@ class Section:
     @property
     def dealt(self) -> int:
         """Candidates dealt with."""
-        done = (len(f.kinds) if isinstance(f, frames.Verdicts) else sum(f.part[1][1:]) for f in self.done.values())
-        return sum(done) + sum(sum(half.counts[1:]) for half in self.open.values())
+        done = (len(f.kinds) if isinstance(f, frames.Verdicts) else sum(f.part[1][1:7]) for f in self.done.values())
+        return sum(done) + sum(sum(half.counts[1:7]) for half in self.open.values())
 
     @property
     def best(self) -> float | None:

@@ -18,15 +18,17 @@ MAGIC = b"ftlm search store 1\n"
 HEAD = struct.Struct("<II")
 DIGEST = 16
 #: Number of the algorithm that rounds follow; rounds of different ones must not be joined.
-ALGORITHM = 2
+ALGORITHM = 3
 #: Earlier ones whose half-finished stores go on where the rounds of a search have not changed since: 2 screens lattices
-#: of 2²⁵ candidates and more in boxes and in longer rounds, and leaves all others as they were.
-CONTINUED = (1,)
+#: of 2²⁵ candidates and more in boxes and in longer rounds, 3 in sharper boxes and by squared equation errors too; both
+#: leave all others as they were.
+CONTINUED = (1, 2)
 #: Largest payload: a table of 100 000 rows of many coefficients is far below.
 MAX_PAYLOAD = 1 << 30
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 Row = tuple[Natural, float, tuple[float, ...], tuple[tuple[float, ...], ...]]
-Counts = tuple[Natural, Natural, Natural, Natural, Natural, Natural, Natural]
+#: Candidates, kept, beaten, bounded, stopped early, singular, diverged; of the bounded those in boxes, if any.
+Counts = Annotated[tuple[Natural, ...], msgspec.Meta(min_length=7, max_length=8)]
 Failures = tuple[tuple[Natural, bool], ...]
 #: Rows (index, raw score, coefficients, initial terms by record), counts, failures (index, whether diverged).
 Part = tuple[tuple[Row, ...], Counts, Failures]

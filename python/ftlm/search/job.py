@@ -138,12 +138,12 @@ def run_job(job: Job, *, store: Store | None = None, number: int = 0, executor: 
         )
     if job.structure.has_order_law:
         stage = search_stage(job.stage_work(), store=store, number=number, executor=executor, progress=job.progress)
-        return _result(job, *_stage_rows(job.structure, stage), stage["counts"])
+        return _result(job, *_stage_rows(job.structure, stage), stage["counts"], 0)
     try:
         one = search_equation(job.equation_work(), store=store, number=number, executor=executor, progress=job.progress)
     except ModelError as error:
         raise named_signals(error, job.records[0].signals) from None
-    return _result(job, *_equation_rows(job.structure, one), one["counts"])
+    return _result(job, *_equation_rows(job.structure, one), one["counts"], one["boxed"])
 
 
 def _equation_rows(structure: Structure, found: _core._Found) -> tuple[list[SearchRow], Failures]:
@@ -172,7 +172,7 @@ def _stage_rows(structure: Structure, found: _core._FoundStage) -> tuple[list[Se
     return table, [(dict(zip(names, free, strict=True)), str(reason)) for _, free, reason in found["failures"]]
 
 
-def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core._Counts) -> SearchResult:
+def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core._Counts, boxed: int) -> SearchResult:
     structure, values, settings = job.structure, job.values, job.settings
     m = job.records[0].m
     if not table:
@@ -192,4 +192,4 @@ def _result(job: Job, table: list[SearchRow], failures: Failures, counts: _core.
     highest = {n for e in structure.equations for n in e.order.names}
     edges = {n: v for n, v in edges.items() if not (v == 2.0 and n in highest)}
     pruned = {k: cast("int", v) for k, v in counts.items() if k not in ("candidates", "kept")}
-    return SearchResult(table, model, counts["candidates"], pruned, failures, m, settings.to_dict(), edges)
+    return SearchResult(table, model, counts["candidates"], pruned, failures, m, settings.to_dict(), edges, boxed)

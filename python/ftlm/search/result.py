@@ -62,6 +62,8 @@ class SearchResult:
         Criterion, norm, coefficients, innovation length, prior covariance, rows, initial terms.
     edges
         Orders of the first row that stand on the edge of their interval, by name with the edge.
+    boxed
+        Of those under "bound", the candidates whose whole box of orders was excluded by one bound.
     """
 
     table: list[SearchRow]
@@ -72,6 +74,7 @@ class SearchResult:
     m: int
     settings: dict[str, Any]
     edges: dict[str, float]
+    boxed: int = 0
 
     @property
     def orders(self) -> dict[str, float]:
@@ -91,6 +94,14 @@ class SearchResult:
     def _repr_html_(self) -> str:
         return search_html(self)
 
+    @property
+    def left_out(self) -> str:
+        """What became of the candidates that are not in the table, in words."""
+        told = {reason: f"{count} {reason}" for reason, count in self.pruned.items() if count}
+        if self.boxed:
+            told["bound"] += f" ({self.boxed} of them in boxes excluded whole)"
+        return "".join(f", {words}" for words in told.values())
+
     def to_frame(self) -> Any:
         """The ranked table as a pandas frame, by rank."""
         rows = [{"rank": r.rank, "score": r.score, **r.orders, **r.coefficients} for r in self.table]
@@ -101,6 +112,7 @@ class SearchResult:
         return {
             "candidates": self.candidates,
             "pruned": self.pruned,
+            "boxed": self.boxed,
             "m": self.m,
             "settings": self.settings,
             "table": [dict(vars(row)) for row in self.table],
@@ -117,8 +129,7 @@ class SearchResult:
             orders = "".join(f"{row.orders[n]:>9.5g}" for n in names)
             values = "".join(f"{row.coefficients[n]:>12.5g}" for n in coefficients)
             lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}")
-        pruned = ", ".join(f"{count} {reason}" for reason, count in self.pruned.items() if count)
-        lines.append(f"{self.candidates} candidates: {len(self.table)} kept" + (f", {pruned}" if pruned else ""))
+        lines.append(f"{self.candidates} candidates: {len(self.table)} kept{self.left_out}")
         lines += [f"warning: order {n} = {v:g} is on the edge of its interval; widen it" for n, v in self.edges.items()]
         return "\n".join(lines)
 
@@ -197,7 +208,13 @@ def search_summary(searches: Mapping[str, SearchResult], *, title: str = "What b
         rows,
         groups=(("", 4), ("left out", len(reasons))) if reasons else (),
         note="Every candidate of the lattice is kept or counted under a reason. “beaten” and “stopped early” were "
-        "worse than the last row kept.",
+        "worse than the last row kept."
+        + "".join(
+            f" Of the {number(s.pruned['bound'])} under “bound” of {_search_name(name)}, {number(s.boxed)} are in "
+            "boxes of orders that one bound excludes whole."
+            for name, s in searches.items()
+            if s.boxed
+        ),
     )
 
 
@@ -240,7 +257,10 @@ def _search_name(name: str) -> str:
 def search_html(found: SearchResult) -> str:
     """Return the best rows of an order search and what became of the rest."""
     rows: list[list[Cell]] = [["kept", len(found.table)]]
-    rows += [[reason, count] for reason, count in found.pruned.items()]
+    for reason, count in found.pruned.items():
+        rows.append([reason, count])
+        if reason == "bound" and found.boxed:
+            rows.append(["of these in boxes excluded whole", found.boxed])
     name = found.model.outputs[0] if len(found.model.outputs) == 1 else "stage"
     rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows)
     return str(search_top(name, found).to_html() + rest.to_html())

@@ -190,8 +190,12 @@ pub fn named(failure: Failure) -> &'static str {
 
 /// (index, raw score, coefficients, initial terms by record).
 type RowArg = (u64, f64, List<f64>, List<List<f64>>);
-/// Candidates, kept, beaten, bounded, stopped, singular, diverged.
-type CountsArg = (u64, u64, u64, u64, u64, u64, u64);
+/// Candidates, kept, beaten, bounded, stopped, singular, diverged; how many of the bounded were in boxes, where any was.
+#[derive(FromPyObject, IntoPyObject)]
+pub enum CountsArg {
+    Plain((u64, u64, u64, u64, u64, u64, u64)),
+    Boxed((u64, u64, u64, u64, u64, u64, u64, u64)),
+}
 /// Rows, counts, (index, whether diverged rather than singular) of failures.
 pub type PartArg = (List<RowArg>, CountsArg, List<(u64, bool)>);
 /// (round, followed, end, size, limit, order), whether the stretch was begun anew, and what it came to.
@@ -202,14 +206,20 @@ pub fn part_of(part: Part) -> PartArg {
     let c = part.counts;
     (
         part.rows.into_iter().map(|r| (r.index, r.score, r.coefficients.into(), lists(r.initial))).collect(),
-        (c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged),
+        match c.boxed {
+            0 => CountsArg::Plain((c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged)),
+            n => CountsArg::Boxed((c.candidates, c.kept, c.beaten, c.bounded, c.stopped, c.singular, c.diverged, n)),
+        },
         part.failures.into_iter().map(|(index, f)| (index, f == Failure::Diverged)).collect(),
     )
 }
 
 /// What rounds came to, as they told.
 pub fn part((rows, counts, failures): PartArg) -> Part {
-    let (candidates, kept, beaten, bounded, stopped, singular, diverged) = counts;
+    let (candidates, kept, beaten, bounded, stopped, singular, diverged, boxed) = match counts {
+        CountsArg::Plain((a, b, c, d, e, f, g)) => (a, b, c, d, e, f, g, 0),
+        CountsArg::Boxed(all) => all,
+    };
     Part {
         rows: rows
             .into_iter()
@@ -220,7 +230,7 @@ pub fn part((rows, counts, failures): PartArg) -> Part {
                 initial: nested(initial),
             })
             .collect(),
-        counts: Counts { candidates, kept, beaten, bounded, stopped, singular, diverged },
+        counts: Counts { candidates, kept, beaten, bounded, boxed, stopped, singular, diverged },
         failures: failures
             .into_iter()
             .map(|(index, diverged)| (index, if diverged { Failure::Diverged } else { Failure::Singular }))

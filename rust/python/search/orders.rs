@@ -80,6 +80,7 @@ impl Found {
         let dict = PyDict::new(py);
         dict.set_item("rows", self.rows)?;
         dict.set_item("counts", counted(py, &self.counts)?)?;
+        dict.set_item("boxed", self.counts.boxed)?;
         dict.set_item("failures", self.failures)?;
         Ok(dict)
     }
@@ -132,6 +133,10 @@ pub fn search_join<'py>(
         }
         if all.counts.candidates != lattice.count() || all.counts.done() != lattice.count() {
             return Err(another(format!("parts account for {} of {} candidates", all.counts.done(), lattice.count())));
+        }
+        if all.counts.boxed > all.counts.bounded {
+            let Counts { boxed, bounded, .. } = all.counts;
+            return Err(another(format!("parts have {boxed} candidates in boxes among {bounded} excluded ones")));
         }
         Ok(Found::new(&lattice, all.outcome(options.norm, samples)))
     })?;

@@ -6,9 +6,12 @@ use std::ops::Range;
 use crate::error::Result;
 use crate::lanes::{self, WIDTH};
 use crate::regressors::Record;
+use crate::search::bound::lower::Bound;
+use crate::search::bound::probes::Probes;
 use crate::search::boxes::cell::{Common, Slab, Stretch, MOST_OTHERS};
 use crate::search::boxes::differences::Differences;
 use crate::search::boxes::side::{Others, Side};
+use crate::search::candidate::problem::Problem;
 use crate::search::catalogue::Catalogue;
 use crate::search::lattice::cursor::Cursor;
 use crate::search::lattice::slab;
@@ -33,13 +36,13 @@ pub(crate) struct Boxes {
 }
 
 impl Boxes {
-    /// Whether boxes can be had for a search and pay: it ranks by free runs at rest, its coefficients are all least
-    /// squares', and some slab is large.
+    /// Whether boxes can be had for a search and pay: it ranks by free runs at rest or by squared equation errors, its
+    /// coefficients are all least squares', and some slab is large.
     pub(crate) fn pay(catalogue: &Catalogue<'_>) -> bool {
         let (options, lattice) = (&catalogue.options, &*catalogue.lattice);
         options.early_stopping
             && options.estimator == Estimator::LeastSquares
-            && options.criterion == Criterion::OutputError
+            && (options.criterion == Criterion::OutputError || options.scored_by_products())
             && catalogue.problem.equations.whole().is_some()
             && (2..=MOST_OTHERS + 2).contains(&lattice.width())
             && lattice
@@ -52,7 +55,7 @@ impl Boxes {
     /// pool.
     pub(crate) fn new(catalogue: &Catalogue<'_>) -> Option<Self> {
         let (problem, lattice) = (&catalogue.problem, &*catalogue.lattice);
-        let (bound, normal) = (problem.bound.as_ref()?, problem.equations.whole()?);
+        let (probes, normal) = (probes(problem)?, problem.equations.whole()?);
         let mut neighbours: Vec<[usize; 3]> = Vec::new();
         for (number, block) in lattice.blocks().iter().enumerate() {
             let Some(slab) = lattice.slab(block.start) else { continue };
@@ -65,9 +68,8 @@ impl Boxes {
         let differences = Differences::new(problem, neighbours.into_iter(), catalogue.spare)?;
         #[allow(clippy::cast_precision_loss)]
         let rounding = f64::EPSILON * problem.samples() as f64;
-        let probes = bound.probes();
         let others = Others { normal, probes, columns: &[], inverse: &[], trace: 0.0, rounding };
-        let common = Common::new(&others, catalogue.options.norm, problem.size());
+        let common = Common::new(&others, catalogue.options.norm, problem.squares.is_some(), problem.size());
         Some(Self { common, differences, rounding })
     }
 
@@ -75,7 +77,7 @@ impl Boxes {
         let k = columns.len();
         Some(Others {
             normal: catalogue.problem.equations.whole()?,
-            probes: catalogue.problem.bound.as_ref()?.probes(),
+            probes: probes(&catalogue.problem)?,
             columns,
             inverse,
             trace: (0..k).map(|i| inverse[i * k + i]).sum::<f64>().max(1.0),
@@ -84,15 +86,23 @@ impl Boxes {
     }
 }
 
+/// The test vectors of a search, which has none where squared equation errors rank; none at all where nothing is proved.
+fn probes(problem: &Problem) -> Option<&[Probes]> {
+    match (&problem.squares, &problem.bound) {
+        (Some(_), _) => Some(&[]),
+        (None, bound) => bound.as_ref().map(Bound::probes),
+    }
+}
+
 /// Screens candidates `lo … hi − 1` of a slab against a limit: the open ones, and the singular ones among those that no
-/// box excludes; none where boxes prove nothing here.
+/// box excludes; how many are in boxes that are excluded whole. None where boxes prove nothing here.
 pub(crate) fn screen_slab(
     catalogue: &Catalogue<'_>,
     boxes: &Boxes,
     slab: &slab::Slab,
     (lo, hi): (u64, u64),
     limit: f64,
-) -> Option<(Vec<Open>, Vec<u64>)> {
+) -> Option<(Vec<Open>, Vec<u64>, u64)> {
     lanes::widest(Walk { catalogue, boxes, slab, lo, hi, limit })
 }
 
@@ -107,7 +117,7 @@ struct Walk<'a> {
 }
 
 impl lanes::Kernel for Walk<'_> {
-    type Output = Option<(Vec<Open>, Vec<u64>)>;
+    type Output = Option<(Vec<Open>, Vec<u64>, u64)>;
 
     #[inline(always)]
     fn run(self) -> Self::Output {
@@ -122,7 +132,7 @@ impl lanes::Kernel for Walk<'_> {
         let start = slab.lo + rows.start as u64 * len;
         let mut screen = Screen::<WIDTH>::new(columns.len());
         let (mut found, mut waiting) = ((Vec::new(), Vec::new()), [(0, 0, 0); WIDTH]);
-        let mut count = 0;
+        let (mut count, mut boxed) = (0, hi - lo);
         let lengths = [rows.len(), slab.len];
         let coarse = lengths.map(|n| COARSE.min(n.next_power_of_two().trailing_zeros() as usize));
         let mut stack = Vec::new();
@@ -152,6 +162,7 @@ impl lanes::Kernel for Walk<'_> {
                             if index < lo || index >= hi {
                                 continue;
                             }
+                            boxed -= 1;
                             waiting[count] = (index, ready.sides[0].columns[row], ready.sides[1].columns[value]);
                             count += 1;
                             if count == WIDTH {
@@ -166,7 +177,8 @@ impl lanes::Kernel for Walk<'_> {
         if count > 0 {
             screen.these(catalogue, slab, &columns, &waiting[..count], limit, &mut found);
         }
-        Some(found)
+        let (open, singular) = found;
+        Some((open, singular, boxed))
     }
 }
 
@@ -223,11 +235,12 @@ pub struct Boxed {
     pub values: u64,
     /// See `first`.
     pub stride: u64,
-    /// No candidate's raw output error at rest, Σ|y − ŷ| or Σ(y − ŷ)² with least-squares coefficients, is below this.
+    /// No candidate's raw error at rest, Σ|e| or Σe² with least-squares coefficients, is below this.
     pub bound: f64,
 }
 
-/// What is proved of every box of the slab that holds a candidate: the boxes of all sizes, down to single candidates.
+/// What is proved of every box of the slab that holds a candidate: the boxes of all sizes, down to single candidates, of
+/// output errors in either norm or of equation errors in squares.
 ///
 /// Empty where the lattice has no slabs (its fastest signal has several terms, or no other has orders to vary) or where
 /// nothing is proved of this one.
@@ -236,19 +249,26 @@ pub struct Boxed {
 /// As [`crate::search::rounds::search`].
 ///
 /// ```
-/// # use ftlm::search::{boxes::box_bounds, lattice::{Lattice, TermAxis}, options::Norm};
+/// # use ftlm::search::{boxes::box_bounds, lattice::{Lattice, TermAxis}};
+/// # use ftlm::search::options::{Criterion, Norm};
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, vec![output, input], None)?;
 /// let axis = |signal, values: &[f64]| TermAxis { signal, values: values.to_vec(), interchangeable: false };
 /// let lattice = Lattice::new(0, &[1.6], &[axis(0, &[0.1, 0.3, 0.5]), axis(1, &[0.0, 0.4])], |s| s == 1)?;
-/// let boxes = box_bounds(&[record], &lattice, Norm::L1, 0)?;
+/// let boxes = box_bounds(&[record], &lattice, Criterion::OutputError, Norm::L1, 0)?;
 /// assert!(boxes.iter().any(|b| b.rows * b.values == 6) && boxes.iter().any(|b| b.rows * b.values == 1));
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn box_bounds(records: &[Record], lattice: &Lattice, norm: Norm, index: u64) -> Result<Vec<Boxed>> {
-    with_slab(records, lattice, norm, index, |catalogue, boxes, slab| {
+pub fn box_bounds(
+    records: &[Record],
+    lattice: &Lattice,
+    criterion: Criterion,
+    norm: Norm,
+    index: u64,
+) -> Result<Vec<Boxed>> {
+    with_slab(records, lattice, (criterion, norm), index, |catalogue, boxes, slab| {
         let columns = columns(catalogue, slab);
         let (others, inverse) = others(catalogue, slab, &columns)?;
         let others = boxes.others(catalogue, &others, &inverse)?;
@@ -275,21 +295,22 @@ pub fn box_bounds(records: &[Record], lattice: &Lattice, norm: Norm, index: u64)
 }
 
 /// The candidates `lo … hi − 1` of the slab that holds `index` that no box excludes and no bound of their own: among them
-/// are all whose raw output error at rest is at most `limit`. Empty where [`box_bounds`] is.
+/// are all whose raw error at rest is at most `limit`. Empty where [`box_bounds`] is.
 ///
 /// # Errors
 /// As [`crate::search::rounds::search`].
 pub fn left_open(
     records: &[Record],
     lattice: &Lattice,
+    criterion: Criterion,
     norm: Norm,
     index: u64,
     range: Range<u64>,
     limit: f64,
 ) -> Result<Vec<u64>> {
-    with_slab(records, lattice, norm, index, |catalogue, boxes, slab| {
+    with_slab(records, lattice, (criterion, norm), index, |catalogue, boxes, slab| {
         let range = (range.start.clamp(slab.lo, slab.hi), range.end.clamp(slab.lo, slab.hi));
-        let (open, _) = screen_slab(catalogue, boxes, slab, range, limit)?;
+        let (open, ..) = screen_slab(catalogue, boxes, slab, range, limit)?;
         Some(open.iter().map(|open| open.index).collect())
     })
 }
@@ -298,7 +319,7 @@ pub fn left_open(
 fn with_slab<T>(
     records: &[Record],
     lattice: &Lattice,
-    norm: Norm,
+    (criterion, norm): (Criterion, Norm),
     index: u64,
     work: impl FnOnce(&Catalogue<'_>, &Boxes, &slab::Slab) -> Option<Vec<T>> + Send,
 ) -> Result<Vec<T>>
@@ -306,17 +327,19 @@ where
     T: Send,
 {
     let pool = pool(1)?;
-    let options = Options { norm, ..Options::default() };
+    let options = Options { criterion, norm, ..Options::default() };
     let fixed = vec![None; lattice.width()];
     let mut catalogue = Catalogue::new(records, Cow::Borrowed(lattice), &fixed, &options, &pool)?;
     catalogue.problem = pool.install(|| catalogue.problem.with_bound(u64::MAX >> 8));
-    let mut adapted = catalogue.problem.no_adapted().0;
-    for made_for in [index, 0, lattice.count() / 2, lattice.count() - 1] {
-        let mut positions = vec![0; lattice.width()];
-        catalogue.positions(&Cursor::at(lattice, made_for), &mut positions);
-        adapted.each.extend(pool.install(|| catalogue.problem.fit(&adapted, &positions)));
+    if criterion == Criterion::OutputError {
+        let mut adapted = catalogue.problem.no_adapted().0;
+        for made_for in [index, 0, lattice.count() / 2, lattice.count() - 1] {
+            let mut positions = vec![0; lattice.width()];
+            catalogue.positions(&Cursor::at(lattice, made_for), &mut positions);
+            adapted.each.extend(pool.install(|| catalogue.problem.fit(&adapted, &positions)));
+        }
+        catalogue.problem.adapted = Some(adapted);
     }
-    catalogue.problem.adapted = Some(adapted);
     let slab = lattice.slab(index).filter(|_| (2..=MOST_OTHERS + 2).contains(&lattice.width()));
     let Some(slab) = slab else { return Ok(Vec::new()) };
     Ok(pool.install(|| work(&catalogue, &Boxes::new(&catalogue)?, &slab)).unwrap_or_default())

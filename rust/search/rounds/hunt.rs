@@ -58,7 +58,7 @@ impl<'a> Hunt<'a> {
         let (start, end) = bounds;
         let (limit, resumed) = (kept.limit, place.end > 0);
         let (catalogue, control) = (self.catalogue, self.control);
-        let parts: Vec<(Vec<Open>, Vec<u64>)> = self.pool.install(|| {
+        let parts: Vec<(Vec<Open>, Vec<u64>, u64)> = self.pool.install(|| {
             self.chunks(start, end, limit)
                 .par_iter()
                 .with_max_len(1)
@@ -68,8 +68,12 @@ impl<'a> Hunt<'a> {
                         return Default::default();
                     }
                     let boxes = slab.as_ref().zip(self.boxes);
-                    let boxed = boxes.and_then(|(slab, boxes)| screen_slab(catalogue, boxes, slab, (lo, hi), limit));
-                    let found = boxed.unwrap_or_else(|| screen(catalogue, lo, hi, limit));
+                    let found = boxes
+                        .and_then(|(slab, boxes)| screen_slab(catalogue, boxes, slab, (lo, hi), limit))
+                        .unwrap_or_else(|| {
+                            let (open, singular) = screen(catalogue, lo, hi, limit);
+                            (open, singular, 0)
+                        });
                     let closed = hi - lo - (found.0.len() + found.1.len()) as u64;
                     if !resumed {
                         control.count(closed + found.1.len() as u64, closed);
@@ -81,9 +85,11 @@ impl<'a> Hunt<'a> {
         self.check_stop()?;
         let mut open: Vec<Open> = Vec::new();
         let mut singular: Vec<u64> = Vec::new();
-        for (found, failed) in parts {
+        let mut boxed = 0;
+        for (found, failed, excluded) in parts {
             open.extend(found);
             singular.extend(failed);
+            boxed += excluded;
         }
         by_guess(&mut open);
         let order = digest(&open);
@@ -95,6 +101,7 @@ impl<'a> Hunt<'a> {
             let failed = singular.len() as u64;
             self.part.counts.singular += failed;
             self.part.counts.bounded += end - start - open.len() as u64 - failed;
+            self.part.counts.boxed += boxed;
             self.part.failures.extend(singular.into_iter().take(LISTED).map(|index| (index, Failure::Singular)));
         }
         self.follow(&open, kept, place, true).map(|()| true)

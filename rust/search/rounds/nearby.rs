@@ -32,13 +32,17 @@ const MOST: u64 = 256 << 20;
 impl Hunt<'_> {
     /// Goes down from the best rows, and from what is found all over the lattice by the limit that they give; then test
     /// vectors made for candidates that the others do not exclude, and the bytes of each. None where there is no memory
-    /// for them.
+    /// for them, or no use.
     pub(super) fn nearby(&mut self, kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<Option<(Adapted, u64)>> {
         self.neighbours(kept, tried)?;
         let hard = self.hard(kept)?;
         let anew: Vec<Open> = hard.iter().filter(|open| tried.insert(open.index)).copied().collect();
         self.follow(&anew, kept, Place::start(0), false)?;
         self.neighbours(kept, tried)?;
+        // Of equation errors in squares the Gram matrix says all.
+        if self.catalogue.problem.squares.is_some() {
+            return Ok(None);
+        }
         self.adapted(kept, hard)
     }
 

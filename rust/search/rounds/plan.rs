@@ -22,10 +22,10 @@ pub(super) const FEW: u64 = ROUND_FOLLOWED;
 /// Number of the algorithm by which the rounds of a search over so many candidates are cut and done.
 #[must_use]
 pub fn algorithm(candidates: u64, options: &Options) -> u64 {
-    if candidates < BOXED || options.refines() || !options.early_stopping || options.scored_by_products() {
+    if candidates < BOXED || options.refines() || !options.early_stopping {
         1
     } else {
-        2
+        3
     }
 }
 
@@ -33,7 +33,7 @@ pub fn algorithm(candidates: u64, options: &Options) -> u64 {
 pub(super) fn round_length(candidates: u64, options: &Options, algorithm: u64) -> u64 {
     if options.refines() || !options.early_stopping {
         ROUND_FOLLOWED
-    } else if options.scored_by_products() {
+    } else if options.scored_by_products() && algorithm < 3 {
         ROUND_PLAIN
     } else if algorithm < 2 {
         ROUND_BOUNDED

@@ -211,6 +211,10 @@ impl<'a> Search<'a> {
             return Err(another("a checkpoint holds rows of another search".into()));
         }
         let done = part.counts.done();
+        if part.counts.boxed > part.counts.bounded {
+            let Counts { boxed, bounded, .. } = part.counts;
+            return Err(another(format!("a checkpoint has {boxed} candidates in boxes among {bounded} excluded ones")));
+        }
         if done > count || part.counts.candidates > count {
             return Err(another(format!("a checkpoint accounts for {done} candidates, but there are {count}")));
         }
