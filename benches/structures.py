@@ -2,20 +2,22 @@
 
 ``python benches/structures.py arm`` chooses the equation of θ12 from everything inside {D^k θ11, D^k θ21, D^k θ22,
 k = 0, 1, 2; I1; two own terms of free order; an offset}, each run of the arm judged by a fit on the other one.
-``python benches/structures.py truth --plants 3T,A,motor --seeds 20 [--first 0]`` counts in how many seeds at 40 dB the
-chosen structure is the one that the run was made by: no term, no free order and no offset more or less. 3T is judged by
-blocks of one run, the stage A by blocks of one run under both laws, the motor on two runs. No run is simulated by ftlm:
-the motor's are SciPy's, those of 3T and A an inverse z-transform's (``tests/python/oracles.py``).
+``python benches/structures.py truth --plants 3T,A,motor --seeds 100 [--first 0] [--kept FILE]`` counts in how many
+seeds at 40 dB the chosen structure is the one that the run was made by: no term, no free order and no offset more or
+less. 3T is judged by blocks of one run, the stage A by blocks of one run under both laws, the motor on two runs. No run
+is simulated by ftlm: the motor's are SciPy's, those of 3T and A an inverse z-transform's (``tests/python/oracles.py``).
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy import signal
@@ -24,9 +26,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 from arm_measured import arm_run
-from ftlm.selection.candidates import Inside, Variant, signature
+from ftlm.selection.candidates import Inside, Variant, signature, worded
+from ftlm.selection.trial import Folds, criterion, fit, judged, spread
 from oracles import held_response
-from results import append, heading
+from results import Kept, append, heading
 
 DRIVES = [(hub, k) for hub in ("theta11", "theta21", "theta22") for k in (0, 1, 2)]
 
@@ -116,40 +119,71 @@ def plant(name: str, seed: int) -> tuple[list[ftlm.Run], ftlm.Structure, Variant
     return [motor(2 * seed), motor(2 * seed + 1)], rich, true
 
 
-def truth(names: list[str], seeds: range, threads: int) -> Iterator[str]:
-    """How often the true structure is found, and what was chosen instead."""
-    yield "| plant | seeds | found | processor time a seed, the longest | wall clock a seed | chosen instead |"
-    yield "| --- | --- | --- | --- | --- | --- |"
-    for name in names:
-        others: list[str] = []
-        spent: list[float] = []
-        wall = time.perf_counter()
-        for seed in seeds:
-            begun = time.process_time()
-            runs, rich, true = plant(name, seed)
-            found = ftlm.select(runs, rich, threads=threads)
-            spent.append(time.process_time() - begun)
-            asked = signature(Inside(rich).build(true))
-            right = signature(found.winner.structure) == asked
-            if not right:
-                others.append(f"{seed}: {found.winner.name}")
-            print(f"{name} {seed}: {'' if right else 'NOT THE TRUE ONE: '}{found.winner.name}", file=sys.stderr)
-            print(f"  {found.fitted} fitted, {spent[-1]:.1f} s of processor time", file=sys.stderr, flush=True)
-            if not right:
-                there = [t for t in found.trials if signature(t.structure) == asked]
-                rows = {"truth": there[0] if there else None, "chosen": found.winner, "best": found.trials[0]}
-                for word, trial in rows.items():
-                    told = (
-                        "was not judged" if trial is None else f"{trial.name}, BIC {trial.bic}, scores {trial.scores}"
-                    )
-                    print(f"  {word}: {told}", file=sys.stderr, flush=True)
-        each, longest = sum(spent) / len(seeds), max(spent)
-        elapsed, count = (time.perf_counter() - wall) / len(seeds), len(seeds) - len(others)
-        which = f"{seeds.start} to {seeds.stop - 1}"
+def choice(name: str, seed: int, threads: int) -> dict[str, Any]:
+    """Whether the true structure is chosen, and where it is not, how the truth stands beside what was chosen."""
+    begun, wall = time.process_time(), time.perf_counter()
+    runs, rich, true = plant(name, seed)
+    found = ftlm.select(runs, rich, threads=threads)
+    row = {
+        "fitted": found.fitted, "spent": time.process_time() - begun, "wall": time.perf_counter() - wall,
+        "chosen": found.winner.name,
+    }  # fmt: skip
+    structure = Inside(rich).build(true)
+    asked = signature(structure)
+    row["found"] = signature(found.winner.structure) == asked
+    if row["found"]:
+        return row
+    there = next((t for t in found.trials if signature(t.structure) == asked), None)
+    row["why"] = "the choice" if there is not None else "the search: the truth was not judged"
+    if there is None:
+        folds = Folds.of(runs, "runs" if len(runs) > 1 else "blocks")
+        there = judged(worded(structure), structure, folds, fit(folds.runs, structure, []))
+        there = replace(there, bic=criterion(there.joint, there.numbers, scatter_of(found)))
+    for word, trial in {"truth": there, "winner": found.winner, "best": found.trials[0]}.items():
+        row[word] = {"name": trial.name, "numbers": trial.numbers, "bic": trial.bic, "scores": trial.scores}
+    return row
+
+
+def scatter_of(found: ftlm.Selection) -> float:
+    """How many samples told as much as one, when a choice compared criteria."""
+    return min(spread(t.joint) for t in found.trials if t.joint is not None)
+
+
+def failure(seed: int, row: dict[str, Any]) -> Iterator[str]:
+    """A seed in which something else was chosen, in words."""
+    truth, winner, best = (row[n] for n in ("truth", "winner", "best"))
+    yield f"seed {seed}: {winner['name']}, by {row['why']}"
+    means = {n: float(np.mean(t["scores"])) for n, t in (("truth", truth), ("chosen", winner), ("best", best))}
+    for word, trial in (("chosen", winner), ("best", best)):
+        apart = np.array(truth["scores"]) - np.array(trial["scores"])
+        error = float(np.std(apart, ddof=1)) / np.sqrt(apart.size)
         yield (
-            f"| {name} | {which} | {count} of {len(seeds)} | {each:.1f} s, {longest:.1f} s | {elapsed:.1f} s | "
-            f"{'; '.join(others)} |"
+            f"  the truth leaves {100 * (np.exp(means['truth'] - means[word]) - 1):.3g} % more where unseen than the "
+            f"{word} ({trial['numbers']} numbers for {truth['numbers']}), {float(np.mean(apart)) / error:.2g} standard "
+            f"errors of {apart.size} folds; its criterion is {truth['bic'] - trial['bic']:+.3g}"
         )
+
+
+def truth(names: list[str], seeds: range, threads: int, kept: Kept) -> Iterator[str]:
+    """How often the true structure is found, and what was chosen instead."""
+    yield "| plant | seeds | found | processor time a seed, the longest | wall clock a seed | commit |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    failures: list[str] = []
+    for name in names:
+        rows: dict[int, dict[str, Any]] = {}
+        for seed in seeds:
+            rows[seed] = row = kept.row(f"{name} {seed}", functools.partial(choice, name, seed, threads))
+            print(f"{name} {seed}: {'' if row['found'] else 'NOT THE TRUE ONE: '}{row['chosen']}", file=sys.stderr)
+            print(f"  {row['fitted']} fitted, {row['spent']:.1f} s of processor time", file=sys.stderr, flush=True)
+            if not row["found"]:
+                failures += [f"- {name}, {line}" if line[0] != " " else line for line in failure(seed, row)]
+        spent, wall = ([r[k] for r in rows.values()] for k in ("spent", "wall"))
+        yield (
+            f"| {name} | {seeds.start} to {seeds.stop - 1} | {sum(r['found'] for r in rows.values())} of {len(rows)} | "
+            f"{np.mean(spent):.1f} s, {max(spent):.1f} s | {np.mean(wall):.1f} s | "
+            f"{kept.commits([f'{name} {s}' for s in seeds])} |"
+        )
+    yield from ("", *failures)
 
 
 def main() -> None:
@@ -160,12 +194,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--kept", type=Path, help="file of seeds that are done, to go on from")
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     given = parser.parse_args()
+    seeds = range(given.first, given.first + given.seeds)
     rows = (
         arm(given.threads)
         if given.what == "arm"
-        else truth(given.plants.split(","), range(given.first, given.first + given.seeds), given.threads)
+        else truth(given.plants.split(","), seeds, given.threads, Kept(given.kept))
     )
     lines = [f"{heading()}:", ""]
     for line in rows:
