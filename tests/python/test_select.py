@@ -15,10 +15,11 @@ import ftlm
 from ftlm.base.threads import stop
 from ftlm.cli.app import app
 from ftlm.selection.automatic import automatic
-from ftlm.selection.candidates import Inside, Variant, named
-from ftlm.selection.growth import Work, duration, listed
+from ftlm.selection.candidates import Change, Inside, Variant, named
+from ftlm.selection.glance import contenders
+from ftlm.selection.growth import Fitted, Work, _judged, duration, listed
 from ftlm.selection.select import _as_good
-from ftlm.selection.trial import Folds, Trial, masked
+from ftlm.selection.trial import Folds, Trial, fit, judged, least_unseen, masked
 
 RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
 
@@ -159,6 +160,60 @@ def test_blocks_of_one_run_are_judged_by_a_fit_that_has_not_read_them():
     assert len(found.winner.validation) == 4
     # 40 dB of noise leave 1 % over, of whatever block.
     assert all(97.5 < part["y"] < 99.5 for part in found.winner.validation.values())
+
+
+@pytest.mark.parametrize("text", ["D^2 y = d D y + a y + b u", "D y = a y + b u"])
+@pytest.mark.parametrize("validation", ["runs", "blocks"])
+def test_no_fold_is_left_less_than_where_all_is_fitted(runs, text, validation):
+    structure, folds = ftlm.equation(text), Folds.of(runs, validation)
+    joint = fit(folds.runs, structure, [], refine=False)
+    least, found = least_unseen(joint, folds), judged("it", structure, folds, joint)
+    # Free runs that judge are of finer grids and of two samples a run more.
+    assert found.score > least - 0.01
+    assert found.score < least + 0.2
+    own = Folds.of(runs[0], runs[1])
+    assert least_unseen(joint, own) == -np.inf
+    assert least_unseen(replace(joint, converged=False), folds) == -np.inf
+
+
+def test_what_cannot_matter_is_not_judged(runs):
+    """Of two whose fits are known, the far worse one waits for the better, and is judged where that fails."""
+    inside = Inside(ftlm.equation("D^alpha y = a y + b0 u + b1 D^gamma u", orders={"gamma": (0.5, 1.5, 0.1)}))
+    variants = [Variant(frozenset({"a", "b0"}), (("alpha", top),), offset=False) for top in (2.0, 1.0)]
+    folds = Folds.of(runs, "runs")
+    ahead = [
+        Fitted(Change("", v), fit(folds.runs, inside.build(v), [], refine=False), 0.0) for v in variants
+    ]  # fmt: skip
+    scores = [judged("", inside.build(v), folds, f.joint).score for v, f in zip(variants, ahead, strict=True)]
+    order = sorted(range(2), key=lambda k: scores[k])
+    better, worse = (ahead[k] for k in order)
+
+    def names(pair, **more):
+        return [t.name for t in _judged(inside, Work(folds, 1), pair, **more)]
+
+    both = names([better, worse])
+    assert len(both) == 2
+    assert names([better, worse], beyond=min(scores) + 0.01) == both[:1]
+    assert names([better, worse], beyond=-np.inf, margin=10.0) == both
+    assert names([worse, better], beyond=min(scores) + 0.01) == both[::-1]
+
+
+def test_long_records_are_fitted_by_those_alone_that_may_lead():
+    runs = [motor(seed, rows=3001) for seed in (0, 1)]
+    at = {"d": -5.0, "a": -40.0, "b": 40.0}
+    true, free, first = map(
+        ftlm.equation, ("D^2 y = d D y + a y + b u", "D^2 y = d D^mu y + a y + b u", "D y = a y + b u")
+    )
+    starts = [(first, [at]), (true, [at]), (first, [{"a": -1.0, "b": 0.1}]), (free, [{**at, "mu": 1.2}])]
+    work = Work(Folds.of(runs, "runs"), 1)
+    assert contenders(runs, starts, 2, work) == [1, 3]
+    assert contenders(runs, starts, 3, work) == [0, 1, 3]
+    assert contenders(runs, starts, 4, work) == [0, 1, 2, 3]
+    # Short ones are not thinned, and what sticks is not told from what slides by a few evaluations.
+    assert contenders([motor(0)], starts, 2, work) == [0, 1, 2, 3]
+    rubbing = ftlm.equation("D^2 y = d D y + a y + b u - fc*sign(D y)")
+    assert contenders(runs, [*starts, (rubbing, [{**at, "fc": 0.1}])], 2, work) == [0, 1, 2, 3, 4]
+    assert work.done == work.known == 0
 
 
 def test_a_run_of_its_own_judges(runs):

@@ -16,9 +16,10 @@ from ftlm.data.structures import Structure
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
 from ftlm.selection.candidates import Change, Inside, Variant, signature, worded
+from ftlm.selection.glance import Start, contenders
 from ftlm.selection.screen import Screened, screened
 from ftlm.selection.store import Store
-from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, numbers_of, refined, spread
+from ftlm.selection.trial import Folds, Trial, criterion, fit, judged, least_unseen, numbers_of, refined, spread
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -32,6 +33,8 @@ PATIENCE = 2
 BETTER = 0.005
 #: Two predictions are alike where what they leave over differs by no more than this share.
 SAME = 0.01
+#: The most that counts as alike, whatever the scatter.
+MOST_ALIKE = 0.05
 #: Subsets that were screened are fitted where what they leave over is within this share of the best's, at most so many,
 #: and the best of each number of terms.
 NEAR, LEADING = 0.03, 8
@@ -182,7 +185,7 @@ def grown(inside: Inside, work: Work) -> list[Trial]:
     if not inside.droppable:
         return _from_everything(inside, work)
     changes = _new(inside, inside.skeletons(), set())
-    joints = work.each(lambda c: work.fitted(inside.build(c.variant), []), changes)
+    joints = work.each(lambda c: work.fitted(inside.build(c.variant), [], refine=False), changes)
     roots: dict[tuple[float | None, ...], list[tuple[Change, JointFit | FtlmError]]] = {}
     for change, joint in zip(changes, joints, strict=True):
         roots.setdefault(inside.top(change.variant), []).append((change, joint))
@@ -219,19 +222,19 @@ def _from_everything(inside: Inside, work: Work) -> list[Trial]:
     structure = inside.structure
     full = Variant(frozenset(structure.coefficient_names), (), structure.offset == "constant")
     changes = _new(inside, [*inside.skeletons(), Change(worded(inside.build(full)), full)], set())
-    joints = work.each(lambda c: work.fitted(inside.build(c.variant), []), changes)
+    joints = work.each(lambda c: work.fitted(inside.build(c.variant), [], refine=False), changes)
     pairs = list(zip(changes, joints, strict=True))
-    roots = _by_criterion(inside, work, [p for p in pairs if p[0].variant != full])[:1]
-    roots += _by_criterion(inside, work, [p for p in pairs if p[0].variant == full])
+    roots = _by_criterion(inside, work, [p for p in pairs if p[0].variant == full])
+    roots += _by_criterion(inside, work, [p for p in pairs if p[0].variant != full])[:1]
     if not roots:
         work.trials += [work.judge(c.words, inside.build(c.variant), j) for c, j in pairs]
         return work.trials
-    first = _judged(inside, work, roots)
+    first = _judged(inside, work, roots, beyond=-math.inf, margin=DOMINATED)
     tried = {_key(inside, r.change) for r in roots}
     least = min(trial.score for trial in first)
     ends = [
         _upwards(inside, work, at, tried, trial)
-        for trial, at in zip(first, roots, strict=True) if trial.score <= least + DOMINATED
+        for trial, at in reversed(list(zip(first, roots, strict=False))) if trial.score <= least + DOMINATED
     ]  # fmt: skip
     return _finished(inside, work, ends, tried)
 
@@ -281,7 +284,7 @@ def _upwards(
         ahead = _tried(inside, work, chosen, larger)[:JUDGED]
         if not ahead:
             break
-        found = _judged(inside, work, ahead)
+        found = _judged(inside, work, ahead, beyond=_hopeless(best))
         tried |= {_key(inside, s.change) for s in ahead}
         place = min(range(len(found)), key=lambda k: (_rank(found[k]), k))
         chosen = ahead[place]
@@ -290,6 +293,11 @@ def _upwards(
         else:
             idle += 1
     return best, best_at
+
+
+def _hopeless(best: Trial) -> float:
+    """What a candidate leaves over that is neither better than the best nor alike."""
+    return math.inf if best.grows else best.score + MOST_ALIKE
 
 
 def _is_better(trial: Trial, than: Trial) -> bool:
@@ -326,27 +334,39 @@ def _downwards(
             best, best_at = trial, at
 
 
-def _judged(inside: Inside, work: Work, ahead: Sequence[Fitted]) -> list[Trial]:
-    """Fitted variants on what they never saw."""
+def _judged(
+    inside: Inside, work: Work, ahead: Sequence[Fitted], *, beyond: float = math.inf, margin: float = 0.0
+) -> list[Trial]:
+    """Fitted variants on what they never saw: all, or as many of the first of them as may matter.
+
+    One that leaves over more than `beyond` already where it is fitted waits for those before it, and is not judged if
+    it leaves more than the best of these does where unseen, by the margin: it predicts no better.
+    """
 
     def one(fitted: Fitted) -> Trial:
         return work.judge(_name(inside, fitted), inside.build(fitted.change.variant), fitted.joint)
 
-    found = work.each(one, ahead)
+    least = [least_unseen(f.joint, work.folds) for f in ahead]
+    first = next((k for k, level in enumerate(least) if k > 0 and level > beyond), len(ahead))
+    found = work.each(one, ahead[:first])
+    best = min(found, key=_rank, default=None)
+    if best is not None and (best.grows or any(level <= best.score + margin for level in least[first:])):
+        found += work.each(one, ahead[first:])
     work.trials += found
     return found
 
 
 def _tried(inside: Inside, work: Work, at: Fitted, changes: Sequence[Change]) -> list[Fitted]:
-    """Changes fitted from where one is, best first."""
+    """Changes fitted from where one is, best first; of long records those alone that may lead."""
     values = values_of(at.joint)
-
-    def one(change: Change) -> JointFit | FtlmError:
+    starts: list[Start] = []
+    for change in changes:
         structure = inside.build(change.variant)
         whole = {**at.change.variant.held(), **change.variant.held()}
-        return work.fitted(structure, starts_from(structure, values, whole), refine=False)
-
-    return _by_criterion(inside, work, list(zip(changes, work.each(one, changes), strict=True)))
+        starts.append((structure, starts_from(structure, values, whole)))
+    ahead = contenders(work.folds.runs, starts, JUDGED, work)
+    joints = work.each(lambda k: work.fitted(*starts[k], refine=False), ahead)
+    return _by_criterion(inside, work, [(changes[k], joint) for k, joint in zip(ahead, joints, strict=True)])
 
 
 def _by_criterion(inside: Inside, work: Work, pairs: Sequence[tuple[Change, JointFit | FtlmError]]) -> list[Fitted]:
@@ -366,7 +386,7 @@ def _pruned(inside: Inside, work: Work, best: Trial, at: Fitted, tried: set[str]
         changes = [c for c in _new(inside, inside.smaller(at.change.variant), tried) if _beside(c, at)]
         steps = _tried(inside, work, at, changes)
         tried |= {_key(inside, c) for c in changes}
-        found = _judged(inside, work, steps[:JUDGED])
+        found = _judged(inside, work, steps[:JUDGED], beyond=_hopeless(best))
         better = [(t, s) for t, s in zip(found, steps, strict=False) if _rank(t) <= (best.grows, best.score + BETTER)]
         if not better:
             return

@@ -17,7 +17,7 @@ from ftlm.fit.problem import FreeProblem
 from ftlm.identification.identify import identify
 from ftlm.selection.automatic import automatic
 from ftlm.selection.candidates import Inside, named, signature, worded
-from ftlm.selection.growth import SAME, Work, grown, listed
+from ftlm.selection.growth import MOST_ALIKE, SAME, Work, grown, listed
 from ftlm.selection.result import Selection
 from ftlm.selection.store import Request, Store
 from ftlm.selection.trial import Folds, Trial, criterion, spread
@@ -27,9 +27,8 @@ from ftlm.solve.records import prepare
 ALIKE = 2.0
 #: Difference of Schwarz criteria that is very strong evidence; the same source.
 STRONG = 10.0
-#: Folds from which on the scatter over them says something, one-sided 95 % quantiles of Student's t from there on, and
-#: the most that counts as alike whatever the scatter.
-FOLDS, STUDENT_95, MOST_ALIKE = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81), 0.05
+#: Folds from which on the scatter over them says something, and one-sided 95 % quantiles of Student's t from there on.
+FOLDS, STUDENT_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
 #: Candidates of a list beyond which somebody has made a mistake.
 MOST = 10_000
 
@@ -47,8 +46,8 @@ def select(
 
     A structure is grown: from the simplest one inside it (whole orders, the output's own terms, one thing that drives),
     a term, a free order, a delay, friction or an offset more at a time, each fitted by output error from the last
-    optimum, the two most promising by Schwarz's criterion judged by free runs on what they were not fitted to. Where
-    two steps in a row predict no better, it is pruned, one thing less at a time. A list is judged whole, from automatic
+    optimum, the two most promising by Schwarz's criterion judged by free runs on what they were not fitted to (the
+    second where what it leaves over on all runs lets it matter). Where two steps in a row predict no better, it is pruned, one thing less at a time. A list is judged whole, from automatic
     starts. Chosen is, among those that predict as well as the best (what is left over is within 1 %, or, up to 5 %,
     three or more folds do not tell the difference from 0 at 95 %, or all samples are very strong evidence), the one
     with the least Schwarz criterion, samples counted as the colour of the residuals lets them; of those alike in that
@@ -92,7 +91,8 @@ def select(
     -----
     Initial terms are those of whole orders (none from rest, else level and velocity, Caputo's) unless the structure
     says otherwise: with a history, which has more terms the more orders are free, candidates could not be compared.
-    Growth costs one fit for each thing that may be added, at each step. Where three or more terms drive one equation
+    Growth costs one fit for each thing that may be added, at each step; of records of more than some 1800 samples every
+    one of these is looked at on thinned samples first, and those far behind are not fitted. Where three or more terms drive one equation
     and whole runs judge, every subset of them at whole orders is fitted and judged in closed form first, on a lattice
     of the own coefficients, and growth begins with the best. Of a list of more than 200 candidates a ``UserWarning``
     says, after the first ones, how long the rest takes.

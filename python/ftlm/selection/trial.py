@@ -290,11 +290,13 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fi
     estimation = compare(model, list(folds.runs)).fit_percent
     grows = not structure.has_friction and model.stability(coupling=structure.coupling).unstable_poles > 0
     start = dict(zip(joint.names, joint.values.tolist(), strict=True))
+    # Fine, it was found on half its step as well: each fold tells from the same two grids whether they matter.
+    near = replace(joint, refinement=max(1, joint.refinement // 2)) if fine and joint.settled else joint
     validation: dict[str, dict[str, float]] = {}
     for fold in folds.parts:
         runs = fold.seen(structure.outputs)
         try:
-            own = joint if runs is folds.runs else fit(runs, structure, [], near=joint)
+            own = joint if runs is folds.runs else fit(runs, structure, [], near=near)
             validation[fold.name] = fold.fit_percent(model_of(structure, own, folds.runs))
         except FtlmError as error:
             # What is wrong is wrong with what is left, not with the runs as they were given.
@@ -306,6 +308,33 @@ def judged(name: str, structure: Structure, folds: Folds, joint: JointFit, *, fi
         values=start, errors=joint.standard_errors, idle=idle(joint), grows=grows,
         joint=joint, fine=fine,
     )  # fmt: skip
+
+
+def least_unseen(joint: JointFit, folds: Folds) -> float:
+    """What a candidate leaves over on what it was not fitted to at least, as its score; -infinity where nothing tells.
+
+    A fit without a fold leaves no less on all runs than the fit on all of them, and no more on the rest: so it leaves
+    no less on that fold. Of several outputs that holds of the sum of their weighted squares, not of each.
+    """
+    if not joint.converged:
+        return -math.inf
+    pooled = {o: read(np.concatenate([part[o] for part in joint.residuals])) for o in joint.noise}
+    # Residuals are over the noise that they were weighted with.
+    scale = {o: v / max(float(np.sqrt(np.mean(pooled[o] ** 2))), 1e-300) for o, v in joint.noise.items()}
+    scores = []
+    for fold in folds.parts:
+        place = next((k for k, run in enumerate(folds.runs) if run is fold.judged), None)
+        if place is None:
+            return -math.inf
+        first, last = fold.rows or (0, fold.judged.length)
+        for output, residuals in joint.residuals[place].items():
+            if residuals.size != fold.judged.length - 2:
+                return -math.inf
+            left, there = residuals[max(first - 1, 0) : last - 1], fold.judged[output][first:last]
+            size = float(np.linalg.norm(there - np.nanmean(there)))
+            share = scale[output] * float(np.linalg.norm(read(left))) / max(size, 1e-300)
+            scores.append(math.log(min(max(share, 1e-12), 1.0 - LOST / 100.0)))
+    return float(np.mean(scores))
 
 
 def refined(trial: Trial, folds: Folds, joint: JointFit) -> Trial:
