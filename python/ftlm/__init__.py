@@ -30,6 +30,7 @@ if _typing.TYPE_CHECKING:
     from ftlm.fit.genetic import Genetic
     from ftlm.fit.interval import ProfileInterval
     from ftlm.fit.recursion import Trace, multi_innovation_trace
+    from ftlm.identification.agreement import Agreement, Difference, agreement
     from ftlm.identification.frequency import identify_frequency
     from ftlm.identification.frequency_result import FrequencyIdentification, FrequencyValidation
     from ftlm.identification.identify import identify
@@ -61,18 +62,19 @@ if _typing.TYPE_CHECKING:
     )
 
 __all__ = [
-    "PARAMETERS", "Assumption", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "Equation",
-    "Estimate", "FeedbackTest", "FileColumn", "FrequencyData", "FrequencyIdentification", "FrequencyValidation",
-    "Friction", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria", "InternalError",
-    "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError", "OpenedFile", "Order", "OutputResiduals",
-    "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run",
-    "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck", "Structure", "Term",
-    "Trace", "Trial", "Validation", "Verdict", "__version__", "block_pulse_matrix", "compare", "energies",
-    "equation", "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse",
-    "haar_matrix", "haar_transform", "identify", "identify_frequency", "identify_many", "information_criteria",
-    "lattice", "link_model", "load", "load_frequency", "load_model", "metrics", "multi_innovation_trace",
-    "open_file", "operational_matrix", "order_law", "physical_parameters", "reproduce", "resid", "resume_search",
-    "rig", "search_orders", "search_status", "select", "simulate",
+    "PARAMETERS", "Agreement", "Assumption", "Comparison", "ConvergenceError", "CorrelationTest", "DataError",
+    "Difference", "Equation", "Estimate", "FeedbackTest", "FileColumn", "FrequencyData", "FrequencyIdentification",
+    "FrequencyValidation", "Friction", "FtlmError", "Genetic", "Identification", "Identified",
+    "InformationCriteria", "InternalError", "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError",
+    "OpenedFile", "Order", "OutputResiduals", "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals",
+    "RigFault", "Run", "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck",
+    "Structure", "Term", "Trace", "Trial", "Validation", "Verdict", "__version__", "agreement",
+    "block_pulse_matrix", "compare", "energies", "equation", "explicit_euler", "flexible_link",
+    "fractional_derivative", "fractional_integral", "haar_inverse", "haar_matrix", "haar_transform", "identify",
+    "identify_frequency", "identify_many", "information_criteria", "lattice", "link_model", "load",
+    "load_frequency", "load_model", "metrics", "multi_innovation_trace", "open_file", "operational_matrix",
+    "order_law", "physical_parameters", "reproduce", "resid", "resume_search", "rig", "search_orders",
+    "search_status", "select", "simulate",
 ]  # fmt: skip
 
 #: Where each name lives.
@@ -99,6 +101,7 @@ _HOMES = {
         "fit.genetic": "Genetic",
         "fit.interval": "ProfileInterval",
         "fit.recursion": "Trace multi_innovation_trace",
+        "identification.agreement": "Agreement Difference agreement",
         "identification.frequency": "identify_frequency",
         "identification.frequency_result": "FrequencyIdentification FrequencyValidation",
         "identification.identify": "identify",

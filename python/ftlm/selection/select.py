@@ -47,11 +47,12 @@ def select(
     A structure is grown: from the simplest one inside it (whole orders, the output's own terms, one thing that drives),
     a term, a free order, a delay, friction or an offset more at a time, each fitted by output error from the last
     optimum, the two most promising by Schwarz's criterion judged by free runs on what they were not fitted to (the
-    second where what it leaves over on all runs lets it matter). Where two steps in a row predict no better, it is pruned, one thing less at a time. A list is judged whole, from automatic
-    starts. Chosen is, among those that predict as well as the best (what is left over is within 1 %, or, up to 5 %,
-    three or more folds do not tell the difference from 0 at 95 %, or all samples are very strong evidence), the one
-    with the least Schwarz criterion, samples counted as the colour of the residuals lets them; of those alike in that
-    the one with the fewest numbers, of the lowest order, best determined.
+    second where what it leaves over on all runs lets it matter). Where two steps in a row predict no better, it is
+    pruned, one thing less at a time. A list is judged whole, from automatic starts. Chosen is, among those that predict
+    as well as the best (what is left over is within 1 %, or, up to 5 %, three or more folds do not tell the difference
+    from 0 at 95 %, or all samples are very strong evidence), the one with the least Schwarz criterion, samples counted
+    as the colour of the residuals lets them; of those alike in that the one with the fewest numbers, of the lowest
+    order, best determined.
 
     Parameters
     ----------
@@ -92,10 +93,10 @@ def select(
     Initial terms are those of whole orders (none from rest, else level and velocity, Caputo's) unless the structure
     says otherwise: with a history, which has more terms the more orders are free, candidates could not be compared.
     Growth costs one fit for each thing that may be added, at each step; of records of more than some 1800 samples every
-    one of these is looked at on thinned samples first, and those far behind are not fitted. Where three or more terms drive one equation
-    and whole runs judge, every subset of them at whole orders is fitted and judged in closed form first, on a lattice
-    of the own coefficients, and growth begins with the best. Of a list of more than 200 candidates a ``UserWarning``
-    says, after the first ones, how long the rest takes.
+    one of these is looked at on thinned samples first, and those far behind are not fitted. Where three or more terms
+    drive one equation and whole runs judge, every subset of them at whole orders is fitted and judged in closed form
+    first, on a lattice of the own coefficients, and growth begins with the best. Of a list of more than 200 candidates
+    a ``UserWarning`` says, after the first ones, how long the rest takes.
     """
     # Checked here as identify checks it: threads is a whole number, at least 1.
     workers = Settings.check(coefficients="least-squares", threads=threads).threads
