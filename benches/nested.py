@@ -1,7 +1,7 @@
 """Nested structures: how often one that contains another ends with a larger cost.
 
-``python benches/nested.py [--records psf,lqr,steps,heating,robot_arm,plants,wrong] [--seeds 40] [--first 0]`` fits
-chains of four structures, each of which contains the one before it, by the default call, and compares the mean squares
+``python benches/nested.py [--records psf,lqr,steps,heating,robot_arm,plants,wrong] [--seeds 40] [--first 0] [--kept FILE]``
+fits chains of four structures, each of which contains the one before it, by the default call, and compares the mean squares
 of their residuals, each richer structure against the least of all that it contains. Plants are random ones of the chain
 at 40 dB; wrong ones have a resonance and a dead time that the chain lacks.
 """
@@ -9,6 +9,7 @@ at 40 dB; wrong ones have a resonance and a dead time that the chain lacks.
 from __future__ import annotations
 
 import argparse
+import functools
 import sys
 import time
 from collections.abc import Iterator
@@ -21,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 import ftlm
 from arm_measured import FOLDER, arm_run, step_run
 from plants import resonant_plant
-from results import append, heading
+from results import Kept, append, heading
 
 #: The share of the cost beyond which a richer structure counts as worse.
 TOLD = 1e-3
@@ -116,21 +117,30 @@ def chain(run: ftlm.Run, name: str) -> Iterator[str]:
         least = min(least, cost)
 
 
+def rows_of(run: ftlm.Run, name: str) -> dict[str, list[str]]:
+    """A chain's rows, to be kept."""
+    return {"rows": list(chain(run, name))}
+
+
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--records", default="psf,lqr,steps,heating,robot_arm,plants,wrong")
     parser.add_argument("--seeds", type=int, default=40)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--kept", type=Path, help="file of chains that are done, to go on from")
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     given = parser.parse_args()
+    kept = Kept(given.kept)
     lines = [f"{heading()}:", "", "| record | chain | structure | fit | cost | numbers | time |"]
     lines += ["| --- | --- | --- | --- | --- | --- | --- |"]
     print("\n".join(lines))
     pairs = worse = 0
     for run, chains in records(given.records.split(","), range(given.first, given.first + given.seeds)):
         for name in chains:
-            for row, line in enumerate(chain(run, name)):
+            # Two outputs of one record have its name.
+            of = f"{run.name} {np.std(run['y']):.6g}, {name}"
+            for row, line in enumerate(kept.row(of, functools.partial(rows_of, run, name))["rows"]):
                 pairs += row > 0
                 worse += "**worse**" in line
                 lines.append(line)

@@ -9,6 +9,7 @@ are never changed.
 from __future__ import annotations
 
 import argparse
+import functools
 import itertools
 import os
 import sys
@@ -29,7 +30,7 @@ from ftlm.fit.grid import Attempt, descend, experiment
 from ftlm.fit.joint import fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.paper.arm import demo_plant
-from results import append, heading
+from results import Kept, append, heading
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -159,10 +160,13 @@ def random_plant(seed: int) -> tuple[int, float, float, str]:
     return seed, (found.noise["y"] / reference.noise["y"]) ** 2 - 1.0, taken, words
 
 
-def random_plants(seeds: int) -> Iterator[str]:
+def random_plants(seeds: int, kept: Kept) -> Iterator[str]:
     """Share of random plants whose automatic start ends in the global optimum; the others one by one."""
+    asked = [s for s in range(seeds) if f"random plant {s}" not in kept.known]
     with ProcessPoolExecutor(workers()) as pool:
-        ended = list(pool.map(random_plant, range(seeds)))
+        for end in pool.map(random_plant, asked):
+            kept.row(f"random plant {end[0]}", functools.partial(dict, end=end))
+    ended = [kept.known[f"random plant {s}"]["end"] for s in range(seeds)]
     missed = [e for e in ended if e[1] > SAME_OPTIMUM]
     yield (
         f"random plants, seeds 0 to {seeds - 1}, 40 dB: {seeds - len(missed)} of {seeds} end in the global optimum; "
@@ -291,6 +295,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=100)
     parser.add_argument("--plants", default="A,A2,3T")
     parser.add_argument("--levels", default="20,40,60,80")
+    parser.add_argument("--kept", type=Path, help="file of random plants that are done, to go on from")
     parser.add_argument("--write", action="store_true", help="append to benches/RESULTS.md")
     arguments = parser.parse_args()
     names = arguments.plants.split(",")
@@ -300,7 +305,7 @@ def main() -> None:
         "instruments": lambda: instruments(arguments.seeds),
         "orders": lambda: orders([n for n in names if n in LATTICES], arguments.seeds),
         "three-terms": lambda: three_terms_table(arguments.seeds),
-        "random-plants": lambda: random_plants(arguments.seeds),
+        "random-plants": lambda: random_plants(arguments.seeds, Kept(arguments.kept)),
         "arm": lambda: itertools.chain(arm_measured.measured(), arm_measured.orders(), arm_measured.steps()),
         "heating": heating,
     }[arguments.what]()

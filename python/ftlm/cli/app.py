@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from ftlm import _core
+from ftlm.cli.agreement import agreement
 from ftlm.cli.command import Command
 from ftlm.cli.frequency import identify_frequency
 from ftlm.cli.identify import identify, resume, search, status
@@ -43,8 +44,8 @@ def version(
 
 
 for _command in (
-    demo, page, record, open_, inspect, identify, identify_frequency, select, search, resume, status, compare, resid,
-    simulate, report, reproduce, orders, plot, export, doctor,
+    demo, page, record, open_, inspect, identify, identify_frequency, select, agreement, search, resume, status,
+    compare, resid, simulate, report, reproduce, orders, plot, export, doctor,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_").replace("_", "-"), cls=Command)(_command)
 

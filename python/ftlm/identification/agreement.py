@@ -17,6 +17,7 @@ from ftlm.base.errors import DataError, FtlmError, ModelError
 from ftlm.base.frames import to_frame
 from ftlm.base.statistics import NORMAL_95, chi_squared_99
 from ftlm.data.run import Run
+from ftlm.data.samples import FEWEST_ROWS
 from ftlm.data.several import as_runs
 from ftlm.data.structures import Structure
 from ftlm.identification.identify import identify
@@ -334,14 +335,13 @@ def agreement(
 
 def cut(run: Run, parts: int) -> list[Run]:
     """Parts of a run of the same length, but for a row."""
-    try:
-        ends = np.linspace(0, run.length, parts + 1).astype(int).tolist()
-        return [
-            run.slice(a * run.step if a else None, b * run.step if b < run.length else None)
-            for a, b in itertools.pairwise(ends)
-        ]
-    except (DataError, MemoryError) as error:
-        raise DataError(f"{run.name} has {run.length} rows, too few to be cut into {parts} parts: {error}") from error
+    if parts * FEWEST_ROWS > run.length:
+        raise DataError(f"{run.name} has {run.length} rows, too few to be cut into {parts} parts; use fewer")
+    ends = [k * run.length // parts for k in range(parts + 1)]
+    return [
+        run.slice(a * run.step if a else None, b * run.step if b < run.length else None)
+        for a, b in itertools.pairwise(ends)
+    ]
 
 
 def _named(pieces: Sequence[Run]) -> list[str]:
