@@ -1,9 +1,9 @@
 """Nested structures: how often one that contains another ends with a larger cost.
 
-``python benches/nested.py [--records psf,lqr,steps,heating,robot_arm,plants,wrong] [--seeds 40] [--first 0] [--kept FILE]``
-fits chains of four structures, each of which contains the one before it, by the default call, and compares the mean squares
-of their residuals, each richer structure against the least of all that it contains. Plants are random ones of the chain
-at 40 dB; wrong ones have a resonance and a dead time that the chain lacks.
+``python benches/nested.py [--records psf,lqr,steps,heating,robot_arm,plants,wrong] [--seeds 40] [--first 0] [--kept
+FILE]`` fits chains of four structures, each of which contains the one before it, by the default call, and compares the
+mean squares of their residuals, each richer structure against the least of all that it contains. Plants are random ones
+of the chain at 40 dB; wrong ones have a resonance and a dead time that the chain lacks.
 """
 
 from __future__ import annotations
