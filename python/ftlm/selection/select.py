@@ -200,13 +200,13 @@ def _as_good(trial: Trial, best: Trial) -> bool:
 
 
 def _winner(near: Sequence[Trial]) -> Trial:
-    """Of those that predict alike, the one with the least criterion; of those alike in that, the best determined.
+    """Of those that predict alike, the one with the least criterion; of those alike in that, the best where unseen.
 
     From rest an equation differentiated throughout is the same equation: of these it is the one of the lowest order.
     """
     least = min(_bic(t) for t in near)
     alike = [t for t in near if _bic(t) <= least + ALIKE]
-    return min(alike, key=lambda t: (t.numbers, _whole_order(t), t.looseness, t.score))
+    return min(alike, key=lambda t: (t.numbers, _whole_order(t), t.score, t.looseness))
 
 
 def _whole_order(trial: Trial) -> int:
