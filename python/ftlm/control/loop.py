@@ -182,7 +182,9 @@ class HubLoops:
 def _power(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
     """Poles, residues and direct gain of s^power, 0 < power <= 1."""
     if power < 1.0:
-        return oustaloup(power, reach, order)
+        poles, residues, _ = oustaloup(power, reach, order)
+        # The gain that leaves nothing of a constant, as no derivative does; Oustaloup's leaves the lower end's.
+        return poles, residues, -float(np.sum(residues / poles))
     high = reach[1]
     return np.array([high]), np.array([-high * high]), high
 

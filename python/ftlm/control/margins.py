@@ -145,7 +145,9 @@ def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) 
     away = np.abs((phases + 360.0) % 360.0 - 180.0)
     turns = np.floor((phase / math.pi + 1.0) / 2.0)
     cut = np.flatnonzero(turns[:-1] != turns[1:])
-    gains = np.exp(np.abs((size[cut] + size[cut + 1]) / 2.0))
+    edge = math.pi * (2.0 * np.maximum(turns[cut], turns[cut + 1]) - 1.0)
+    part = (edge - phase[cut]) / (phase[cut + 1] - phase[cut])
+    gains = np.exp(np.abs(size[cut] + part * (size[cut + 1] - size[cut])))
     return Margins(
         bool(round(closed) == 0), float(crossings[-1]) if at.size else math.nan, float(np.min(away, initial=180.0)),
         float(np.min(gains, initial=math.inf)), float(np.max(1.0 / np.abs(difference))),
