@@ -9,7 +9,7 @@ import importlib as _importlib
 import typing as _typing
 
 if _typing.TYPE_CHECKING:
-    from ftlm import control, rig
+    from ftlm import rig
     from ftlm._core import __version__
     from ftlm.arm.energies import energies
     from ftlm.arm.link import flexible_link, link_model, order_law
