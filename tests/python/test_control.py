@@ -273,7 +273,7 @@ def test_what_runs_is_the_exact_controller_within_what_it_says():
         t = np.arange(8000) / 500.0
         answer = np.array([realised(v) for v in np.sin(w * t)])
         last = slice(-round(10 * 2 * math.pi / w * 500.0), None)
-        both = np.column_stack([np.sin(w * t), np.cos(w * t), np.ones(3000)])[last]
+        both = np.column_stack([np.sin(w * t), np.cos(w * t), np.ones(8000)])[last]
         real, imaginary, _ = np.linalg.lstsq(both, answer[last], rcond=None)[0]
         exact = PID.kp + PID.ki * (1j * w) ** -PID.lam + PID.kd * (1j * w) ** PID.mu
         quotient = complex(real, imaginary) / exact
