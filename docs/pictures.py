@@ -43,7 +43,7 @@ def draw(folder: Path) -> None:
         "landscape": ftlm.plot.landscape(searched),
         "unseen": unseen(),
     }
-    for name, figure in (drawn | performance() | {"boxes": boxes()}).items():
+    for name, figure in (drawn | performance() | moves() | {"boxes": boxes()}).items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
 
 
@@ -110,6 +110,44 @@ def boxes() -> Figure:
     plot.plot((first, last), (start, start * (last / first) ** 0.5), "k:", label="as candidates to the 0.5")
     plot.legend()
     return figure
+
+
+def moves() -> dict[str, Figure]:
+    """A move with and without its shaper, and where designs fail, from what the bench wrote."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
+
+    measured = json.loads((Path(__file__).parent / "control.json").read_text(encoding="utf-8"))
+    move = Figure(figsize=(7, 3.2), layout="constrained")
+    plot = move.add_subplot(xlabel="time [s]", ylabel="tip [degrees]")
+    for (name, tip), style in zip(measured["traces"].items(), ("C1", "C0"), strict=True):
+        t = np.arange(len(tip)) * measured["step"]
+        plot.plot(t, np.degrees(tip), style, linewidth=1.2, label=name)
+    plot.axhline(20, color="0.6", linewidth=0.6)
+    plot.legend()
+    contenders = measured["plants"]
+    worst, best = 5e-2, 5e-4
+    figure = Figure(figsize=(9, 5), layout="constrained")
+    figure.suptitle("tip after the move, RMS [mrad]; x: the rig stopped the run", fontsize="small")
+    for at, (name, rows) in enumerate(contenders.items(), start=1):
+        times, delays = (sorted({row[k] for row in rows}) for k in (0, 1))
+        left = {(a, b): c for a, b, c in rows}
+        grid = np.array([[left[a, b] or np.nan for a in times] for b in delays])
+        plot = figure.add_subplot(2, 3, at)
+        plot.set_title(name, fontsize="small")
+        plot.imshow(
+            np.log(grid), origin="lower", aspect="auto", cmap="viridis_r", vmin=np.log(best), vmax=np.log(worst)
+        )
+        for i, b in enumerate(delays):
+            for j, a in enumerate(times):
+                value = left[a, b]
+                dark = value is not None and value > np.sqrt(best * worst)
+                shown = "x" if value is None else f"{1e3 * value:.2g}"
+                plot.text(j, i, shown, ha="center", va="center", fontsize=7, color="white" if dark else "black")
+        plot.set_xticks(range(len(times)), [f"{a:g}" for a in times], fontsize=7)
+        plot.set_yticks(range(len(delays)), [f"{1e3 * b:.0f}" for b in delays], fontsize=7)
+        plot.set_xlabel("stiffness of link 1, times", fontsize=7)
+        plot.set_ylabel("delay of the angles [ms]", fontsize=7)
+    return {"control-move": move, "control-plants": figure}
 
 
 def unseen() -> Figure:

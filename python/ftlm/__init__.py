@@ -129,7 +129,20 @@ _HOMES = {
 }
 #: Modules that are asked for as attributes.
 _MODULES = frozenset(
-    {"advice", "demo", "errors", "exports", "frequency", "plot", "progress", "report", "reproduction", "rig", "sklearn"}
+    {
+        "advice",
+        "control",
+        "demo",
+        "errors",
+        "exports",
+        "frequency",
+        "plot",
+        "progress",
+        "report",
+        "reproduction",
+        "rig",
+        "sklearn",
+    }
 )
 
 

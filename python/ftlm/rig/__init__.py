@@ -3,9 +3,10 @@
 from ftlm.fit.streaming import Streaming
 from ftlm.rig.excitation import SHAPES, Excitation
 from ftlm.rig.experiment import record
+from ftlm.rig.loop import Controller, control
 from ftlm.rig.parameters import ArmParameters, StageParameters
 from ftlm.rig.rig import Board, Limits, Rig
 from ftlm.rig.virtual import INJECTIONS, VirtualBoard
 
-__all__ = ["INJECTIONS", "SHAPES", "ArmParameters", "Board", "Excitation", "Limits", "Rig", "StageParameters",
-           "Streaming", "VirtualBoard", "record"]  # fmt: skip
+__all__ = ["INJECTIONS", "SHAPES", "ArmParameters", "Board", "Controller", "Excitation", "Limits", "Rig",
+           "StageParameters", "Streaming", "VirtualBoard", "control", "record"]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Experiments on a rig: inputs, the loop that records, and the files that keep what was recorded."""
+"""Experiments on a rig: what is asked of it, the one loop that drives and records, the files that keep its rows."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import math
 import os
 import signal
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ftlm.fit.streaming import Streaming
 from ftlm.rig.excitation import INPUTS, Excitation
 from ftlm.rig.parameters import ArmParameters
 from ftlm.rig.quanser import QuanserBoard
-from ftlm.rig.recording import UNITS, Partial, partial_of, saved
+from ftlm.rig.recording import Partial, partial_of, saved, units_of
 from ftlm.rig.rig import COLUMNS, LONGEST, Board, Limits, Rig
 from ftlm.rig.virtual import VirtualBoard
 
@@ -118,58 +118,133 @@ def record(
         notes say what went wrong on the way out.
     """
     excitation = Excitation(input, amplitude, period, band, ramp, seed, file)
-    _check_times(duration, limit, rate, seed)
+    check_times(duration, limit, rate, seed)
     commands = excitation.commands(rate, duration)
-    if sensor_filter not in (None, "stock"):
-        raise ModelError(f"sensor_filter = {sensor_filter!r} is not known; use 'stock' or None")
-    board, told = _board(rig, parameters, seed, offset, paced=paced, horizon=limit, card=card)
-    paced = paced or board.hardware or bool(getattr(board, "paced", False))
-    if board.hardware and not arm:
-        raise ModelError(
-            f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so with "
-            "arm=True (--arm)"
-        )
-    name = excitation.shape if name is None else name
-    if not is_run_name(name):
-        raise DataError(f"name={name!r} cannot name a run")
-    target = None if out is None else Path(out)
-    if target is not None:
-        _check_target(target, force=force)
-    about: dict[str, Any] = {
-        "rig": board.name, "seed": seed, "rate": rate, "duration": duration, "paced": paced,
-        "watchdog": watchdog, "sensor_filter": sensor_filter, "input": excitation.to_dict(), **told,
-    }  # fmt: skip
-    link = Rig(
-        board, rate=rate, watchdog=watchdog, limit=limit, limits=Limits(),
-        sensor_filter=STOCK_FILTER if sensor_filter else None,
+    asked = Experiment(
+        rig, duration, limit, rate, seed, parameters, offset, paced, sensor_filter, watchdog, arm, card,
+        excitation.shape if name is None else name, out, force, live, progress,
     )  # fmt: skip
-    columns = [] if live is None else [_column_of(signal_name) for signal_name in live.signals]
-    recorder = _Recorder(Partial(target, name, 1.0 / rate, about), len(commands), progress, live, columns)
-    ended, faults = _drive(link, recorder, commands, _ROWS_PACED if paced else _ROWS_FAST)
-    about |= {"missed_deadlines": link.guard.missed, "faults": faults}
-    if live is not None:
-        about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.trouble}
-    try:
-        run = recorder.finish(name, about, faults, 1.0 / rate)
-        return saved(run, target, recorder.partial, force=force, ended=ended, faults=faults)
-    except BaseException:
-        recorder.partial.close()
-        raise
+    return asked.recorded(lambda board: Given(commands), {"input": excitation.to_dict()})
 
 
-def _drive(link: Rig, recorder: _Recorder, commands: Floats, block: int) -> tuple[BaseException | None, list[str]]:
+class Source(Protocol):
+    """What asks for commands while a run is recorded."""
+
+    rows: int
+    #: Further columns of the run by name, a row for each of its samples.
+    told: dict[str, Floats]
+
+    def first(self, rig: Rig, block: int) -> Floats:
+        """The first commands, shape (n, 2) [A]; at most `block` of them where none depends on a measurement."""
+
+    def after(self, rows: Floats) -> Floats:
+        """The next commands when these rows have been measured; none when the run is over."""
+
+    def blamed(self, fault: str) -> str:
+        """A fault of the rig in words, with what the source has to do with it."""
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """What a run is asked with; see :func:`record`."""
+
+    rig: str | Board
+    duration: float
+    limit: float
+    rate: float
+    seed: int
+    parameters: str | os.PathLike[str] | ArmParameters
+    offset: tuple[float, float] | None
+    paced: bool
+    sensor_filter: Literal["stock"] | None
+    watchdog: float
+    arm: bool
+    card: str
+    name: str
+    out: str | os.PathLike[str] | None
+    force: bool
+    live: Streaming | None
+    progress: Callable[[int, int], None] | None
+
+    def recorded(self, source_on: Callable[[Board], Source], told: dict[str, Any]) -> Run:
+        """Drive the rig as a source on its board asks, and record it."""
+        if self.sensor_filter not in (None, "stock"):
+            raise ModelError(f"sensor_filter = {self.sensor_filter!r} is not known; use 'stock' or None")
+        board, known = _board(
+            self.rig, self.parameters, self.seed, self.offset, paced=self.paced, horizon=self.limit, card=self.card
+        )
+        paced = self.paced or board.hardware or bool(getattr(board, "paced", False))
+        if board.hardware and not self.arm:
+            raise ModelError(
+                f"the {board.name} moves a real arm: clear its workspace, keep the emergency stop at hand, and say so "
+                "with arm=True (--arm)"
+            )
+        if not is_run_name(self.name):
+            raise DataError(f"name={self.name!r} cannot name a run")
+        target = None if self.out is None else Path(self.out)
+        if target is not None:
+            _check_target(target, force=self.force)
+        source = source_on(board)
+        about: dict[str, Any] = {
+            "rig": board.name, "seed": self.seed, "rate": self.rate, "duration": self.duration, "paced": paced,
+            "watchdog": self.watchdog, "sensor_filter": self.sensor_filter, **told, **known,
+        }  # fmt: skip
+        link = Rig(
+            board, rate=self.rate, watchdog=self.watchdog, limit=self.limit, limits=Limits(),
+            sensor_filter=STOCK_FILTER if self.sensor_filter else None,
+        )  # fmt: skip
+        step, live = 1.0 / self.rate, self.live
+        columns = [] if live is None else [_column_of(signal_name) for signal_name in live.signals]
+        partial = Partial(target, self.name, step, about, tuple(source.told))
+        recorder = _Recorder(partial, source, self.progress, live, columns, _ROWS_PACED if paced else _ROWS_FAST)
+        ended, faults = _drive(link, recorder)
+        about |= {"missed_deadlines": link.guard.missed, "faults": faults}
+        if live is not None:
+            about["live"] = {"coefficients": live.coefficients, "pulses": live.pulses, "trouble": recorder.trouble}
+        try:
+            run = recorder.finish(self.name, about, faults, step)
+            return saved(run, target, recorder.partial, force=self.force, ended=ended, faults=faults)
+        except BaseException:
+            recorder.partial.close()
+            raise
+
+
+class Given:
+    """Commands that are known before the run, shape (rows, 2) [A]."""
+
+    def __init__(self, commands: Floats) -> None:
+        self.commands, self.rows = commands, len(commands)
+        self.told: dict[str, Floats] = {}
+        self._at = self._block = 0
+
+    def first(self, rig: Rig, block: int) -> Floats:
+        """The first block."""
+        self._at, self._block = block, block
+        return self.commands[:block]
+
+    def after(self, rows: Floats) -> Floats:
+        """The next block, whatever was measured."""
+        start, self._at = self._at, self._at + self._block
+        return self.commands[start : start + self._block]
+
+    def blamed(self, fault: str) -> str:
+        """The fault: commands that were known beforehand have nothing to do with it."""
+        return fault
+
+
+def _drive(link: Rig, recorder: _Recorder) -> tuple[BaseException | None, list[str]]:
     """Runs all commands between a start and a way out; what ended the run early, and every fault in words."""
     faults: list[str] = []
     ended: BaseException | None = None
     try:
         with link:
-            recorder.follow(link, commands, block)
+            recorder.follow(link)
     except RigFault as error:
         ended = error
-        faults.append(str(error))
+        faults.append(recorder.source.blamed(str(error)))
     except (KeyboardInterrupt, SystemExit) as error:
         ended = error
-        faults.append(stopped_by(error))
+        faults.append(recorder.source.blamed(stopped_by(error)))
     except BaseException as error:
         # Of the program, such as one in `progress`: it is raised when what was recorded is in its file.
         ended = error
@@ -193,25 +268,42 @@ class _Recorder:
     """Takes rows from a rig, to disk and to memory."""
 
     def __init__(
-        self, partial: Partial, rows: int, progress: Callable[[int, int], None] | None, live: Streaming | None,
-        columns: list[int],
+        self, partial: Partial, source: Source, progress: Callable[[int, int], None] | None, live: Streaming | None,
+        columns: list[int], block: int,
     ) -> None:  # fmt: skip
-        self.partial, self.progress = partial, progress
-        self.live, self.columns = live, columns
+        self.partial, self.source, self.progress = partial, source, progress
+        self.live, self.columns, self.block = live, columns, block
         self.trouble: str | None = None
         self.blocks: list[Floats] = []
-        self.rows, self.done = rows, 0
+        self.waiting: list[Floats] = []
+        self.done = 0
 
-    def follow(self, rig: Rig, commands: Floats, block: int) -> None:
-        """Runs all commands, a block at a time."""
-        for start in range(0, len(commands), block):
-            try:
-                rig.run(commands[start : start + block])
-            finally:
-                self.keep(rig.take())
+    def follow(self, rig: Rig) -> None:
+        """Runs all that the source asks for; rows are kept a block at a time."""
+        try:
+            commands = self.source.first(rig, self.block)
+            while len(commands):
+                try:
+                    rig.run(commands)
+                finally:
+                    rows = rig.take()
+                    self.waiting.append(rows)
+                if sum(map(len, self.waiting)) >= self.block:
+                    self.flush()
+                commands = self.source.after(rows)
+        finally:
+            self.flush()
+
+    def flush(self) -> None:
+        """Keeps the rows that wait."""
+        rows, self.waiting = np.concatenate([np.empty((0, len(COLUMNS) + 1)), *self.waiting]), []
+        if len(rows):
+            self.keep(rows)
 
     def keep(self, rows: Floats) -> None:
         """Keeps rows in memory first, then on disk."""
+        told = [values[self.done : self.done + len(rows), None] for values in self.source.told.values()]
+        rows = np.hstack([rows[:, : len(COLUMNS)], *told])
         self.blocks.append(rows)
         self.done += len(rows)
         self.partial.write(rows)
@@ -222,17 +314,18 @@ class _Recorder:
                 # An estimate that fails is no reason to stop a run that can be identified afterwards.
                 self.trouble = str(error)
         if self.progress is not None:
-            self.progress(self.done, self.rows)
+            self.progress(self.done, self.source.rows)
 
     def finish(self, name: str, about: dict[str, Any], faults: list[str], step: float) -> Run | None:
         """The run; None if fewer than three rows were recorded."""
-        rows = np.concatenate(self.blocks) if self.blocks else np.empty((0, len(COLUMNS) + 1))
+        told = tuple(self.source.told)
+        rows = np.concatenate(self.blocks) if self.blocks else np.empty((0, len(COLUMNS) + len(told)))
         if len(rows) < 3:
             return None
-        data = {column: rows[:, k] for k, column in enumerate(COLUMNS)}
+        data = {column: rows[:, k] for k, column in enumerate((*COLUMNS, *told))}
         facts = tuple(f"the rig stopped the run after {(len(rows) - 1) * step:.6g} s: {f}" for f in faults)
-        signals = {n: data[n] for n in INPUTS}, {n: data[n] for n in COLUMNS[2:]}
-        return built(Asked(*signals, step=step, units=UNITS, name=name, facts=facts, about=about))
+        signals = {n: data[n] for n in (*INPUTS, *told)}, {n: data[n] for n in COLUMNS[2:]}
+        return built(Asked(*signals, step=step, units=units_of(told), name=name, facts=facts, about=about))
 
 
 def _board(
@@ -272,7 +365,7 @@ def _check_target(target: Path, *, force: bool) -> None:
         )
 
 
-def _check_times(duration: float, limit: float, rate: float, seed: int) -> None:
+def check_times(duration: float, limit: float, rate: float, seed: int) -> None:
     """Refuse times, a rate or a seed that no run can have."""
 
     def number(value: object) -> bool:

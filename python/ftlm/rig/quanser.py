@@ -116,7 +116,7 @@ class QuanserBoard:
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:  # fmt: skip
         self.card = card
-        self._clock = clock
+        self.clock = clock
         self._sleep = sleep
         self._hil: Any = None
         self._error: type[Exception] = Exception
@@ -308,7 +308,7 @@ class QuanserBoard:
                 guard.fail("Q8-USB: the board's task stopped and handed over no sample: samples were lost")
                 self._write((0.0, 0.0))
                 return None
-        since = self._clock() - self._samples / self._rate
+        since = self.clock() - self._samples / self._rate
         self._samples += 1
         self._origin = min(self._origin + DRIFT / self._rate, since)
         return since - self._origin

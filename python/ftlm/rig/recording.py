@@ -20,6 +20,11 @@ from ftlm.rig.rig import COLUMNS
 UNITS = {name: "A" if name.startswith("I") else "rad" for name in COLUMNS}
 
 
+def units_of(told: tuple[str, ...] = ()) -> dict[str, str]:
+    """Units of a run's columns; what a run tells besides are angles."""
+    return UNITS | dict.fromkeys(told, "rad")
+
+
 def partial_of(target: Path) -> Path:
     """Where the rows of a run are until it has ended."""
     return target.with_name(target.stem + ".csv.partial")
@@ -34,22 +39,28 @@ class Partial:
         The file asked for; None keeps nothing on disk.
     name, step, about
         Of the run.
+    told
+        Names of its further inputs, which follow the rig's columns in every row.
     """
 
-    def __init__(self, target: Path | None, name: str, step: float, about: dict[str, Any]) -> None:
+    def __init__(
+        self, target: Path | None, name: str, step: float, about: dict[str, Any], told: tuple[str, ...] = ()
+    ) -> None:
         self.path = None if target is None else partial_of(target)
         self._step, self._rows = step, 0
+        self._columns = (*COLUMNS, *told)
         #: Rows that are on disk, whole.
         self.kept = 0
         self._descriptor: int | None = None
         if self.path is None:
             return
+        inputs = (*INPUTS, *told)
         header = Header(
-            name, step, 0.0, tuple(INPUTS), tuple(COLUMNS[2:]), UNITS, dict.fromkeys(INPUTS, "zoh"),
+            name, step, 0.0, inputs, tuple(COLUMNS[2:]), units_of(told), dict.fromkeys(inputs, "zoh"),
             ("the recording did not end: the program died, or the disk was full",),
             about | {"faults": ["the recording did not end"]},
         )  # fmt: skip
-        lines = f"{CSV_MARK}{header.text()}\n{','.join([CSV_TIME, *COLUMNS])}\n"
+        lines = f"{CSV_MARK}{header.text()}\n{','.join([CSV_TIME, *self._columns])}\n"
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         try:
             # Whoever overwrites a link means the link, not what it leads to.
@@ -64,7 +75,7 @@ class Partial:
             ) from None
 
     def write(self, rows: Floats) -> None:
-        """Appends rows, shape (n, 9).
+        """Appends rows, shape (n, columns).
 
         Raises
         ------
@@ -75,7 +86,7 @@ class Partial:
             self._rows += len(rows)
             return
         t = np.round((self._rows + np.arange(len(rows))) * self._step, 9)
-        columns = [map(repr, t.tolist()), *(map(repr, rows[:, k].tolist()) for k in range(len(COLUMNS)))]
+        columns = [map(repr, t.tolist()), *(map(repr, rows[:, k].tolist()) for k in range(len(self._columns)))]
         text = "\n".join(map(",".join, zip(*columns, strict=True))) + "\n"
         self._rows += len(rows)
         try:
@@ -140,5 +151,6 @@ def saved(
     if ended is not None or faults or run is None:
         fault = RigFault(f"{'; '.join(faults) or 'no sample was read'}; {place}")
         fault.run = run
-        raise fault from None
+        # What made a controller fail is its own to show.
+        raise fault from (None if ended is None else ended.__cause__)
     return run

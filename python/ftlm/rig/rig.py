@@ -7,7 +7,7 @@ import math
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, NoReturn, Protocol
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
@@ -293,9 +293,7 @@ class Rig:
         """
         self._check()
         if self._samples + len(commands) > self.limit * self.rate + 1.5:
-            self.guard.fail(f"the time limit of {self.limit:g} s is over; ask for a longer one")
-            self.board.write((0.0, 0.0))
-            self._check()
+            self.fail(f"the time limit of {self.limit:g} s is over; ask for a longer one")
         self._samples += len(commands)
         try:
             self.board.run(self.guard, commands)
@@ -307,6 +305,23 @@ class Rig:
                 raise
             self.guard.fail(str(error))
         self._check()
+
+    def fail(self, why: str, cause: BaseException | None = None) -> NoReturn:
+        """Latch a fault of the program: 0 V at once.
+
+        Raises
+        ------
+        RigFault
+            The first fault of the run, from what caused it.
+        """
+        self.guard.fail(why)
+        with contextlib.suppress(Exception):
+            self.board.write((0.0, 0.0))
+        try:
+            self._check()
+        except RigFault as fault:
+            raise fault from cause
+        raise RigFault(why) from cause
 
     def take(self) -> Floats:
         """Rows since the last call, shape (n, 9): COLUMNS and how late each was [s]."""

@@ -1,0 +1,211 @@
+"""Fractional controllers one sample at a time, in bounded memory, and both hubs of the arm under them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ftlm.base.arrays import Complex, Floats
+from ftlm.base.checks import real_number, whole_number
+from ftlm.base.errors import ModelError
+from ftlm.control.pid import FractionalPid
+from ftlm.solve.approximation import LARGEST_ORDER, oustaloup
+
+#: Poles reach this many times beyond the band on both sides.
+REACH = 30.0
+#: Frequencies at which the error is measured.
+COMPARED = 200
+
+
+@dataclass(frozen=True)
+class _Bank:
+    """A sum of gain, integral and lags 1/(s + p), exact for what is linear between samples."""
+
+    direct: float
+    weights: Floats
+    keeps: Floats
+    now: Floats
+    before: Floats
+
+    def response(self, z: Complex) -> Complex:
+        """At points of the unit circle."""
+        inverse = 1.0 / z[:, None]
+        lags = (self.now + self.before * inverse) / (1.0 - self.keeps * inverse)
+        return np.asarray(self.direct + lags @ self.weights)
+
+
+class Realised:
+    """A fractional PID at a sampling rate: Oustaloup's poles, each an exponential memory of one number.
+
+    The first sample is safe: a constant error has no derivative, so what is there at the start answers with kp alone.
+    While the output is at its limit the integral stands still where it would push it further.
+
+    Parameters
+    ----------
+    pid
+        The controller.
+    rate
+        Samples per second.
+    limit
+        Largest output; what is beyond is cut, since it is known to be and nothing winds up.
+    band
+        Frequencies within which it is to hold [rad/s]; default from a thousandth to an eighth of the rate's half.
+    order
+        Of Oustaloup's filter: 2 order + 1 poles for the integral, as many for the derivative.
+
+    Raises
+    ------
+    ModelError
+        A rate, limit, band or order that is none.
+    """
+
+    def __init__(
+        self, pid: FractionalPid, rate: float, *, limit: float = math.inf, band: tuple[float, float] | None = None,
+        order: int = 6,
+    ) -> None:  # fmt: skip
+        value = real_number("rate", rate)
+        if not (math.isfinite(value) and value > 0):
+            raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
+        most = real_number("limit", limit)
+        if not most > 0:
+            raise ModelError(f"limit = {limit!r} is not a number above 0")
+        half = math.pi * value
+        if band is None:
+            band = (half / 1000.0, half / 8.0)
+        try:
+            low, high = (real_number("band", b) for b in band)
+        except (TypeError, ValueError):
+            raise ModelError(f"band = {band!r} is no pair of frequencies; give (low, high) in rad/s") from None
+        if not (math.isfinite(low) and 0 < low < high <= half):
+            raise ModelError(f"band = ({low:g}, {high:g}) rad/s is no interval up to half the rate, {half:g} rad/s")
+        count = whole_number(order)
+        if count is None or not 1 <= count <= LARGEST_ORDER:
+            raise ModelError(f"order = {order!r} is no whole number from 1 to {LARGEST_ORDER}")
+        self.pid, self.rate, self.limit, self.band = pid, value, most, (low, high)
+        reach = (low / REACH, high * REACH)
+        self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)
+        self._derivative = _bank(pid.kd, *_power(pid.mu, reach, count), 1.0 / value)
+        #: Largest errors over the band against the exact controller [dB], [degrees].
+        self.gain_error, self.phase_error = self._errors()
+        self.reset()
+
+    @property
+    def memory(self) -> int:
+        """Numbers that are remembered from one sample to the next."""
+        return len(self._integral.weights) + len(self._derivative.weights) + 1
+
+    def response(self, w: Floats) -> Complex:
+        """Its own response at frequencies [rad/s], limit apart."""
+        z = np.exp(1j * np.asarray(w, dtype=np.float64) / self.rate)
+        return self.pid.kp + self._integral.response(z) + self._derivative.response(z)
+
+    def reset(self) -> None:
+        """Forgets everything."""
+        self._sums = np.zeros(len(self._integral.weights))
+        self._lags: Floats | None = None
+        self._error = 0.0
+
+    def __call__(self, error: float) -> float:
+        """The output for the error of a sample."""
+        if self._lags is None:
+            # As if the error had always been there: of a constant no derivative is left.
+            bank = self._derivative
+            self._lags = error * (bank.now + bank.before) / (1.0 - bank.keeps)
+            self._error, sums = error, self._sums
+        else:
+            self._lags = self._stepped(self._derivative, self._lags, error)
+            sums = self._stepped(self._integral, self._sums, error)
+        rest = self.pid.kp * error + self._derivative.direct * error + float(self._lags @ self._derivative.weights)
+        output = rest + self._integral.direct * error + float(sums @ self._integral.weights)
+        if abs(output) > self.limit and output * error > 0:
+            sums = self._sums
+            output = rest + self._integral.direct * error + float(sums @ self._integral.weights)
+        self._sums, self._error = sums, error
+        return min(max(output, -self.limit), self.limit)
+
+    def _stepped(self, bank: _Bank, states: Floats, error: float) -> Floats:
+        return bank.keeps * states + bank.now * error + bank.before * self._error
+
+    def _errors(self) -> tuple[float, float]:
+        w = np.geomspace(*self.band, COMPARED)
+        quotient = self.response(w) / self.pid.response(w)
+        gain = float(np.max(np.abs(20.0 * np.log10(np.abs(quotient)))))
+        return gain, float(np.degrees(np.max(np.abs(np.angle(quotient)))))
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"pid": self.pid.to_dict(), "rate": self.rate, "band": list(self.band), "gain_error_db": self.gain_error,
+                "phase_error_degrees": self.phase_error, "memory": self.memory}  # fmt: skip
+
+    def __str__(self) -> str:
+        return (
+            f"{self.pid} at {self.rate:g} Hz with {self.memory} numbers of memory: within {self.gain_error:.2g} dB and "
+            f"{self.phase_error:.2g} degrees from {self.band[0]:.3g} to {self.band[1]:.3g} rad/s"
+        )
+
+
+class HubLoops:
+    """A controller of each hub for :func:`ftlm.rig.control`: reference less hub angle in, current out.
+
+    Parameters
+    ----------
+    first, second
+        Of hub 1 and hub 2, called with an error [rad] and returning a current [A]; None leaves a hub without current.
+    """
+
+    def __init__(self, first: Realised | None, second: Realised | None = None) -> None:
+        if not isinstance(first, (Realised, type(None))) or not isinstance(second, (Realised, type(None))):
+            raise ModelError("first and second are Realised controllers, or None")
+        self.loops = (first, second)
+
+    def reset(self) -> None:
+        """Forgets what was."""
+        for loop in self.loops:
+            if loop is not None:
+                loop.reset()
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {f"hub{j}": None if loop is None else loop.to_dict() for j, loop in enumerate(self.loops, start=1)}
+
+    def __call__(self, time: float, angles: Floats, reference: Floats) -> tuple[float, float]:
+        """Both currents [A]."""
+        first, second = (
+            0.0 if loop is None else loop(float(reference[j] - angles[2 * j])) for j, loop in enumerate(self.loops)
+        )
+        return first, second
+
+
+def _power(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
+    """Poles, residues and direct gain of s^power, 0 < power <= 1."""
+    if power < 1.0:
+        poles, residues, _ = oustaloup(power, reach, order)
+        # The gain that leaves nothing of a constant, as no derivative does; Oustaloup's leaves the lower end's.
+        return poles, residues, -float(np.sum(residues / poles))
+    high = reach[1]
+    return np.array([high]), np.array([-high * high]), high
+
+
+def _integral(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:
+    """The same of s^-power: an integral of s^(1 - power), so that nothing constant is left at rest."""
+    if power >= 1.0:
+        return np.zeros(1), np.ones(1), 0.0
+    poles, residues, gain = oustaloup(1.0 - power, reach, order)
+    whole = gain + float(np.sum(residues / poles))
+    return np.append(0.0, poles), np.append(whole, -residues / poles), 0.0
+
+
+def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: float) -> _Bank:
+    """Lags that are exact for a signal that is linear between samples."""
+    x = poles * step
+    keeps = np.exp(-x)
+    # (1 - e^-x)/x and what follows from it, whose limits at 0 are 1, 1/2 and 1/2.
+    small = x < 1e-6
+    safe = np.where(small, 1.0, x)
+    mean = np.where(small, 1.0 - x / 2.0, -np.expm1(-safe) / safe)
+    now = step * np.where(small, 0.5, (1.0 - mean) / safe)
+    before = step * np.where(small, 0.5, (mean - keeps) / safe)
+    return _Bank(factor * direct, factor * residues, keeps, now, before)

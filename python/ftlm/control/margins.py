@@ -1,0 +1,154 @@
+"""Loops on a model's exact frequency response: whether they are stable, and how far from not being so."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from ftlm.base.arrays import Complex, Floats
+from ftlm.base.errors import ModelError
+from ftlm.data.solved import Solved
+from ftlm.solve.frequency import frequency_response, model_numbers, response_inputs, transfer_functions, with_numbers
+from ftlm.solve.stability import stability
+
+#: Frequencies of a Nyquist curve, from a thousandth of the crossover to half the sampling rate.
+POINTS = 1500
+BELOW = 1e-3
+
+
+@dataclass(frozen=True)
+class Margins:
+    """How far a loop is from instability.
+
+    Parameters
+    ----------
+    stable
+        Whether the closed loop is stable, by the argument principle on 1 + L.
+    crossover
+        Highest frequency at which abs(L) = 1 [rad/s]; NaN where there is none.
+    phase
+        Smallest phase margin of all crossovers [degrees].
+    gain
+        Smallest factor by which the loop's gain may rise or fall before the phase is -180 degrees at 1.
+    sensitivity
+        Largest abs(1/(1 + L)).
+    """
+
+    stable: bool
+    crossover: float
+    phase: float
+    gain: float
+    sensitivity: float
+
+    def __str__(self) -> str:
+        if not self.stable:
+            return "not stable"
+        return (
+            f"crossover {self.crossover:.4g} rad/s, phase margin {self.phase:.3g} degrees, gain margin "
+            f"{self.gain:.3g}, largest sensitivity {self.sensitivity:.3g}"
+        )
+
+
+@dataclass(frozen=True)
+class Plant:
+    """One input and one output of a model behind a sampled loop.
+
+    Parameters
+    ----------
+    model
+        The model.
+    output, input
+        Names.
+    rate
+        Of the loop [Hz]: an answer acts a sample later and is held.
+    coupling
+        See :func:`ftlm.frequency.frequency_response`.
+    """
+
+    model: Solved
+    output: str
+    input: str
+    rate: float
+    coupling: str
+
+    def response(self, w: Floats) -> Complex:
+        """Response at frequencies below half the rate [rad/s], delay and hold included."""
+        inputs = response_inputs(self.model, coupled=self.coupling == "simulated")
+        every = frequency_response(self.model, w, coupling=self.coupling)
+        one = every[self.model.outputs.index(self.output), inputs.index(self.input)]
+        turn = 1j * w / self.rate
+        return np.asarray(one * np.exp(-turn) * -np.expm1(-turn) / turn)
+
+    def integrates(self) -> float:
+        """Order of the plant's own integral."""
+        transfer = transfer_functions(self.model, coupling=self.coupling)
+        above = transfer.numerators[self.output, self.input]
+        if not above:
+            raise ModelError(f"{self.input} does not reach {self.output} in this model")
+        return transfer.denominator[self.output][-1][1] - above[-1][1]
+
+    def grows(self) -> float:
+        """Number of unstable poles; NaN where one is on the axis."""
+        found = stability(self.model, coupling=self.coupling)
+        return math.nan if found.on_axis else found.unstable_poles
+
+    def samples(self, count: int, seed: int) -> list[Plant]:
+        """Plants as the covariance of the model's numbers has them; none where it has no covariance."""
+        estimate = self.model.estimate
+        if estimate is None or estimate.covariance is None:
+            return []
+        matrix = np.asarray(estimate.covariance, dtype=np.float64)
+        # A number that hardly anything tells has an infinite variance; it is drawn as wide as numbers go.
+        matrix = np.nan_to_num(matrix, nan=0.0, posinf=1e12, neginf=-1e12)
+        values, vectors = np.linalg.eigh((matrix + matrix.T) / 2)
+        spread = vectors * np.sqrt(np.maximum(values, 0.0))
+        drawn = np.random.default_rng(seed).standard_normal((count, len(values))) @ spread.T
+        centre = model_numbers(self.model)
+        return [
+            Plant(with_numbers(self.model, centre + d), self.output, self.input, self.rate, self.coupling)
+            for d in drawn
+        ]
+
+
+def grid(crossover: float, rate: float) -> Floats:
+    """Frequencies of a Nyquist curve [rad/s]."""
+    return np.geomspace(BELOW * crossover, 0.999 * math.pi * rate, POINTS)
+
+
+def margins_of(loop: Complex, w: Floats, integrates: float, grows: float = 0.0) -> Margins:
+    """Margins of a loop's response on a fine grid.
+
+    Parameters
+    ----------
+    loop
+        L(jw), shape (W,).
+    w
+        Frequencies, rising [rad/s].
+    integrates
+        Order with which L grows towards 0.
+    grows
+        Unstable poles of L.
+    """
+    if not np.isfinite(loop).all() or math.isnan(grows):
+        return Margins(False, math.nan, math.nan, math.nan, math.inf)
+    difference = 1.0 + loop
+    turned = np.unwrap(np.angle(difference))
+    # Upper half of the contour, and of the small circle around the origin.
+    closed = grows + integrates / 2.0 - (turned[-1] - turned[0]) / math.pi
+    size, phase = np.log(np.abs(loop)), np.unwrap(np.angle(loop))
+    at = np.flatnonzero(np.sign(size[:-1]) != np.sign(size[1:]))
+    share = size[at] / (size[at] - size[at + 1])
+    phases = np.degrees(phase[at] + share * (phase[at + 1] - phase[at]))
+    crossings = np.exp(np.log(w[at]) + share * np.log(w[at + 1] / w[at]))
+    away = np.abs((phases + 360.0) % 360.0 - 180.0)
+    turns = np.floor((phase / math.pi + 1.0) / 2.0)
+    cut = np.flatnonzero(turns[:-1] != turns[1:])
+    edge = math.pi * (2.0 * np.maximum(turns[cut], turns[cut + 1]) - 1.0)
+    part = (edge - phase[cut]) / (phase[cut + 1] - phase[cut])
+    gains = np.exp(np.abs(size[cut] + part * (size[cut + 1] - size[cut])))
+    return Margins(
+        bool(round(closed) == 0), float(crossings[-1]) if at.size else math.nan, float(np.min(away, initial=180.0)),
+        float(np.min(gains, initial=math.inf)), float(np.max(1.0 / np.abs(difference))),
+    )  # fmt: skip

@@ -1,0 +1,301 @@
+"""Fractional PID controllers, tuned on the exact frequency response of a fractional model and on its intervals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ftlm.base.arrays import Complex, Floats
+from ftlm.base.checks import nearest, real_number, whole_number
+from ftlm.base.errors import ModelError
+from ftlm.control.margins import Margins, Plant, grid, margins_of
+from ftlm.data.solved import Solved
+from ftlm.solve.frequency import check_unlimited, model_numbers, response_inputs
+from ftlm.solve.records import check_linear
+
+#: Orders that are tried: of the integral and of the derivative, first over all, then around the best.
+LOWEST, HIGHEST, TRIED = 0.5, 1.0, 15
+ROUNDS = 3
+#: Frequencies of the curves on which orders are compared.
+COMPARED = 300
+#: Largest sensitivity over all samples that is aimed at; where none has so little, this much above the least.
+CALM, ABOVE = 1.5, 1.05
+#: Where the loop's gain is to be high, against friction and offsets: this share of the crossover.
+SLOW = 0.1
+#: A design that more than this share of the parameters' samples breaks is none.
+BROKEN = 0.05
+#: A sample keeps a design whose phase margin is at least this share of what was asked for.
+KEPT = 0.5
+#: Gains of the plant over which flatness is told.
+FLAT = (0.7, 1.4)
+
+
+@dataclass(frozen=True)
+class FractionalPid:
+    """kp + ki s^-lam + kd s^mu.
+
+    Parameters
+    ----------
+    kp, ki, kd
+        Gains, of the controller's output over the error.
+    lam, mu
+        Orders of the integral and of the derivative.
+    """
+
+    kp: float
+    ki: float
+    kd: float
+    lam: float
+    mu: float
+
+    def response(self, w: Floats) -> Complex:
+        """Exact response at frequencies above 0 [rad/s]."""
+        s = 1j * np.asarray(w, dtype=np.float64)
+        return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return f"{self.kp:.4g} + {self.ki:.4g} s^-{self.lam:.3g} + {self.kd:.4g} s^{self.mu:.3g}"
+
+
+@dataclass(frozen=True)
+class PidDesign:
+    """A fractional PID with the margins of its loop.
+
+    Parameters
+    ----------
+    pid
+        The controller.
+    rate
+        Of the loop [Hz].
+    nominal
+        Margins at the values of the model's numbers.
+    samples
+        Margins at samples of the numbers from their covariance; none where the model has no covariance.
+    flat
+        Phase margin with 0.7, 1 and 1.4 times the plant's gain [degrees].
+    """
+
+    pid: FractionalPid
+    rate: float
+    nominal: Margins
+    samples: tuple[Margins, ...]
+    flat: tuple[float, float, float]
+
+    @property
+    def kept(self) -> float:
+        """Share of the samples whose loop is stable; 1 where there are none."""
+        return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
+
+    def within(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
+        """Where 95 % of the samples have a margin."""
+        if not self.samples:
+            value = getattr(self.nominal, what)
+            return value, value
+        low, high = np.quantile([getattr(m, what) for m in self.samples], [0.025, 0.975])
+        return float(low), float(high)
+
+    def __str__(self) -> str:
+        lines = [f"fractional PID: {self.pid}", f"at the values: {self.nominal}"]
+        if self.samples:
+            phase, gain, peak = (self.within(n) for n in ("phase", "gain", "sensitivity"))
+            lines.append(
+                f"over the intervals ({len(self.samples)} samples, {100 * self.kept:.0f} % stable), 95 % between: "
+                f"phase margin {phase[0]:.3g} and {phase[1]:.3g} degrees, gain margin {gain[0]:.3g} and {gain[1]:.3g}, "
+                f"largest sensitivity {peak[0]:.3g} and {peak[1]:.3g}"
+            )
+        lines.append("phase margin with {:g}, 1, {:g} of the plant's gain: ".format(*FLAT)
+                     + ", ".join(f"{p:.3g}" for p in self.flat) + " degrees")  # fmt: skip
+        return "\n".join(lines)
+
+
+def fractional_pid(
+    model: Solved, *, output: str | None = None, input: str | None = None, crossover: float,
+    phase_margin: float = 60.0, rate: float = 500.0, samples: int = 100, seed: int = 0,
+    coupling: Literal["simulated", "measured"] = "simulated",
+) -> PidDesign:  # fmt: skip
+    """Tune a fractional PID on a model: crossover, phase margin, flat phase, and the best worst case of its intervals.
+
+    Parameters
+    ----------
+    model
+        A linear model, identified or written down, of any orders.
+    output, input : str, optional
+        What is controlled and what with; where the model has one of them alone it needs no name.
+    crossover
+        Where the loop's gain is 1 [rad/s].
+    phase_margin
+        There [degrees], 10 to 80.
+    rate
+        Of the loop [Hz], whose sample of delay and whose hold are counted as they are.
+    samples
+        Of the model's numbers, from their covariance, 0 to 10000.
+    seed
+        Of the samples.
+    coupling
+        ``"measured"``: the output's own equation alone.
+
+    Returns
+    -------
+    PidDesign
+        With margins at the values and at each sample.
+
+    Raises
+    ------
+    ModelError
+        A model that is not stable (an integral is), with friction, or whose intervals are too wide: more than a
+        twentieth of the samples break the loop or halve its phase margin. A margin that no gains from 0 reach there.
+
+    Notes
+    -----
+    At given orders three conditions at the crossover, gain 1, phase, and no change of phase with frequency, are linear
+    in the three gains: they hold exactly. Of all orders whose largest sensitivity over all samples is at most 1.5 (or
+    within 5 % of the least there is) those are taken that give the loop most gain at a tenth of the crossover.
+    Monje, Vinagre, Feliu and Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
+    """
+    plant = _plant(model, output, input, rate, coupling)
+    wc = real_number("crossover", crossover)
+    if not (math.isfinite(wc) and 0 < wc < math.pi * plant.rate / 4):
+        raise ModelError(
+            f"crossover = {crossover!r} rad/s is outside (0, {math.pi * plant.rate / 4:.4g}), an eighth of the rate of "
+            f"{plant.rate:g} Hz"
+        )
+    asked = real_number("phase_margin", phase_margin)
+    if not 10 <= asked <= 80:
+        raise ModelError(f"phase_margin = {phase_margin!r} degrees is outside [10, 80]")
+    count, start = whole_number(samples), whole_number(seed)
+    if count is None or not 0 <= count <= 10_000:
+        raise ModelError(f"samples = {samples!r} is no whole number from 0 to 10000")
+    if start is None or start < 0:
+        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
+    if plant.grows() != 0:
+        raise ModelError(
+            f"the model is not stable ({_why(plant)}): a loop that holds it cannot be judged by its margins; stabilise "
+            "it first, and identify what is then there"
+        )
+    drawn = plant.samples(count, start)
+    target = np.exp(1j * (math.radians(asked) - math.pi)) / plant.response(np.array([wc]))[0]
+    near = np.array([wc * (1 - 1e-5), wc * (1 + 1e-5)])
+    slope = float(np.diff(np.unwrap(np.angle(plant.response(near))))[0] / (near[1] - near[0]))
+    w = np.geomspace(wc / 100, min(30 * wc, 0.999 * math.pi * plant.rate), COMPARED)
+    curves = np.array([one.response(w) for one in [plant, *drawn[:50]]])
+    best = _best(target, slope, wc, w, curves)
+    if best is None:
+        raise ModelError(
+            f"no fractional PID with gains from 0 and orders from {LOWEST:g} to {HIGHEST:g} has a flat phase margin of "
+            f"{asked:g} degrees at {wc:g} rad/s on this model, whose phase there is "
+            f"{np.degrees(np.angle(plant.response(np.array([wc]))[0])):.4g} degrees; move the crossover, or ask for "
+            "another phase margin"
+        )
+    fine = grid(wc, plant.rate)
+    acting = best.response(fine)
+
+    def judged(one: Plant, factor: float = 1.0) -> Margins:
+        order = one.integrates() + (best.lam if best.ki > 0 else 0.0)
+        return margins_of(factor * acting * one.response(fine), fine, order, one.grows())
+
+    nominal = judged(plant)
+    if not nominal.stable:
+        raise ModelError(
+            f"the loop with a phase margin of {asked:g} degrees at {wc:g} rad/s is not stable on this model: its gain "
+            "is 1 elsewhere too, at a resonance; move the crossover away from it"
+        )
+    margins = tuple(map(judged, drawn))
+    broken = [m for m in margins if not (m.stable and m.phase >= KEPT * asked)]
+    if len(broken) > BROKEN * len(margins):
+        raise ModelError(
+            f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
+            f"numbers the loop is not stable or has less than {KEPT * asked:g} degrees of the phase margin; "
+            f"{_widest(model)}; "
+            "identify from a longer or richer run, or lower the crossover"
+        )
+    flat = tuple(judged(plant, factor).phase for factor in (FLAT[0], 1.0, FLAT[1]))
+    return PidDesign(best, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]))
+
+
+def _plant(model: Solved, output: str | None, driver: str | None, rate: float, coupling: str) -> Plant:
+    """The input and output that are meant, or a refusal."""
+    check_linear(model.equations, "a loop's margin")
+    check_unlimited(model, "a loop's margin")
+    if coupling not in ("simulated", "measured"):
+        raise ModelError(f"coupling = {coupling!r} is not known; use 'simulated' or 'measured'")
+    inputs = response_inputs(model, coupled=coupling == "simulated")
+    names = []
+    for what, name, known in (("output", output, model.outputs), ("input", driver, inputs)):
+        if name is None and len(known) == 1:
+            names.append(known[0])
+        elif name is None or name not in known:
+            raise ModelError(
+                f"{what} = {name!r} is not one of the model's{nearest(name, known)}; it has "
+                f"{', '.join(known) or 'none'}"
+            )
+        else:
+            names.append(name)
+    value = real_number("rate", rate)
+    if not (math.isfinite(value) and value > 0):
+        raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
+    return Plant(model, names[0], names[1], value, coupling)
+
+
+def _why(plant: Plant) -> str:
+    grows = plant.grows()
+    return "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
+
+
+def _best(target: complex, slope: float, wc: float, w: Floats, curves: Complex) -> FractionalPid | None:
+    """Of the calm controllers that meet all three conditions, the one with most gain at low frequencies."""
+    found: list[tuple[float, float, FractionalPid]] = []
+    centre, reach = ((LOWEST + HIGHEST) / 2,) * 2, (HIGHEST - LOWEST) / 2
+    for _ in range(ROUNDS):
+        around = [np.clip(c + reach * np.linspace(-1, 1, TRIED), LOWEST, HIGHEST) for c in centre]
+        for lam in np.unique(around[0]).tolist():
+            for mu in np.unique(around[1]).tolist():
+                pid = _solved(target, slope, wc, lam, mu)
+                if pid is None:
+                    continue
+                worst = float(np.max(1.0 / np.abs(1.0 + pid.response(w) * curves)))
+                found.append((worst, float(abs(pid.response(np.array([SLOW * wc]))[0])), pid))
+        if not found:
+            return None
+        calm = max(CALM, ABOVE * min(worst for worst, _, _ in found))
+        best = max((f for f in found if f[0] <= calm), key=lambda f: f[1])[2]
+        centre, reach = (best.lam, best.mu), reach / TRIED * 2
+    return best
+
+
+def _solved(target: complex, slope: float, wc: float, lam: float, mu: float) -> FractionalPid | None:
+    """Gains at given orders: C(j wc) = target and d arg C/dw = -slope; None where one is negative."""
+    powers = np.array([0.0, -lam, mu])
+    parts = (1j * wc) ** powers
+    turning = powers * parts / (wc * target)
+    try:
+        gains = np.linalg.solve(
+            np.array([parts.real, parts.imag, turning.imag]), np.array([target.real, target.imag, -slope])
+        )
+    except np.linalg.LinAlgError:
+        return None
+    if not (np.isfinite(gains).all() and (gains >= 0).all()):
+        return None
+    kp, ki, kd = gains.tolist()
+    return FractionalPid(kp, ki, kd, lam, mu)
+
+
+def _widest(model: Solved) -> str:
+    """Which coefficient or order is known least."""
+    covariance = None if model.estimate is None else model.estimate.covariance
+    if covariance is None:
+        return "none is known"
+    names = []
+    for item in model.equations:
+        names += [f"the order of {item.output}"]
+        names += [n for t in item.terms for n in (f"the order of {t.signal} in {item.output}", f"the coefficient of "
+                                                  f"{t.signal} in {item.output}")]  # fmt: skip
+    share = np.sqrt(np.abs(np.diag(covariance))) / np.maximum(np.abs(model_numbers(model)), 1e-12)
+    at = int(np.argmax(np.nan_to_num(share, nan=0.0, posinf=1e300)))
+    return f"known least is {names[at]}, to {100 * share[at]:.2g} % (one standard error)"

@@ -1,0 +1,358 @@
+"""Shapers, fractional PIDs and their memory, against SciPy, python-control and sums that share no code with them."""
+
+import dataclasses
+import math
+
+import control as python_control
+import numpy as np
+import pytest
+from scipy import signal
+
+import ftlm
+from ftlm import control
+
+W, Z = 17.7, 0.13
+POLE = W * complex(-Z, math.sqrt(1 - Z * Z))
+HUB = "D^2 theta = -63 D^0.95 theta + 140 I"
+
+
+def left_after(reference, rate, w, z, arrived):
+    """Amplitude of a second-order system's swing about 1 at a sample, by SciPy's exact discretisation."""
+    a, b = np.array([[0.0, 1.0], [-w * w, -2 * z * w]]), np.array([[0.0], [w * w]])
+    system = signal.cont2discrete((a, b, np.eye(2), np.zeros((2, 1))), 1.0 / rate)
+    _, _, states = signal.dlsim((*system[:4], 1.0 / rate), reference)
+    pole = w * complex(-z, math.sqrt(1 - z * z))
+    return float(abs(states[arrived, 1] - pole.conjugate() * (states[arrived, 0] - 1.0)) / w)
+
+
+@pytest.mark.parametrize("kind", ["zv", "zvd"])
+@pytest.mark.parametrize("rate", [500.0, 93.7, 24.0])
+def test_a_shaped_step_leaves_nothing_at_the_pole_whatever_the_rate(kind, rate):
+    shaper = control.input_shaper(POLE, kind)
+    step = np.r_[0.0, np.ones(round(4 * rate))]
+    arrived = len(shaper.impulses(rate)) + 1
+    assert left_after(step, rate, W, Z, 1) > 0.5
+    shaped = shaper.filter(step, rate)
+    assert shaped[-1] == pytest.approx(1.0, abs=1e-14)
+    assert np.all(np.diff(shaped) >= 0)
+    assert left_after(shaped, rate, W, Z, arrived) < 1e-12
+
+
+def test_rounding_the_impulses_to_samples_would_leave_vibration():
+    """What the exact split is for: the same shaper with its second impulse at the next sample, and interpolated."""
+    rate = 24.0
+    shaper = control.input_shaper(POLE)
+    step = np.r_[0.0, np.ones(100)]
+    at = shaper.times[1] * rate
+    for taps in (
+        np.bincount([0, round(at)], weights=shaper.amplitudes),
+        np.bincount([0, int(at), int(at) + 1],
+                    weights=[shaper.amplitudes[0], *np.multiply(shaper.amplitudes[1], (1 - at % 1, at % 1))]),
+    ):  # fmt: skip
+        assert left_after(np.convolve(step, taps)[:101], rate, W, Z, 10) > 0.01
+
+
+def test_zvd_has_no_slope_and_zv_has_one():
+    """Residuals beside the pole, simulated: of first order for zv, of second for zvd."""
+    step = np.r_[0.0, np.ones(2000)]
+    left = {}
+    for kind in ("zv", "zvd"):
+        shaper = control.input_shaper(POLE, kind)
+        shaped = shaper.filter(step, 500.0)
+        left[kind] = [left_after(shaped, 500.0, W * (1 + e), Z, len(shaper.impulses(500.0)) + 1) for e in (0.02, 0.04)]
+    assert left["zv"][1] / left["zv"][0] == pytest.approx(2.0, abs=0.2)
+    assert left["zvd"][1] / left["zvd"][0] == pytest.approx(4.0, abs=0.5)
+    assert left["zvd"][0] < 0.1 * left["zv"][0]
+
+
+@pytest.mark.parametrize("kind", ["zv", "zvd"])
+def test_what_a_shaper_says_is_left_is_what_is_simulated(kind):
+    shaper = control.input_shaper(POLE, kind)
+    rate = 5000.0
+    shaped = shaper.filter(np.r_[0.0, np.ones(3000)], rate)
+    arrived = round(shaper.delay * rate) + 1
+    for w, z in ((1.2 * W, Z), (0.8 * W, 0.05), (W, 0.3)):
+        said = float(shaper.residual(w, z))
+        one = left_after(np.r_[0.0, np.ones(3000)], rate, w, z, 1)
+        assert left_after(shaped, rate, w, z, arrived) / one == pytest.approx(said, rel=0.01)
+
+
+def test_two_modes_are_shaped_together():
+    model = ftlm.Model(ftlm.equation("D^4 y = -3.7 D^3 y - 1000 D^2 y - 1500 D y - 200000 y + 200000 u"))
+    modes = sorted((m for m in model.modes() if m.swings), key=lambda m: m.damping)
+    shaper = control.input_shaper(model, modes_shaped=2)
+    for mode in modes:
+        assert float(shaper.residual(mode.frequency, mode.damping)) < 1e-12
+    assert sum(shaper.amplitudes) == pytest.approx(1.0)
+    assert float(control.input_shaper(model).residual(modes[1].frequency, modes[1].damping)) > 0.05
+
+
+def test_a_fractional_models_own_pole_is_shaped():
+    """A spring-pot: the swing of its exact step response is gone, what relaxes as a power of time stays."""
+    model = ftlm.Model(ftlm.equation("D^2 y = -220 D^0.12 y - D^2 x"))
+    (mode,) = model.modes()
+    shaper = control.input_shaper(model)
+    t = np.arange(1501) * 0.002
+    step = np.r_[0.0, np.zeros(49), np.ones(1451)]
+    left = {}
+    for name, x in (("step", step), ("shaped", shaper.filter(step, 500.0))):
+        run = ftlm.Run.from_arrays(step=0.002, inputs={"x": np.convolve(x, np.ones(25) / 25)[:1501]},
+                                   outputs={"y": 0 * t}, intersample={"x": "foh"})  # fmt: skip
+        bend = model.simulate(run)["y"][200:700]
+        # About a mean that creeps, as a power of time does.
+        left[name] = np.std(bend - np.polyval(np.polyfit(t[200:700], bend, 3), t[200:700]))
+    assert left["shaped"] < 0.02 * left["step"]
+    assert shaper.delay == pytest.approx(math.pi / mode.pole.imag)
+
+
+def test_a_filter_keeps_what_it_is_given_and_begins_at_rest():
+    shaper = control.input_shaper(POLE)
+    given = np.column_stack([np.linspace(1.0, 2.0, 300), np.full(300, -3.0)])
+    kept = given.copy()
+    shaped = shaper.filter(given, 500.0)
+    assert np.array_equal(given, kept)
+    assert np.allclose(shaped[:, 1], -3.0)
+    assert shaped[0, 0] == 1.0
+    assert np.array_equal(shaper.filter([1, 2, 3], 500.0)[:1], [1.0])
+
+
+def uncertain(text, errors, **options):
+    """A model whose numbers have these standard errors, by their place."""
+    model = ftlm.Model(ftlm.equation(text, **options))
+    size = sum(1 + 2 * len(e.terms) for e in model.equations)
+    covariance = np.zeros((size, size))
+    for at, error in errors.items():
+        covariance[at, at] = error**2
+    estimate = ftlm.Estimate("output-error", (), {}, covariance=tuple(map(tuple, covariance.tolist())))
+    return dataclasses.replace(model, estimate=estimate)
+
+
+def test_intervals_too_wide_for_a_shaper_are_refused_in_words():
+    text = "D^2 y = -300 y - 4 D y + 300 u"
+    # Of the coefficient of y: 10 % are 5 % of the frequency, a fifth of it leaves too much.
+    good = control.input_shaper(uncertain(text, {2: 10.0}))
+    assert 0 < good.worst < 0.2
+    with pytest.raises(ftlm.ModelError, match=r"too wide to design on.* may leave .* longer run.*kind='zvd'"):
+        control.input_shaper(uncertain(text, {2: 60.0}))
+    assert control.input_shaper(uncertain(text, {2: 40.0}), "zvd").worst < 0.1
+
+
+REFUSED = [
+    (lambda: control.input_shaper(POLE, "zvv"), "kind = 'zvv' is not known"),
+    (lambda: control.input_shaper(POLE, modes_shaped=0), "modes_shaped = 0"),
+    (lambda: control.input_shaper(POLE, modes_shaped="1"), "modes_shaped = '1'"),
+    (lambda: control.input_shaper(2 + 17j), "not stable"),
+    (lambda: control.input_shaper(17j), "not stable"),
+    (lambda: control.input_shaper(-3.0), "does not swing"),
+    (lambda: control.input_shaper(complex("nan")), "does not swing"),
+    (lambda: control.input_shaper(ftlm.Model(ftlm.equation("D^2 y = -9 y + 0.1 D y + u"))), "not stable"),
+    (lambda: control.input_shaper(ftlm.Model(ftlm.equation("D y = -9 y + u"))), "0 modes that swing"),
+    (lambda: control.input_shaper(POLE).impulses(0), "rate = 0"),
+    (lambda: control.input_shaper(POLE).impulses(10.0), "fewer than four samples in a period"),
+    (lambda: control.input_shaper(POLE).impulses("fast"), "rate = 'fast' is not a number"),
+]
+
+
+@pytest.mark.parametrize("case", range(len(REFUSED)))
+def test_what_is_no_shaper_is_refused(case):
+    act, words = REFUSED[case]
+    with pytest.raises(ftlm.ModelError, match=words):
+        act()
+
+
+@pytest.mark.parametrize("given", ["text", None, [], [1j], np.zeros((2, 2, 2)), [[1, 2], [3]]])
+def test_what_cannot_be_filtered_is_refused(given):
+    with pytest.raises(ftlm.DataError, match="no array of numbers"):
+        control.input_shaper(POLE).filter(given, 500.0)
+    with pytest.raises(ftlm.DataError, match=r"not finite at row 1 .2 such"):
+        control.input_shaper(POLE).filter([0.0, np.nan, np.inf], 500.0)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Fractional PID
+
+
+def test_a_tuned_loop_has_the_margins_that_were_asked_for():
+    """Recomputed from the model's powers alone, the sample of delay and the hold included."""
+    model = ftlm.Model(ftlm.equation(HUB))
+    design = control.fractional_pid(model, crossover=40.0, phase_margin=60.0, rate=500.0)
+    pid = design.pid
+
+    def loop(w):
+        s = 1j * w
+        plant = 140.0 / (s**2 + 63.0 * s**0.95) * np.exp(-s / 500.0) * (1 - np.exp(-s / 500.0)) / (s / 500.0)
+        return plant * (pid.kp + pid.ki * s**-pid.lam + pid.kd * s**pid.mu)
+
+    assert abs(loop(40.0)) == pytest.approx(1.0, abs=1e-9)
+    assert math.degrees(np.angle(loop(40.0))) + 180.0 == pytest.approx(60.0, abs=1e-6)
+    slope = (np.angle(loop(40.4)) - np.angle(loop(39.6))) / 0.8
+    assert abs(slope) * 40.0 < 1e-3
+    assert min(pid.kp, pid.ki, pid.kd) >= 0.0
+    assert design.nominal.stable
+    assert design.nominal.phase == pytest.approx(60.0, abs=0.1)
+    assert all(abs(phase - 60.0) < 8.0 for phase in design.flat)
+
+
+@pytest.mark.parametrize(("gain", "stable"), [(1.0, True), (3.0, True), (11.0, True), (30.0, True), (38.0, False)])
+def test_stability_and_margins_are_those_of_python_control(gain, stable):
+    """A plant of whole order with two integrals in its loop; the delay as a high Pade."""
+    model = ftlm.Model(ftlm.equation("D^3 y = -70 D^2 y - 600 D y + 4000 u"))
+    w = control.margins.grid(10.0, 200.0)
+    plant = control.margins.Plant(model, "y", "u", 200.0, "simulated")
+    lead = control.FractionalPid(gain, 0.5 * gain, 0.05 * gain, 1.0, 1.0)
+    found = control.margins.margins_of(lead.response(w) * plant.response(w), w, plant.integrates() + 1.0)
+    s = python_control.tf("s")
+    top, bottom = python_control.pade(1.5 / 200.0, 6)
+    loop = gain * (1 + 0.5 / s + 0.05 * s) * 4000 / (s**3 + 70 * s**2 + 600 * s) * python_control.tf(top, bottom)
+    poles = python_control.feedback(loop, 1).poles()
+    assert bool(np.all(poles.real < 1e-6)) == stable
+    assert found.stable == stable
+    if stable:
+        upper, phase, _, _ = python_control.margin(loop)
+        assert found.phase == pytest.approx(phase, abs=1.5)
+        lower = [v for v in (upper,) if math.isfinite(v)]
+        assert found.gain == pytest.approx(min(lower), rel=0.02)
+
+
+def test_designs_are_made_over_the_intervals():
+    model = uncertain(HUB, {4: 0.01, 2: 3.0})
+    design = control.fractional_pid(model, crossover=40.0, samples=60)
+    assert len(design.samples) == 60
+    assert design.kept == 1.0
+    low, high = design.within("phase")
+    assert low < 59.9
+    assert high > 60.05 or low > 50.0
+    assert design == control.fractional_pid(model, crossover=40.0, samples=60)
+    assert "over the intervals (60 samples, 100 % stable)" in str(design)
+
+
+def test_intervals_too_wide_for_a_loop_are_refused_in_words():
+    with pytest.raises(
+        ftlm.ModelError, match=r"too wide to design on: in [0-9]+ of 40 samples .*known least is the coeff"
+    ):
+        control.fractional_pid(uncertain(HUB, {2: 300.0}), crossover=40.0, samples=40)
+
+
+def test_models_that_cannot_be_designed_on_are_refused():
+    def tuned(text, **options):
+        return control.fractional_pid(ftlm.Model(ftlm.equation(text)), **{"crossover": 40.0, **options})
+
+    for text, options, words in (
+        ("D^2 y = 9 D y + u", {}, "not stable .1 of its poles"),
+        ("D^2 y = -9 y + u", {}, "not stable .a pole is on the imaginary axis"),
+        (HUB, {"crossover": 0.0}, "crossover = 0.0 rad/s is outside"),
+        (HUB, {"crossover": 1e4}, "crossover = 10000.0 rad/s is outside"),
+        (HUB, {"crossover": "40"}, "crossover = '40' is not a number"),
+        (HUB, {"phase_margin": 5.0}, "phase_margin = 5.0 degrees is outside"),
+        (HUB, {"output": "thet"}, "did you mean 'theta'"),
+        (HUB, {"input": "U"}, "input = 'U' is not one"),
+        (HUB, {"rate": -1.0}, "rate = -1.0"),
+        (HUB, {"samples": -1}, "samples = -1"),
+        (HUB, {"seed": "x"}, "seed = 'x'"),
+        (HUB, {"coupling": "loose"}, "coupling = 'loose'"),
+        ("D^2.9 y = -63 D^2 y + 140 u", {"phase_margin": 80.0}, "no fractional PID with gains from 0"),
+    ):
+        with pytest.raises(ftlm.ModelError, match=words):
+            tuned(text, **options)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Realisation
+
+
+PID = control.FractionalPid(6.4, 300.0, 2.5, 0.9, 0.6)
+
+
+def test_what_runs_is_the_exact_controller_within_what_it_says():
+    """Its own answer to a sine over many periods, against powers of jw."""
+    realised = control.Realised(PID, 500.0)
+    assert realised.gain_error < 0.5
+    assert realised.phase_error < 5.0
+    for w in (5.0, 40.0, 150.0):
+        realised.reset()
+        t = np.arange(8000) / 500.0
+        answer = np.array([realised(v) for v in np.sin(w * t)])
+        last = slice(-round(10 * 2 * math.pi / w * 500.0), None)
+        both = np.column_stack([np.sin(w * t), np.cos(w * t), np.ones(8000)])[last]
+        real, imaginary, _ = np.linalg.lstsq(both, answer[last], rcond=None)[0]
+        exact = PID.kp + PID.ki * (1j * w) ** -PID.lam + PID.kd * (1j * w) ** PID.mu
+        quotient = complex(real, imaginary) / exact
+        assert abs(20 * math.log10(abs(quotient))) < realised.gain_error + 0.05
+        assert abs(math.degrees(np.angle(quotient))) < realised.phase_error + 0.5
+
+
+def test_its_memory_is_bounded_and_of_the_size_it_says():
+    realised = control.Realised(PID, 500.0, order=4)
+    assert realised.memory == 2 * 9 + 2  # an integral and the error before besides
+    for v in np.random.default_rng(0).standard_normal(5000):
+        assert math.isfinite(realised(float(v)))
+    assert realised.memory == 20
+
+
+def test_its_step_is_that_of_the_sum_over_the_whole_past():
+    """Half a second of a ramp against Gruenwald-Letnikov's sums."""
+    realised = control.Realised(PID, 500.0)
+    rows = 400
+    ramp = np.arange(rows) / 500.0
+    found = np.array([realised(float(v)) for v in ramp])
+    fine = np.arange(20 * rows) / 10_000.0
+
+    def differintegral(power):
+        weights = np.cumprod(np.r_[1.0, 1.0 - (power + 1.0) / np.arange(1, fine.size)])
+        return np.convolve(weights, fine)[: fine.size] * 10_000.0**power
+
+    exact = PID.kp * fine + PID.ki * differintegral(-PID.lam) + PID.kd * differintegral(PID.mu)
+    assert np.max(np.abs(found - exact[::20])[20:]) < 0.03 * np.max(np.abs(exact))
+
+
+def test_the_first_sample_kicks_nothing_and_the_limit_winds_nothing_up():
+    assert control.Realised(PID, 500.0)(0.1) == pytest.approx(PID.kp * 0.1, rel=1e-9)
+    realised = control.Realised(PID, 500.0, limit=0.9)
+    assert {realised(1.0) for _ in range(2000)} == {0.9}
+    # Two seconds at the limit are forgotten within a few samples of the other sign.
+    assert [realised(-0.1) < 0 for _ in range(3)][-1]
+    free = control.Realised(PID, 500.0)
+    for _ in range(2000):
+        free(1.0)
+    assert free(-0.1) > 100.0
+
+
+def test_a_reset_forgets():
+    realised = control.Realised(PID, 500.0)
+    first = [realised(v) for v in (0.1, 0.3, -0.2)]
+    realised.reset()
+    assert [realised(v) for v in (0.1, 0.3, -0.2)] == first
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"rate": 0.0}, "rate = 0"),
+        ({"limit": 0.0}, "limit = 0"),
+        ({"limit": math.nan}, "limit = nan"),
+        ({"band": (5.0, 1.0)}, "is no interval"),
+        ({"band": (1.0, 1e5)}, "is no interval"),
+        ({"band": 3.0}, "no pair of frequencies"),
+        ({"order": 0}, "order = 0"),
+        ({"order": 51}, "order = 51"),
+    ],
+)
+def test_what_cannot_be_realised_is_refused(options, words):
+    with pytest.raises(ftlm.ModelError, match=words):
+        control.Realised(PID, **{"rate": 500.0, **options})
+    with pytest.raises(ftlm.ModelError, match="Realised controllers"):
+        control.HubLoops(PID)
+
+
+def test_a_designed_loop_runs_on_the_virtual_arm_and_holds_what_it_is_told():
+    """Tuned on the arm's linear fractional model, run on the arm with friction, coupling, offset and noise."""
+    arm = ftlm.rig.ArmParameters.of("linear").model()
+    design = control.fractional_pid(arm, output="theta11", input="I1", crossover=100.0)
+    loops = control.HubLoops(control.Realised(design.pid, 500.0, limit=0.94),
+                             control.Realised(design.pid, 500.0, limit=1.2))  # fmt: skip
+    angle = np.clip(0.5 * (np.arange(1201) * 0.002 - 0.1), 0.0, 0.3)
+    run = ftlm.rig.control(loops, np.column_stack([angle, 0 * angle]), offset=(0.02, -0.02))
+    assert run.about["faults"] == []
+    assert np.abs(run["theta11"][-200:] - 0.3).max() < 0.002
+    assert np.abs(run["theta21"]).max() < 0.01
+    assert run.about["control"]["controller"]["settings"]["hub1"]["memory"] > 10
