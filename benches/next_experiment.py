@@ -70,7 +70,7 @@ def lines_of(rows: list[dict[str, Any]]) -> list[str]:
     each = np.array([[r["found"][n] / r["predicted"]["designed"][n] for n in truth] for r in rows])
     off = np.array([[r["estimates"][n] - truth[n] for n in truth] for r in rows])
     foretold = np.array([[r["predicted"]["designed"][n] for n in truth] for r in rows])
-    z = off / foretold
+    z, own = off / foretold, [list(truth).index(n) for n in ORDERS]
     held = np.mean(np.abs(off) <= 1.96 * np.array([[r["found"][n] for n in truth] for r in rows]))
     moved = [max(r["largest"][o] / r["allowed"][o] for o in r["largest"]) for r in rows]
     return [
@@ -78,12 +78,13 @@ def lines_of(rows: list[dict[str, Any]]) -> list[str]:
         f"{np.median(product):.1f} times (median; {min(product):.1f} to {max(product):.1f}), predicted "
         f"{np.median(told):.1f} ({min(told):.1f} to {max(told):.1f})",
         f"standard errors found over predicted, all ten numbers of all seeds: {np.min(each):.3f} to {np.max(each):.3f}",
-        f"spread of the estimates around the truth over predicted: root mean square {np.sqrt(np.mean(z**2)):.3f} over all "
-        f"numbers and seeds, {np.sqrt(np.mean(z[:, [list(truth).index(n) for n in ORDERS]] ** 2)):.3f} over orders "
-        f"({len(rows)} seeds know one number's to ± {100 / np.sqrt(2 * len(rows)):.0f} %); 95 % intervals hold the truth in "
-        f"{100 * held:.1f} %",
-        f"largest angle of the plant over its limit: {max(moved):.3f}; efficiency {np.median([r['efficiency'] for r in rows]):.2f} "
-        f"(median); a design takes {np.median([r['seconds'] for r in rows]):.0f} s of processor time",
+        f"spread of the estimates around the truth over predicted: root mean square {np.sqrt(np.mean(z**2)):.3f} "
+        f"over all numbers and seeds, {np.sqrt(np.mean(z[:, own] ** 2)):.3f} over orders "
+        f"({len(rows)} seeds know one number's to ± {100 / np.sqrt(2 * len(rows)):.0f} %); 95 % intervals hold the "
+        f"truth in {100 * held:.1f} %",
+        f"largest angle of the plant over its limit: {max(moved):.3f}; efficiency "
+        f"{np.median([r['efficiency'] for r in rows]):.2f} (median); a design takes "
+        f"{np.median([r['seconds'] for r in rows]):.0f} s of processor time",
     ]
 
 

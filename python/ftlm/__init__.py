@@ -63,18 +63,18 @@ if _typing.TYPE_CHECKING:
     )
 
 __all__ = [
-    "PARAMETERS", "Assumption", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "DesignedInput", "Equation",
-    "Estimate", "FeedbackTest", "FileColumn", "FrequencyData", "FrequencyIdentification", "FrequencyValidation",
-    "Friction", "FtlmError", "Genetic", "Identification", "Identified", "InformationCriteria", "InternalError",
-    "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError", "OpenedFile", "Order", "OutputResiduals",
-    "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals", "RigFault", "Run",
-    "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck", "Structure", "Term",
-    "Trace", "Trial", "Validation", "Verdict", "__version__", "block_pulse_matrix", "compare", "design_input", "energies",
-    "equation", "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse",
-    "haar_matrix", "haar_transform", "identify", "identify_frequency", "identify_many", "information_criteria",
-    "lattice", "link_model", "load", "load_frequency", "load_model", "metrics", "multi_innovation_trace",
-    "open_file", "operational_matrix", "order_law", "physical_parameters", "reproduce", "resid", "resume_search",
-    "rig", "search_orders", "search_status", "select", "simulate",
+    "PARAMETERS", "Assumption", "Comparison", "ConvergenceError", "CorrelationTest", "DataError", "DesignedInput",
+    "Equation", "Estimate", "FeedbackTest", "FileColumn", "FrequencyData", "FrequencyIdentification",
+    "FrequencyValidation", "Friction", "FtlmError", "Genetic", "Identification", "Identified",
+    "InformationCriteria", "InternalError", "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError",
+    "OpenedFile", "Order", "OutputResiduals", "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals",
+    "RigFault", "Run", "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck",
+    "Structure", "Term", "Trace", "Trial", "Validation", "Verdict", "__version__", "block_pulse_matrix", "compare",
+    "design_input", "energies", "equation", "explicit_euler", "flexible_link", "fractional_derivative",
+    "fractional_integral", "haar_inverse", "haar_matrix", "haar_transform", "identify", "identify_frequency",
+    "identify_many", "information_criteria", "lattice", "link_model", "load", "load_frequency", "load_model",
+    "metrics", "multi_innovation_trace", "open_file", "operational_matrix", "order_law", "physical_parameters",
+    "reproduce", "resid", "resume_search", "rig", "search_orders", "search_status", "select", "simulate",
 ]  # fmt: skip
 
 #: Where each name lives.

@@ -11,7 +11,7 @@ import numpy as np
 from ftlm.base.arrays import Floats
 
 Kind = Literal["D", "E"]
-#: Kiefer's mean of which the widest direction is taken, where a derivative is needed: within s^(1/16) of it for s numbers.
+#: Kiefer's mean, taken for the widest axis where a derivative is needed: within s^(1/16) of it for s numbers.
 SHARP = 16
 #: A determinant below this, of an information in units of its own diagonal, is rounding.
 LOST = 1e-28

@@ -72,7 +72,7 @@ def exchanged(
     holds = [Hold.of(known, k, hold, starts, float(peaks[k, 0])) for k in range(inputs)]
 
     def commands() -> Floats:
-        return np.repeat(level, hold, axis=1)[:, :rows] * peaks
+        return np.asarray(np.repeat(level, hold, axis=1)[:, :rows] * peaks)
 
     derivatives, moved = known.derivatives(commands()), known.moved(commands())
     information = known.information(derivatives)
@@ -124,9 +124,9 @@ def _over(moved: Floats, limits: Floats) -> float:
     return math.log(max(1.0, float(np.max(np.abs(moved) / limits))))
 
 
-def _allowed(level: Floats, step: float, gap: int) -> Floats:
+def _allowed(level: Floats, step: float, gap: int) -> NDArray[np.bool_]:
     """Where a hold may be changed by a step, and the one a gap later by as much in the other direction."""
-    there = np.abs(level + step) < LEVELS[-1] + 0.5
+    there: NDArray[np.bool_] = np.abs(level + step) < LEVELS[-1] + 0.5
     if gap:
         there[:-gap] &= np.abs(level[gap:] - step) < LEVELS[-1] + 0.5
         there[-gap:] = False

@@ -60,7 +60,7 @@ class Wanted:
 def design_input(
     model: Identification | Solved, *, like: Run | None = None, duration: float | None = None,
     step: float | None = None, peak: float | Mapping[str, float] | None = None,
-    rate: float | Mapping[str, float] | None = None, limits: Mapping[str, float] | None = None,
+    slew: float | Mapping[str, float] | None = None, limits: Mapping[str, float] | None = None,
     names: Sequence[str] | None = None, criterion: Kind = "D", noise: Mapping[str, float] | None = None,
     period: float | None = None, seed: int = 0, progress: Callable[[int, int], None] | None = None,
 ) -> DesignedInput:  # fmt: skip
@@ -82,7 +82,7 @@ def design_input(
         Of the run [s].
     peak : float or mapping, optional
         Largest size of each input.
-    rate : float or mapping, optional
+    slew : float or mapping, optional
         Fastest change of each input, a second; default none.
     limits : mapping, optional
         Largest size of outputs by name, in the model's units; infinity for none.
@@ -113,7 +113,7 @@ def design_input(
         zones; intervals too wide to design on; an argument that cannot be used, or a limit that cannot be kept.
     """
     wanted = _wanted(
-        model, like, duration, step, peak, rate, limits, names, criterion, noise, period, seed,
+        model, like, duration, step, peak, slew, limits, names, criterion, noise, period, seed,
     )  # fmt: skip
     laid, bounds, goal = wanted.laid, wanted.bounds, wanted.criterion
     course = Course(progress)
@@ -187,7 +187,7 @@ def _tried(wanted: Wanted, known: Sensitivities, spectrum: Spectrum, course: Cou
 
 def _wanted(
     model: Identification | Solved, like: Run | None, duration: float | None, step: float | None,
-    peak: float | Mapping[str, float] | None, rate: float | Mapping[str, float] | None,
+    peak: float | Mapping[str, float] | None, slew: float | Mapping[str, float] | None,
     limits: Mapping[str, float] | None, names: Sequence[str] | None, criterion: str,
     noise: Mapping[str, float] | None, period: float | None, seed: int,
 ) -> Wanted:  # fmt: skip
@@ -207,26 +207,30 @@ def _wanted(
     if free.covariance is None:
         _too_wide(laid, "some of its numbers have infinite intervals", None)
     time = _positive("step", step if step is not None else None if like is None else like.step, "a step [s]")
-    length = _positive("duration", duration if duration is not None else None if like is None else like.duration, "a length [s]")
+    length = _positive(
+        "duration", duration if duration is not None else None if like is None else like.duration, "a length [s]"
+    )
     rows = round(min(length / time, 1e9)) + 1
     if not FEWEST <= rows <= MOST:
         raise ModelError(
             f"duration = {length:g} s in steps of {time:g} s are {rows} rows; give a run of {FEWEST} to {MOST} rows"
         )
+    swings = dict.fromkeys(outputs, math.inf) | ({} if like is None else _largest(like, outputs, moved=True))
     bounds = Bounds(
         by_name("peak", peak, laid.inputs, None if like is None else _largest(like, laid.inputs, moved=False)),
-        by_name("rate", rate, laid.inputs, dict.fromkeys(laid.inputs, math.inf)),
-        by_name("limits", limits, outputs, dict.fromkeys(outputs, math.inf) | ({} if like is None else _largest(like, outputs, moved=True))),
-    )  # fmt: skip
+        by_name("slew", slew, laid.inputs, dict.fromkeys(laid.inputs, math.inf)),
+        by_name("limits", limits, outputs, swings),
+    )
     for name, value in bounds.peaks.items():
         if math.isinf(value):
             raise ModelError(f"peak of {name} is infinite: the louder the better; give what the machine bears")
     ramp = bounds.ramp(time)
     if ramp > rows // 4:
-        slow = min(bounds.rates, key=lambda n: bounds.rates[n] / bounds.peaks[n])
+        slow = min(bounds.slews, key=lambda n: bounds.slews[n] / bounds.peaks[n])
         raise ModelError(
-            f"rate of {slow} = {bounds.rates[slow]:g} a second takes {ramp * time:.3g} s from one peak to the other, of "
-            f"{length:g} s in all: no input of that peak can be kept within it; lower peak=, or raise rate= or duration="
+            f"slew of {slow} = {bounds.slews[slow]:g} a second takes {ramp * time:.3g} s from one peak to the other, "
+            f"of {length:g} s in all: no input of that peak can be kept within it; lower peak=, or raise slew= or "
+            "duration="
         )
     _check_stable(laid, bounds)
     _check_known_enough(laid, time, length)
@@ -242,8 +246,14 @@ def _wanted(
         raise ModelError(f"period = {period:g} s is not between two steps and twice the run; give another one")
     told = () if solved.estimate is None else solved.estimate.warnings
     colour = next((w for w in told if "not white" in w), None)
-    words = () if colour is None or noise is not None else ("predicted for white noise, and of the model it is said: " + colour,)
-    return Wanted(laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, int(seed), words)
+    words = (
+        ()
+        if colour is None or noise is not None
+        else ("predicted for white noise, and of the model it is said: " + colour,)
+    )
+    return Wanted(
+        laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, int(seed), words
+    )
 
 
 def _check_signals(laid: Laid, like: Run | None) -> None:
@@ -252,14 +262,16 @@ def _check_signals(laid: Laid, like: Run | None) -> None:
         raise ModelError("the model has no input, so there is nothing to design; give one with an input")
     if laid.problem.structure.behind_filter:
         raise ModelError(
-            "an input of the model passed its sensor filter, and what a rig is given did not; identify it with the filter "
-            "on outputs alone"
+            "an input of the model passed its sensor filter, and what a rig is given did not; identify it with the "
+            "filter on outputs alone"
         )
-    lacking = [] if like is None else [n for n in laid.inputs if n not in like.inputs]
+    if like is None:
+        return
+    lacking = [n for n in laid.inputs if n not in like.inputs]
     if lacking:
         raise DataError(
-            f"run {like.name if like else ''!r} has no input {lacking[0]!r}{nearest(lacking[0], like.inputs if like else ())}, "
-            "which drives the model; give the run of that machine, or leave like= out"
+            f"run {like.name!r} has no input {lacking[0]!r}{nearest(lacking[0], like.inputs)}, which drives the model; "
+            "give the run of that machine, or leave like= out"
         )
 
 
@@ -310,14 +322,14 @@ def _check_stable(laid: Laid, bounds: Bounds) -> None:
     found = stability(laid.model)
     if found.unstable_poles != 0 or found.on_axis:
         raise ModelError(
-            f"the model is {found}: whatever an experiment begins with grows, and none can be laid out on it; identify the "
-            "machine in a loop that holds it, or check the model"
+            f"the model is {found}: whatever an experiment begins with grows, and none can be laid out on it; identify "
+            "the machine in a loop that holds it, or check the model"
         )
     drifting = [o for o, limit in bounds.swings.items() if math.isinf(limit)]
     if found.origin_order > 0 and drifting:
         raise ModelError(
-            f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift anywhere; say "
-            f"how far it may go, as limits={{'{drifting[0]}': …}} (--limit {drifting[0]}=…), or give like= a run"
+            f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift anywhere; "
+            f"say how far it may go, as limits={{'{drifting[0]}': …}} (--limit {drifting[0]}=…), or give like= a run"
         )
 
 
@@ -334,7 +346,9 @@ def _check_known_enough(laid: Laid, step: float, length: float) -> None:
         _too_wide(laid, f"order {vague[0]}", (step, length))
     rows = min(max(round(length / step), FEWEST), 2000)
     coarse = length / rows
-    probe = np.stack([np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(laid.inputs))])
+    probe = np.stack(
+        [np.where(np.random.default_rng(k).random(rows) < 0.5, -1.0, 1.0) for k in range(len(laid.inputs))]
+    )
     run = laid.run(np.cumsum(probe, axis=1) / math.sqrt(rows) + probe, coarse, "probe")
     rows_of = laid.jacobian(run)
     moved = np.einsum("pt,pq,qt->t", rows_of, spread, rows_of)
@@ -357,9 +371,9 @@ def _too_wide(laid: Laid, why: str, times: tuple[float, float] | None) -> None:
         pass
     band = f"{low:.2g}:{max(high, 2 * low):.2g}"
     raise ModelError(
-        f"the intervals are too wide to design on ({why}): what is best for this model may be bad for the machine. First "
-        f"record a run that shakes all of its band, such as a multisine or a random binary input of {band} Hz (ftlm record "
-        f"--input multisine --band {band}), and identify again from both runs"
+        f"the intervals are too wide to design on ({why}): what is best for this model may be bad for the machine. "
+        f"First record a run that shakes all of its band, such as a multisine of {band} Hz (ftlm record --input "
+        f"multisine --band {band}), and identify again from both runs"
     )
 
 
@@ -386,9 +400,9 @@ def _reached(run: Run, bounds: Bounds) -> tuple[Reached, ...]:
     out = []
     for name, limit in bounds.peaks.items():
         out.append(Reached(name, float(np.max(np.abs(run[name]))), limit))
-        if math.isfinite(bounds.rates[name]):
+        if math.isfinite(bounds.slews[name]):
             fastest = float(np.max(np.abs(np.diff(run[name][:-1], prepend=0.0)))) / run.step
-            out.append(Reached(f"rate of {name}", fastest, bounds.rates[name]))
+            out.append(Reached(f"slew of {name}", fastest, bounds.slews[name]))
     return (*out, *(Reached(o, float(np.max(np.abs(run[o]))), limit) for o, limit in bounds.swings.items()))
 
 

@@ -21,19 +21,19 @@ class Bounds:
     ----------
     peaks
         Largest size of each input.
-    rates
+    slews
         Fastest change of each input, a second; infinite where there is none.
     swings
         Largest size of each output; infinite where there is none.
     """
 
     peaks: Mapping[str, float]
-    rates: Mapping[str, float]
+    slews: Mapping[str, float]
     swings: Mapping[str, float]
 
     def ramp(self, step: float) -> int:
         """Samples over which a change from one peak to the other has to be spread."""
-        return max(1, *(math.ceil(2 * p / (self.rates[n] * step) - 1e-9) for n, p in self.peaks.items()))
+        return max(1, *(math.ceil(2 * p / (self.slews[n] * step) - 1e-9) for n, p in self.peaks.items()))
 
     def scale(self, commands: Floats, moved: Floats) -> float:
         """Factor, at most 1, by which commands within their peaks keep all outputs within theirs; rows by name."""
@@ -72,7 +72,9 @@ def by_name(what: str, given: object, names: Sequence[str], default: Mapping[str
         said = None if given is None else given.get(name)
         if said is None:
             if default is None or name not in default:
-                raise ModelError(f"{what} of {name} is not given; give {what}= a number, or one by name, or like= a run")
+                raise ModelError(
+                    f"{what} of {name} is not given; give {what}= a number, or one by name, or like= a run"
+                )
             out[name] = default[name]
             continue
         value = real_number(f"{what} of {name}", said)

@@ -27,7 +27,7 @@ SHOWN = 6
 
 @dataclass(frozen=True)
 class Reached:
-    """How far a signal of the designed run goes, and how far it may; ``rate`` of an input a second."""
+    """How far a signal of the designed run goes, and how far it may; ``slew`` of an input a second."""
 
     name: str
     largest: float
@@ -70,7 +70,7 @@ class DesignedInput:
         The same of every input that was tried, best first, in the criterion's own measure: of D the volume of the
         ellipsoid of confidence, of E its widest axis to the power of their count.
     reached
-        How far inputs, their rates and outputs go, and may go.
+        How far inputs, their slews and outputs go, and may go.
     spectrum
         The best periodic input in steady state under the same limits.
     efficiency
@@ -152,7 +152,9 @@ class DesignedInput:
             "standard_errors": {k: {n: finite(v) for n, v in e.items()} for k, e in self.errors.items()},
             "gain": finite(self.gain),
             "gains": dict(self.gains),
-            "reached": {r.name: {"largest": r.largest, "limit": finite(r.limit), "binds": r.binds} for r in self.reached},
+            "reached": {
+                r.name: {"largest": r.largest, "limit": finite(r.limit), "binds": r.binds} for r in self.reached
+            },
             "efficiency": finite(self.efficiency),
             "spectrum": {
                 "frequencies": self.spectrum.lines.frequencies.tolist(), "power": self.spectrum.power.tolist(),
@@ -178,11 +180,11 @@ class DesignedInput:
         most, last = self.spectrum.gap, f"{100 * self.efficiency:.0f} %"
         lines += [
             "",
-            f"intervals of the numbers marked *: their product {self.gain:.3g} times smaller than with a {square} of the "
-            "same length and peak",
+            f"intervals of the numbers marked *: their product {self.gain:.3g} times smaller than with a {square} of "
+            "the same length and peak",
             f"limits: {'; '.join(map(str, self.reached))}",
-            f"the best periodic input within them, in steady state, is known to {100 * most:.2g} %: this one has {last} of "
-            "its precision (a start from rest may tell more)",
+            f"the best periodic input within them, in steady state, is known to {100 * most:.2g} %: this one has "
+            f"{last} of its precision (a start from rest may tell more)",
             "tried: " + ", ".join(f"{name} {value:.3g}" for name, value in self.gains[:SHOWN])
             + (f" and {len(self.gains) - SHOWN} more" if len(self.gains) > SHOWN else "")
             + f" (times better than the {square})",

@@ -217,7 +217,7 @@ def _offsets(laid: Laid, step: float, rows: int) -> Floats:
     taken = {*structure.signals, *structure.coefficient_names, *structure.order_names}
     one = next(n for n in (f"one{k}" for k in range(len(taken) + 1)) if not any(t.startswith(n) for t in taken))
     time = step * np.arange(rows + 2)
-    shapes = {f"{one}_{k}": time**k for k in range(drives)}
+    shapes = {f"{one}_{k}": np.asarray(time**k, dtype=np.float64) for k in range(drives)}
     equations = tuple(
         replace(e, terms=(*e.terms, *(Term(s, Order(), f"{s}_{e.output}") for s in shapes)))
         for e in structure.equations
@@ -231,7 +231,10 @@ def _offsets(laid: Laid, step: float, rows: int) -> Floats:
         laid.every,
     )  # fmt: skip
     own = [i for i, n in enumerate(problem.names) if n not in values]
-    return orthonormal(found[own].T, ROUNDING).T
+    # They are told from the second sample on; at the first, a run from rest shows nothing of them.
+    told = found[own].reshape(len(own), len(laid.outputs), rows)
+    told = np.pad(told, ((0, 0), (0, 0), (1, 0)))[..., :rows]
+    return orthonormal(told.reshape(len(own), -1).T, ROUNDING).T
 
 
 def fast_length(least: int) -> int:

@@ -30,7 +30,7 @@ def shapes(spectrum: Spectrum, inputs: int, rows: int, step: float, seed: int) -
     yield "multisine", sines
     yield "binary by multisine", np.where(sines >= 0, 1.0, -1.0)
     low, middle, high = quantiles(spectrum, rows * step)
-    time = step * np.arange(rows)
+    time = np.asarray(step * np.arange(rows), dtype=np.float64)
     sweep = _chirp(time, low, max(high, 1.5 * low))
     signs = np.where(np.arange(inputs) % 2 == 0, 1.0, -1.0)[:, None]
     yield f"chirp {low:.3g} to {max(high, 1.5 * low):.3g} Hz", signs * sweep

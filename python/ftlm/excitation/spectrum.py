@@ -84,7 +84,9 @@ def lines_of(laid: Laid, bounds: Bounds, step: float, rows: int) -> Lines:
     peaks = np.array(list(bounds.peaks.values()))
     swings = np.array(list(bounds.swings.values()))
     weights = 1.0 / np.array([laid.noise[o] for o in laid.outputs])
-    told = np.einsum("oilp,oilq,o->ilpq", slopes, slopes.conj(), weights**2).real * rows * peaks[:, None, None, None] ** 2
+    told = (
+        np.einsum("oilp,oilq,o->ilpq", slopes, slopes.conj(), weights**2).real * rows * peaks[:, None, None, None] ** 2
+    )
     count = len(inputs)
     costs = np.zeros((count + len(swings), count, len(numbers)))
     for k in range(count):
@@ -99,7 +101,7 @@ def lines_of(laid: Laid, bounds: Bounds, step: float, rows: int) -> Lines:
 
 
 def _responses(laid: Laid, w: Floats, step: float) -> tuple[Complex, Complex]:
-    """Responses of the outputs to held inputs, and their derivatives: (outputs, inputs, W, numbers), without numbers."""
+    """Derivatives of the outputs' responses to held inputs, (outputs, inputs, W, numbers), and the responses."""
     held = np.exp(-0.5j * w * step) * np.sinc(w * step / (2 * math.pi))
     gains = frequency_response(laid.model, w)
     coupling = laid.problem.structure.coupling
@@ -108,7 +110,11 @@ def _responses(laid: Laid, w: Floats, step: float) -> tuple[Complex, Complex]:
     chain = laid.problem.number_jacobian(orders, coefficients)
     values = model_numbers(own)
     # What drives an equation is measured, or follows with it.
-    drives = gains if coupling == "simulated" else np.concatenate([gains, np.tile(np.eye(len(laid.inputs))[..., None], w.size)])
+    drives = (
+        gains
+        if coupling == "simulated"
+        else np.concatenate([gains, np.tile(np.eye(len(laid.inputs))[..., None], w.size)])
+    )
     signals = laid.inputs if coupling == "simulated" else (*laid.outputs, *laid.inputs)
     slopes = np.zeros((*gains.shape, len(laid.names)), dtype=np.complex128)
     for k, value in enumerate(values):
@@ -143,7 +149,7 @@ def best_spectrum(lines: Lines, criterion: Criterion) -> Spectrum:
 
     With a price for each limit the problem is one of weights that sum to one, which Titterington's multiplicative
     algorithm solves (doi:10.1214/aos/1176343787); whatever the prices, its optimum is above that of the limits
-    themselves, and Kiefer & Wolfowitz's theorem says how far from it a design is at most. Prices follow what is used up.
+    themselves, and Kiefer & Wolfowitz's theorem says how far from it a design is at most. Prices follow what is used.
     """
     limits, points = lines.costs.shape
     price = np.full(limits, 1.0 / limits)

@@ -64,7 +64,9 @@ def problem_of(model: Solved) -> tuple[FreeProblem, list[float]]:
     lacking = [n for n in known.names if n not in values]
     count = sum(1 + len(e.terms) for e in model.equations)
     if lacking or len(known.orders) != count:
-        what = f"no value of {lacking[0]}" if lacking else f"{len(known.orders)} orders where its equations have {count}"
+        what = (
+            f"no value of {lacking[0]}" if lacking else f"{len(known.orders)} orders where its equations have {count}"
+        )
         raise ModelError(f"what the model says of its fit has {what}; identify it again")
     laws = iter(known.orders)
     equations = []
