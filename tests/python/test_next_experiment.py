@@ -156,8 +156,6 @@ def test_any_input_follows_from_what_one_sample_does(laid: Laid) -> None:
 
 
 def test_lines_are_what_a_period_says_that_was_there_long_before(laid: Laid) -> None:
-    if laid.problem.structure.offset == "ramp":
-        pytest.skip("what a period says beside a ramp depends on the ramp's length")
     rows, periods = 64, 12
     bounds = Bounds(
         dict.fromkeys(laid.inputs, 0.7), dict.fromkeys(laid.inputs, math.inf), dict.fromkeys(laid.outputs, 1.0)
@@ -383,7 +381,7 @@ def test_laws_of_orders_and_coefficients_come_back_from_a_file(tmp_path: Path) -
     ftlm.Model(replace(named, initial="rest"), model.orders, estimate=estimate).save(tmp_path / "a.json")
     laid = Laid.of(ftlm.load_model(tmp_path / "a.json"), noise)
     errors = dict(zip(laid.names, np.sqrt(np.diag(laid.predicted(clean))).tolist(), strict=True))
-    assert errors == pytest.approx(plants.CRAMER_RAO_40_DB["A"], rel=0.13)
+    assert errors == pytest.approx(plants.CRAMER_RAO_40_DB["A"], rel=0.15)
 
 
 # -------------------------------------------------------------------------------------------------- what is refused
@@ -514,7 +512,7 @@ def test_a_rig_takes_what_is_written(tmp_path: Path) -> None:
     known = ftlm.identify(run, structure, threads=1, intervals="quadratic", start=start)
     made = ftlm.design_input(known, duration=3.0, limits={"theta11": 0.3})
     made.save(tmp_path / "next.csv")
-    recorded = ftlm.rig.record(input="csv", file=tmp_path / "next.csv", rate=50.0, duration=run.duration)
+    recorded = ftlm.rig.record(input="csv", file=tmp_path / "next.csv", rate=50.0, duration=made.run.duration)
     assert recorded["I1"][:-1] == pytest.approx(made.run["I1"][:-1], abs=1e-3)
     with pytest.raises(ftlm.DataError, match="exists"):
         made.save(tmp_path / "next.csv")

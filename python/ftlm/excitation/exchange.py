@@ -57,7 +57,7 @@ def exchanged(
     begin: Design, hold: int, known: Sensitivities, criterion: Criterion, bounds: Bounds,
     stopped: Callable[[], None] = lambda: None,
 ) -> Design:  # fmt: skip
-    """Fedorov's exchange (doi:10.1016/B978-0-12-252350-0.50001-9) of the holds of an input, one or two at a time.
+    """Fedorov's exchange (Theory of Optimal Experiments, 1972) of the holds of an input, one or two at a time.
 
     The information is quadratic in the commands, so that what every exchange comes to follows from convolutions, and is
     exact. The best one that the limits bear is made, until none adds anything: no change of one hold is better, nor one

@@ -61,7 +61,7 @@ def multisine(spectrum: Spectrum, inputs: int, rows: int, step: float, rng: np.r
     """A sum of sines with the powers of a spectrum, of size 1, phases such that its crest is low.
 
     Schroeder's phases (doi:10.1109/TIT.1970.1054411) for a start; then its peaks are cut and its spectrum is put back,
-    time and again (Van der Ouderaa et al., doi:10.1109/19.9806).
+    time and again (Van der Ouderaa, Schoukens & Renneboog, 1988).
     """
     points = len(spectrum.power)
     of_input = np.argmax(spectrum.lines.costs[:inputs] > 0, axis=0) if points else np.zeros(0, int)

@@ -148,7 +148,7 @@ def best_spectrum(lines: Lines, criterion: Criterion) -> Spectrum:
     """The best share of power of each line under all limits.
 
     With a price for each limit the problem is one of weights that sum to one, which Titterington's multiplicative
-    algorithm solves (doi:10.1214/aos/1176343787); whatever the prices, its optimum is above that of the limits
+    algorithm solves (Silvey, Titterington & Torsney, 1978); whatever the prices, its optimum is above that of limits
     themselves, and Kiefer & Wolfowitz's theorem says how far from it a design is at most. Prices follow what is used.
     """
     limits, points = lines.costs.shape
