@@ -111,6 +111,7 @@ def main() -> None:
     print("\n".join(lines))
     if arguments.write:
         append(lines)
+        every = [{k: v for k, v in r.items() if k not in ("correlated", "names")} for r in every]
         shown = {"commit": commit(), "machine": machine(), "cores": os.cpu_count(), "seeds": every}
         SHOWN.write_text(json.dumps(shown) + "\n", encoding="utf-8")
 
