@@ -329,7 +329,7 @@ def _check_stable(laid: Laid, bounds: Bounds) -> None:
     if found.origin_order > 0 and drifting:
         raise ModelError(
             f"the model integrates its input (order {found.origin_order:g}), so that {drifting[0]} may drift anywhere; "
-            f"say how far it may go, as limits={{'{drifting[0]}': …}} (--limit {drifting[0]}=…), or give like= a run"
+            "say how far it may go by limits= (--limit), or give like= a run"
         )
 
 
