@@ -43,6 +43,7 @@ def draw(folder: Path) -> None:
         "landscape": ftlm.plot.landscape(searched),
         "unseen": unseen(),
     }
+    drawn["next-experiment"] = next_experiment(folder)
     for name, figure in (drawn | performance() | moves() | {"boxes": boxes()}).items():
         figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
 
@@ -148,6 +149,53 @@ def moves() -> dict[str, Figure]:
         plot.set_xlabel("stiffness of link 1, times", fontsize=7)
         plot.set_ylabel("delay of the angles [ms]", fontsize=7)
     return {"control-move": move, "control-plants": figure}
+
+
+def next_experiment(folder: Path) -> Figure:
+    """Intervals of Plant A's orders after a designed run, from what the bench wrote; beside it writes their table."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
+
+    measured = json.loads((Path(__file__).parent / "next_experiment.json").read_text(encoding="utf-8"))
+    seeds = measured["seeds"]
+    orders = ("alpha1", "alpha2", "gamma1", "beta2", "mu2")
+
+    def ratios(name: str) -> tuple[list[float], list[float]]:
+        before = [s["predicted"]["now"][name] for s in seeds]
+        found = [b / s["found"][name] for b, s in zip(before, seeds, strict=True)]
+        told = [b / s["predicted"]["designed"][name] for b, s in zip(before, seeds, strict=True)]
+        return found, told
+
+    found, told = (np.array([ratios(n)[k] for n in orders]) for k in (0, 1))
+    rows = [[n, *(f"{np.median(v[i]):.2f}" for v in (told, found)), f"{found[i].min():.2f} to {found[i].max():.2f}"]
+            for i, n in enumerate(orders)]  # fmt: skip
+    both = [np.prod(v, axis=0) for v in (told, found)]
+    rows.append(["product of all five", *(f"{np.median(v):.1f}" for v in both),
+                 f"{both[1].min():.1f} to {both[1].max():.1f}"])  # fmt: skip
+    head = ["", "predicted (median)", f"found (median of {len(seeds)} seeds)", "found, least to most"]
+    lines = ["Intervals after the square over intervals after the designed run:", ""]
+    lines += [f"| {' | '.join(row)} |" for row in (head, ["---"] * 4, *rows)]
+    (folder / "next_experiment.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    first = seeds[0]
+    time = 0.002 * np.arange(len(first["input"]))
+    figure = Figure(figsize=(7, 5.6), layout="constrained")
+    figure.suptitle("commit {commit}, {machine}".format(**measured), fontsize="small")
+    current, hub, bars = figure.subplots(3, 1)
+    square = np.where((np.arange(time.size) % 1000) < 500, 0.3, -0.3)
+    current.plot(time, square, "C1", linewidth=0.9, drawstyle="steps-post", label="the paper's square")
+    current.plot(time, first["input"], "C0", linewidth=1, drawstyle="steps-post", label="designed")
+    current.set(xlabel="time [s]", ylabel="current [A]")
+    current.legend(fontsize="small", ncols=2, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    hub.plot(time[::10], first["angles"]["theta11"], "C0", linewidth=1)
+    for side in (-1, 1):
+        hub.axhline(side * first["allowed"]["theta11"], color="0.5", linestyle=":", linewidth=0.8)
+    hub.set(xlabel="time [s]", ylabel="hub angle [rad]")
+    bars.plot(np.arange(5), np.median(told, axis=1), "C0_", markersize=28, label="predicted")
+    for k in range(5):
+        bars.plot(np.full(len(seeds), k), found[k], "C0.", alpha=0.5, label="found" if k == 0 else None)
+    bars.axhline(1.0, color="C1", linewidth=0.9, label="the paper's square")
+    bars.set(xticks=range(5), xticklabels=orders, ylabel="times smaller", ylim=(0.8, None))
+    bars.legend(fontsize="small", ncols=3)
+    return figure
 
 
 def unseen() -> Figure:

@@ -1,8 +1,8 @@
 """Fractional-order models of flexible machines from measured data.
 
 Names are imported when they are first asked for: all of them together take longer than numpy does. Where each lives is
-the way of a measurement: data, files, solve, judge, fit, model, search, identification, selection, and beside it arm,
-rig, paper.
+the way of a measurement: data, files, solve, judge, fit, model, search, identification, selection, excitation, and
+beside it arm, rig, paper.
 """
 
 import importlib as _importlib
@@ -23,6 +23,8 @@ if _typing.TYPE_CHECKING:
     from ftlm.data.run import Run
     from ftlm.data.solved import Estimate
     from ftlm.data.structures import SensorFilter, Structure
+    from ftlm.excitation.experiment import design_input
+    from ftlm.excitation.result import DesignedInput
     from ftlm.files.layout import Assumption, Layout
     from ftlm.files.load import load
     from ftlm.files.opened import FileColumn, OpenedFile, open_file
@@ -63,18 +65,17 @@ if _typing.TYPE_CHECKING:
 
 __all__ = [
     "PARAMETERS", "Agreement", "Assumption", "Comparison", "ConvergenceError", "CorrelationTest", "DataError",
-    "Difference", "Equation", "Estimate", "FeedbackTest", "FileColumn", "FrequencyData", "FrequencyIdentification",
-    "FrequencyValidation", "Friction", "FtlmError", "Genetic", "Identification", "Identified",
-    "InformationCriteria", "InternalError", "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError",
+    "DesignedInput", "Difference", "Equation", "Estimate", "FeedbackTest", "FileColumn", "FrequencyData",
+    "FrequencyIdentification", "FrequencyValidation", "Friction", "FtlmError", "Genetic", "Identification",
+    "Identified", "InformationCriteria", "InternalError", "Lattice", "Layout", "LinkParameters", "Metrics", "Model", "ModelError",
     "OpenedFile", "Order", "OutputResiduals", "PhysicalParameter", "ProfileInterval", "Reproduction", "Residuals",
     "RigFault", "Run", "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck",
-    "Structure", "Term", "Trace", "Trial", "Validation", "Verdict", "__version__", "agreement",
-    "block_pulse_matrix", "compare", "energies", "equation", "explicit_euler", "flexible_link",
-    "fractional_derivative", "fractional_integral", "haar_inverse", "haar_matrix", "haar_transform", "identify",
-    "identify_frequency", "identify_many", "information_criteria", "lattice", "link_model", "load",
-    "load_frequency", "load_model", "metrics", "multi_innovation_trace", "open_file", "operational_matrix",
-    "order_law", "physical_parameters", "reproduce", "resid", "resume_search", "rig", "search_orders",
-    "search_status", "select", "simulate",
+    "Structure", "Term", "Trace", "Trial", "Validation", "Verdict", "__version__", "agreement", "block_pulse_matrix",
+    "compare", "design_input", "energies", "equation", "explicit_euler", "flexible_link", "fractional_derivative",
+    "fractional_integral", "haar_inverse", "haar_matrix", "haar_transform", "identify", "identify_frequency",
+    "identify_many", "information_criteria", "lattice", "link_model", "load", "load_frequency", "load_model", "metrics",
+    "multi_innovation_trace", "open_file", "operational_matrix", "order_law", "physical_parameters", "reproduce",
+    "resid", "resume_search", "rig", "search_orders", "search_status", "select", "simulate",
 ]  # fmt: skip
 
 #: Where each name lives.
@@ -94,6 +95,8 @@ _HOMES = {
         "data.run": "Run",
         "data.solved": "Estimate",
         "data.structures": "SensorFilter Structure",
+        "excitation.experiment": "design_input",
+        "excitation.result": "DesignedInput",
         "files.layout": "Assumption Layout",
         "files.load": "load",
         "files.opened": "FileColumn OpenedFile open_file",

@@ -9,7 +9,7 @@ import re
 #: From the ground up; folders on one storey do not import each other. What is public lies on top of all.
 STOREYS = (
     ("base",), ("paint",), ("data",), ("files", "solve"), ("judge", "fit"), ("model",), ("search", "arm"),
-    ("identification", "rig"), ("selection", "paper", "control"), ("report", "app"), ("cli",), (".",),
+    ("identification", "rig"), ("selection", "paper", "control", "excitation"), ("report", "app"), ("cli",), (".",),
 )  # fmt: skip
 LEVEL = {folder: level for level, folders in enumerate(STOREYS) for folder in folders}
 #: What a function may import for itself: what need not be installed, is slow to start, or is there on one system only.

@@ -208,7 +208,7 @@ def test_terminal_json_frame_page_and_file_say_the_same(found: ftlm.Identificati
     assert "by profile likelihood" in page
     assert "−∞" in page
     found.model.save(tmp_path / "model.json")
-    assert json.loads((tmp_path / "model.json").read_text())["schema"] == 4
+    assert json.loads((tmp_path / "model.json").read_text())["schema"] == 8
     read = ftlm.load_model(tmp_path / "model.json")
     assert read.estimate is not None
     assert read.estimate.intervals["c"] == (None, own.high)
@@ -221,7 +221,7 @@ def test_what_has_no_profile_is_written_as_before(bent: ftlm.Run, tmp_path: Path
     assert "profile likelihood" not in str(plain)
     plain.model.save(tmp_path / "model.json")
     written = json.loads((tmp_path / "model.json").read_text())
-    assert written["schema"] == 2
+    assert written["schema"] == 8
     assert "intervals" not in written["estimate"]
     low, high = plain.intervals["c"]
     assert high - low == pytest.approx(2 * 1.959964 * plain.standard_errors["c"])

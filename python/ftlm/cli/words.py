@@ -24,6 +24,8 @@ OPTIONS = {
     "encoding": "--encoding", "separator": "--separator", "decimal": "--decimal", "skip": "--skip",
     "weights": "--weights", "frequency_unit": "--frequency-unit", "magnitude_unit": "--magnitude-unit",
     "phase_unit": "--phase-unit", "negated": "--negated",
+    "duration": "--duration", "peak": "--peak", "slew": "--slew", "limits": "--limit", "names": "--for",
+    "noise": "--noise", "period": "--period", "like": "--like",
     "header": "--header", "dates": "--dates", "sheet": "--sheet",
 }  # fmt: skip
 #: ``force=True (--force)``, where the option stands beside the argument already.

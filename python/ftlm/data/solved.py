@@ -15,6 +15,33 @@ from ftlm.data.equations import Equation
 from ftlm.data.structures import Structure, check_decided
 
 
+class Freedom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What was free in a joint fit and how well it was told, so that another experiment can be laid out from a file.
+
+    Parameters
+    ----------
+    names
+        Free orders, free coefficients, then delays and limits of inputs.
+    orders
+        Every order of the model as it depends on free ones, in words: equation by equation alpha, then each term's.
+    products
+        Coefficients that follow from others by a law: sign and factors by name.
+    covariance
+        Of the free numbers in the order of their names; None where it is not finite.
+    noise
+        Standard deviation of what the free run left of each output, as it was measured, by name.
+    refinement
+        Pulses a sample interval of the fit's finest grid.
+    """
+
+    names: tuple[str, ...]
+    orders: tuple[str, ...]
+    noise: dict[str, float]
+    products: dict[str, tuple[float, tuple[str, ...]]] = {}
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    refinement: int = 1
+
+
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is known about how a model was identified, kept with it so that a report needs no other file.
 
@@ -39,6 +66,8 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     intervals
         95 % intervals by profile likelihood, of the values that have one; None for an end that is infinite. Those of
         the others are ± 1.96 standard errors. Not set where no value has one.
+    free
+        What a joint fit found together, from which the next experiment is laid out. Not set for other methods.
     """
 
     method: str
@@ -50,6 +79,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     information: dict[str, float | None] = {}
     warnings: tuple[str, ...] = ()
     intervals: dict[str, tuple[float | None, float | None]] | UnsetType = UNSET
+    free: Freedom | UnsetType = UNSET
 
 
 @dataclass(frozen=True)

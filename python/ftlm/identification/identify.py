@@ -19,6 +19,7 @@ from ftlm.data.settings import INTERVALS, LOSSES, METHODS, Intervals, Loss, Sett
 from ftlm.data.several import as_runs
 from ftlm.data.solved import Estimate, Solved
 from ftlm.data.structures import Structure, check_offset
+from ftlm.fit.freedom import freedom
 from ftlm.fit.genetic import Genetic
 from ftlm.identification.estimate import Fit, by_genetic_algorithm, by_lattice, by_output_error
 from ftlm.identification.judged import Task
@@ -282,4 +283,5 @@ def _estimate(
         information={} if criteria is None else {n: finite(getattr(criteria, n)) for n in ("aic", "aicc", "bic")},
         warnings=warnings,
         intervals=profiles or UNSET,
+        free=UNSET if joint is None else freedom(joint, fit.task.structure),
     )

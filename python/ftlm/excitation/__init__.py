@@ -1,0 +1,1 @@
+"""The next experiment: which input would tell the numbers of an identified model best."""
