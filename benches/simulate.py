@@ -17,7 +17,7 @@ from scipy.signal import lsim
 import ftlm
 import results
 from ftlm.identification import estimate, identify, offsets
-from ftlm.solve.sampled import refined
+from ftlm.solve.refined import refined
 
 ROWS, STEP = 2300, 0.01
 #: Words, and state space of y from u where orders are whole.

@@ -88,7 +88,10 @@ impl<'a> System<'a> {
                 match unknown {
                     Some(j) => matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v),
                     None => {
-                        let integral = series::multiply(kernel, record.signal(term.signal), m);
+                        // Of a single sample, only that: nothing is to be transformed then.
+                        let signal = record.signal(term.signal);
+                        let last = signal.iter().rposition(|v| *v != 0.0).map_or(0, |k| k + 1);
+                        let integral = series::multiply(kernel, if last <= FEW { &signal[..last] } else { signal }, m);
                         rhs[i].iter_mut().zip(integral).for_each(|(b, v)| *b += c * v);
                     }
                 }
@@ -187,6 +190,9 @@ impl<'a> System<'a> {
         series::solve(&self.matrix, &borrowed)
     }
 }
+
+/// Pulses of a signal that ends in zeros which a product takes one by one.
+const FEW: usize = 64;
 
 /// Free run: pulse means of the outputs of `equations`, driven by the record's other signals.
 ///

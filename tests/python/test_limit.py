@@ -9,7 +9,8 @@ from scipy.signal import lsim
 import ftlm
 from ftlm.base.statistics import triangle
 from ftlm.solve.limit import Limit, extrapolated
-from ftlm.solve.sampled import FIRST_REFINEMENT, refined, sampled
+from ftlm.solve.refined import refined
+from ftlm.solve.sampled import FIRST_REFINEMENT, sampled
 
 TRUTH = np.random.default_rng(0).standard_normal((1, 200))
 SHAPES = list(np.random.default_rng(1).standard_normal((3, 1, 200)))

@@ -242,9 +242,9 @@ class Grid:
         """An attempt with its residuals and its cost on this grid, without derivatives."""
         return self.descend(attempt, 0)
 
-    def lowest(self, attempt: Attempt, evaluations: int) -> Attempt:
-        """Descend in logarithmic coordinates, then in plain ones, which may cross zero."""
-        first = self.descend(attempt, evaluations)
+    def lowest(self, attempt: Attempt, evaluations: int, *, ended: bool = False) -> Attempt:
+        """Descend in logarithmic coordinates, unless it ended there, then in plain ones, which may cross zero."""
+        first = attempt if ended else self.descend(attempt, evaluations)
         second = self.descend(first, evaluations, plain=True)
         return second if second.outcome["cost"] <= first.outcome["cost"] else first
 

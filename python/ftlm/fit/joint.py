@@ -7,6 +7,7 @@ until it no longer matters, and turns the optimum into numbers with intervals.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -231,7 +232,10 @@ def fit_output_error(
     # Where a step passes faster than the samples see, a grid as coarse as the samples has an optimum of its own.
     while weighed.every < FINEST and weighed.matters(contenders[0]):
         weighed = weighed.finer
-    best = weighed.descend(winner(contenders, replace(alike, every=weighed.every)), LAST_LAP)
+    best = winner(contenders, replace(alike, every=weighed.every))
+    if len(outputs) > 1:
+        # Of one output the noise does not move the optimum.
+        best = weighed.descend(best, LAST_LAP)
     course.at(0.65)
     best, weighed = with_settled_weights(best, weighed, loss)
     course.at(0.75)
@@ -271,7 +275,8 @@ def winner(contenders: Sequence[Attempt], near: Grid) -> Attempt:
             # No finite free run on this grid; the others have one.
             if attempt is contenders[-1] and not ends:
                 raise
-    return near.lowest(near.finer.ranked(ends)[0] if len(ends) > 1 else ends[0], LAST_LAP)
+    best = near.finer.ranked(ends)[0] if len(ends) > 1 else ends[0]
+    return near.lowest(best, LAST_LAP, ended=best.converged)
 
 
 def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -> tuple[Attempt, Grid]:
@@ -303,9 +308,15 @@ def refined(best: Attempt, grid: Grid, loss: Loss = "squares") -> Optimum:
     """Halve the step until that moves the estimate by little of its standard error."""
     estimate, settled = best.values, False
     clock = Clock.of(grid.problem, grid.runs)
+    before: Attempt | None = None
     while not settled and grid.every < FINEST:
         # On a finer grid residuals may shrink to their noise, so weights follow anew.
-        finer, grid = with_settled_weights(best, grid.finer, loss)
+        try:
+            finer, fine_grid = with_settled_weights(expected(grid.problem, clock, best, before), grid.finer, loss)
+        except FtlmError:
+            # Where two grids point there may be no free run.
+            finer, fine_grid = with_settled_weights(best, grid.finer, loss)
+        grid = fine_grid
         errors = clock.errors(finer.values, covariance(finer, grid))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
         # Of a flat valley in which neither stood still, or of two fits that a wall stopped, they tell nothing.
@@ -317,22 +328,42 @@ def refined(best: Attempt, grid: Grid, loss: Loss = "squares") -> Optimum:
         ways = (limit, estimate), (finer.values, best.values)
         moved = [np.abs(clock.told(one) - clock.told(other)) for one, other in ways]
         settled = any(bool(np.all(way <= REFINED * errors)) for way in moved)
-        best, estimate = finer, limit
-    return Optimum(best, grid, nearer(best, grid, estimate, clock), settled)
+        before, best, estimate = best, finer, limit
+    return Optimum(best, grid, nearer(best, grid, estimate, clock, settled=settled), settled)
 
 
-def nearer(best: Attempt, grid: Grid, limit: Floats, clock: Clock) -> Floats:
+def expected(problem: FreeProblem, clock: Clock, best: Attempt, before: Attempt | None) -> Attempt:
+    """Where to begin on half the step: what moved the optimum from the last grid to this moves it a quarter as far."""
+    if before is None or not (best.converged and before.converged):
+        return best
+    fine, coarse = clock.told(best.values), clock.told(before.values)
+    return at_values(best, problem, clock.untold(feasible(problem, fine, fine + (fine - coarse) / 4.0)))
+
+
+def at_values(attempt: Attempt, problem: FreeProblem, values: Floats) -> Attempt:
+    """An attempt at other values."""
+    orders, coefficients, inputs = problem.split(values.tolist())
+    return replace(attempt, orders=orders, coefficients=coefficients, inputs=inputs)
+
+
+def nearer(best: Attempt, grid: Grid, limit: Floats, clock: Clock, *, settled: bool) -> Floats:
     """What is nearer to the truth on half the step, the limit that two grids tell or the optimum of the finer one.
 
     Along the bottom of a flat and curved valley, where numbers cannot be told apart, a straight line leads out of it.
+    Where the residuals follow it there is none, and a limit on which grids agree is nearer.
     """
     columns = np.asarray(best.outcome["jacobian"]).T
     way = clock.step(best.values, clock.told(limit) - clock.told(best.values))
     if float(np.sum((columns @ way) ** 2)) <= REFINED**2:
         # Both leave the same.
         return limit
-    orders, coefficients, inputs = grid.problem.split(limit.tolist())
-    ahead = replace(best, orders=orders, coefficients=coefficients, inputs=inputs)
+    ahead = at_values(best, grid.problem, limit)
+    if settled:
+        with contextlib.suppress(FtlmError):
+            told = np.asarray(best.outcome["residuals"]) + columns @ way
+            bent = np.linalg.norm(np.asarray(grid.evaluated(ahead).outcome["residuals"]) - told)
+            if bent <= REFINED * np.linalg.norm(columns @ way):
+                return limit
     costs = []
     for attempt in (ahead, best):
         try:

@@ -24,7 +24,8 @@ from ftlm.paint.text import Cell, Exact, symbol_html
 from ftlm.solve.free_run import compared, respond
 from ftlm.solve.instants import compared_times
 from ftlm.solve.records import Record, check_m, default_m, equation_tuple, records, whole
-from ftlm.solve.sampled import Sampled, initial_exponents, measured_samples, refined
+from ftlm.solve.refined import refined
+from ftlm.solve.sampled import Sampled, initial_exponents, measured_samples
 
 #: Own-output orders closer to alpha than this make I^(alpha - nu) nearly the identity on smooth signals.
 NEAR_IDENTITY = 0.25
@@ -36,7 +37,7 @@ LOST = 20.0
 USELESS = 0.5
 #: Free runs are refined until halving the step moves them by less than this share of their largest value,
 STILL = 1e-6
-#: or to so many pulses; what still moves by more than VISIBLE then is said.
+#: or to so many pulses, four an interval at least; what still moves by more than VISIBLE then is said.
 LARGEST_M = 1 << 20
 VISIBLE = 1e-3
 
@@ -181,7 +182,7 @@ def compare(model: Solved, runs: Run | Sequence[Run], *, m: int | None = None) -
 
 def free_runs(model: Solved, runs: Sequence[Run]) -> list[Sampled]:
     """The free run on each run, with initial terms fitted to it, on a grid fine enough not to matter."""
-    return [refined(model, run, None, tolerance=STILL, largest_m=max(LARGEST_M, 2 * run.length)) for run in runs]
+    return [refined(model, run, None, tolerance=STILL, largest_m=max(LARGEST_M, 4 * run.length)) for run in runs]
 
 
 def compared_samples(model: Solved, runs: Runs, free: Sequence[Sampled], *, m: int) -> Comparison:

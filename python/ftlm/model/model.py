@@ -46,7 +46,7 @@ class Model(Solved):
 
     def simulate(
         self, run: Run, *, tolerance: float = 1e-6, initial: Mapping[str, Mapping[float, float]] | None = None,
-        largest_m: int = 1 << 21,
+        largest_m: int = 1 << 22,
     ) -> Run:  # fmt: skip
         """Free run on a run's inputs; see :func:`ftlm.simulate`."""
         return simulate(self, run, tolerance=tolerance, initial=initial, largest_m=largest_m)

@@ -15,7 +15,7 @@ from ftlm.data.run import Run
 from ftlm.data.solved import Solved, check_solved
 from ftlm.data.structures import check_initial
 from ftlm.solve.records import MAX_M, Record, acting, equation_tuple, records, sensor_series
-from ftlm.solve.sampled import refined
+from ftlm.solve.refined import refined
 
 
 def compared(runs: Sequence[Run], model: Solved, m: int) -> list[Record]:
@@ -64,7 +64,7 @@ def simulate(
     *,
     tolerance: float = 1e-6,
     initial: Mapping[str, Mapping[float, float]] | None = None,
-    largest_m: int = 1 << 21,
+    largest_m: int = 1 << 22,
 ) -> Run:
     """Point samples of a model's outputs on a run's inputs, at the run's instants.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +18,11 @@ POWERS = (2, 3, 4)
 SEEN = 0.5
 
 
+def _moved(new: Floats, old: Floats) -> Floats:
+    moved, size = np.max(np.abs(new - old), axis=1), np.max(np.abs(new), axis=1)
+    return np.asarray(np.where(moved == 0.0, 0.0, moved / size))
+
+
 @dataclass
 class Limit:
     """What grids of 1, 1/2, 1/4, … of a step say together; samples have the shape (outputs, N).
@@ -28,11 +33,14 @@ class Limit:
         Of the last grids, finest last: the samples, and those with one power of the step after another taken away.
     moved
         By which share of its largest value halving the step moved each output in each of these columns, for the last
-        two halvings; the first of a column is infinite.
+        two halvings; infinite for the samples themselves.
+    measure
+        That share, of samples on a grid and on the one before.
     """
 
     rows: list[list[Floats]] = field(default_factory=list)
     moved: list[list[Floats]] = field(default_factory=list)
+    measure: Callable[[Floats, Floats], Floats] = _moved
 
     def add(self, samples: Floats) -> None:
         """The samples on the next grid; a grid without finite numbers tells nothing, and everything begins anew."""
@@ -40,7 +48,9 @@ class Limit:
         both = bool(before) and bool(np.all(np.isfinite(before[0])) and np.all(np.isfinite(samples)))
         row = extrapolated(samples, before if both else [])
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-            moved = [_moved(new, old) for new, old in zip(row, before, strict=False)]
+            # Nobody asks for the samples themselves: what was taken away moves less.
+            moved = [unknown(samples.shape[0])] * min(len(row), len(before))
+            moved[1:] = [self.measure(new, old) for new, old in zip(row[1:], before[1:], strict=False)]
         self.rows = [*self.rows, row][-2:]
         self.moved = [*self.moved, moved][-2:]
 
@@ -51,8 +61,7 @@ class Limit:
         Infinite before there were three grids.
         """
         row, last = self.rows[-1], self.moved[-1]
-        unknown: Floats = np.full(row[0].shape[0], np.inf)
-        found: tuple[int, Floats] = (len(row) - 1 if len(row) <= 2 else 1, unknown)
+        found: tuple[int, Floats] = (len(row) - 1 if len(row) <= 2 else 1, unknown(row[0].shape[0]))
         for column in range(1, len(last)):
             told = [(column, last[column])]
             before = self.moved[0][column] if len(self.moved) > 1 and column < len(self.moved[0]) else None
@@ -75,9 +84,9 @@ def extrapolated(fine: Floats, coarse: Sequence[Floats]) -> list[Floats]:
     return row
 
 
-def _moved(new: Floats, old: Floats) -> Floats:
-    moved, size = np.max(np.abs(new - old), axis=1), np.max(np.abs(new), axis=1)
-    return np.asarray(np.where(moved == 0.0, 0.0, moved / size))
+def unknown(outputs: int) -> Floats:
+    """The change of outputs of which nothing is known."""
+    return np.full(outputs, np.inf)
 
 
 def _known(change: Floats) -> Floats:

@@ -22,9 +22,8 @@ from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Offset, SensorFilter, Structure, offset_exponents
 from ftlm.solve.friction import begun, motion_with_friction
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
-from ftlm.solve.limit import Limit, extrapolated
 from ftlm.solve.motion import decided, misfit, missed, needed
-from ftlm.solve.records import MAX_M, Record, acting, equation_tuple, record, sensor_series
+from ftlm.solve.records import Record, acting, equation_tuple, record, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
 #: least from which a sample follows that no jump of a held input at its instant has reached.
@@ -83,58 +82,6 @@ def initial_exponents(item: Equation, initial: Initial, offset: Offset, states: 
     return sorted(found | {e for e in left if e == 0.0 or all(abs(e - o) > STAND_IN for o in found)})
 
 
-def refined(
-    model: Solved, run: Run, initial: Terms | None, *, tolerance: float, largest_m: int = MAX_M, on_grid: bool = False
-) -> Sampled:
-    """Samples on grids refined, and extrapolated in the step, until they stand still or the pulses run out.
-
-    Parameters
-    ----------
-    initial
-        Coefficients of initial terms by output and exponent; None: those that bring the run closest to the measured
-        outputs, each weighted by its own deviation.
-    tolerance
-        Change, as a share of each output's largest value, at which refinement ends.
-    on_grid
-        Whether the instants are those of the run's grid although its rows have times of their own.
-    """
-    own = run.length - 1
-    every = FIRST_REFINEMENT
-    if initial is None and model.structure.has_friction:
-        # Level and velocity at the start are found by descent, whose ends scatter by more than steps move them.
-        rec = record(run, model.structure, FRICTION_REFINEMENT * own, filtered=False)
-        initial = begun_terms(model, begun(model, run, rec, FRICTION_REFINEMENT))
-    elif initial is None:
-        model = started(model, run)
-    times = run.time if on_grid and has_own_times(run, model.structure) else own_times(model, run)
-    limit, rows = Limit(), list[list[Floats]]()
-    terms: Terms = {}
-    best: Floats = np.zeros(0)
-    change: Floats = np.zeros(0)
-    lost = 0
-    while True:
-        last = 2 * every * own > largest_m
-        samples, terms = _tried(model, run, every, initial, times, last=lost == 1)
-        finite = bool(np.all(np.isfinite(samples)))
-        limit.add(samples)
-        column, change = limit.best
-        best = limit.rows[-1][column]
-        flat: Floats = np.array([v for powers in terms.values() for v in powers.values()])
-        rows = [extrapolated(flat, rows[-1] if len(limit.rows[-1]) > 1 else [])]
-        # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
-        lost = 0 if finite or every == FIRST_REFINEMENT else lost + 1
-        if last or lost == 2 or np.all(change <= tolerance):
-            break
-        every *= 2
-    return Sampled(best, _like(terms, rows[-1][column]), every, change)
-
-
-def _like(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
-    """Initial terms of these outputs and exponents with other values."""
-    left = iter(values.tolist())
-    return {o: {e: next(left) for e in powers} for o, powers in terms.items()}
-
-
 def begun_terms(model: Solved, found: Mapping[str, Any]) -> dict[str, dict[float, float]]:
     """Initial terms by output and exponent of the only run of a fit with friction."""
     return {o: dict(terms) for o, terms in zip(model.outputs, found["powers"][0], strict=True)}
@@ -165,20 +112,6 @@ def started(model: Solved, run: Run) -> Solved:
     return long if needed(model.structure, excess, more) else short
 
 
-def _tried(
-    model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None, *, last: bool = False
-) -> tuple[Floats, dict[str, dict[float, float]]]:
-    """Samples on one grid; no numbers where it happens to make the equations unsolvable, unless it is the last try."""
-    try:
-        return sampled(model, run, every, initial, times)
-    except ModelError:
-        # An own coefficient c meets 1 = c h^alpha / gamma(alpha + 2) on one step, not on two.
-        if last:
-            raise
-        count = run.length if times is None else times.size
-        return np.full((len(model.outputs), count), np.nan), {o: {} for o in model.outputs}
-
-
 def sampled(
     model: Solved, run: Run, every: int, initial: Terms | None, times: Floats | None = None
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
@@ -194,13 +127,7 @@ def sampled(
     if model.structure.has_friction:
         kept = begun_terms(model, begun(model, run, rec, every))
         return _read(model, run, rec, every, _responses(model, rec, kept), kept, at), kept
-    names = [
-        (e.output, power)
-        for e in model.equations
-        for power in initial_exponents(
-            e, rec.initial, rec.offset, rec.states if model.structure.held_back(e.output) else 0
-        )
-    ]
+    names = initial_names(model, rec.initial)
     none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
     if not names:
         return _read(model, run, rec, every, _responses(model, rec, none), none, at), none
@@ -208,12 +135,38 @@ def sampled(
     driven = _read(model, run, rec, every, free, none, at)
     if not np.all(np.isfinite(driven)):
         return driven, none
+    columns = _columns(model, rec, every, names, units, at)
+    return fitted(model, measured_samples(model, run, every, rec), driven, names, columns)
+
+
+def initial_names(model: Solved, initial: Initial) -> list[tuple[str, float]]:
+    """Output and power of every initial term and offset of a run that starts like this."""
+    structure = model.structure
+    states = structure.filter_states(initial)
+    return [
+        (e.output, power)
+        for e in model.equations
+        for power in initial_exponents(e, initial, structure.offset, states if structure.held_back(e.output) else 0)
+    ]
+
+
+def unit_samples(model: Solved, run: Run, every: int, names: Sequence[tuple[str, float]]) -> list[Floats]:
+    """Samples of all outputs for a unit of each initial term, by output and power, while nothing else drives."""
+    rec = record(run, model.structure, (run.length - 1) * every, filtered=model.structure.behind_filter)
+    return _columns(model, rec, every, names, _free_and_units(model, rec, names)[1], None)
+
+
+def _columns(
+    model: Solved, rec: Record, every: int, names: Sequence[tuple[str, float]], units: Sequence[Floats],
+    at: Instants | None,
+) -> list[Floats]:  # fmt: skip
+    """Samples of units of initial terms from their pulse means."""
+    none: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
     still = replace(rec, means=np.zeros_like(rec.means))
-    columns = [
+    return [
         _read(model, None, still, every, means, {**none, output: {power: 1.0}}, at)
         for (output, power), means in zip(names, units, strict=True)
     ]
-    return _fitted(model, measured_samples(model, run, every, rec), driven, names, columns)
 
 
 def measured_samples(model: Solved, run: Run, every: int, rec: Record | None = None) -> Floats:
@@ -228,7 +181,7 @@ def measured_samples(model: Solved, run: Run, every: int, rec: Record | None = N
     return np.stack([run[n] if through(n) else _core.point_samples(rec.of(n))[::every] for n in model.outputs])
 
 
-def _fitted(
+def fitted(
     model: Solved, measured: Floats, driven: Floats, names: Sequence[tuple[str, float]], columns: Sequence[Floats]
 ) -> tuple[Floats, dict[str, dict[float, float]]]:
     """Initial terms that bring the run closest to what was measured, by least squares, and the run with them."""
@@ -349,7 +302,9 @@ def _read(
             # At the very start nothing has been integrated yet.
             begun = np.where(at.times > 0.0, _finite_readings(rest, at) + kinks, (gain * start + held)[:, None])
             return np.asarray(begun + gain[:, None] * now)
-        later = 1.5 * rest[:, every - 1 :: every] - 0.5 * rest[:, every - 2 :: every]
+        # On one pulse an interval what is asked for lies far behind its start, see long.py.
+        earlier = rest[:, every - 2 :: every] if every > 1 else np.concatenate([rest[:, :1], rest[:, :-1]], axis=1)
+        later = 1.5 * rest[:, every - 1 :: every] - 0.5 * earlier
         if any(t.order.constant > e.order.constant + GRAIN for e in model.equations for t in e.terms):
             # A term above its equation's order differentiates, nearly as Tustin's rule does at one above: pulses carry
             # a part that changes its sign from one to the next, which those on both sides of an instant take away.
