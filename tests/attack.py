@@ -5,6 +5,8 @@ panic, a hang, an error without words, another answer or a live motor counts as 
 """
 
 import argparse
+import hashlib
+import json
 import os
 import random
 import resource
@@ -18,8 +20,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 #: Longest call, and what Ctrl-C may take of its own processor time [s].
 HANG, STOP = 5.0, 0.5
-#: Calls of each entry that a child makes.
-BATCH = 50
+#: Calls of each entry that a child makes; half a second goes by before its first.
+BATCH = 200
 MEMORY = 4 << 30
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -94,34 +96,79 @@ def lines_of(command, folder, hang):
         yield f"!ended the process with {child.returncode}: {words}"
 
 
-def calls(table, count, folder, only=(), hang=HANG):
-    """So many calls of each entry, or those before a Ctrl-C; the table gets their sum and a line for each."""
-    kinds = {}
+def calls(table, count, folder, only=(), hang=HANG, counts=None, until=float("inf")):
+    """So many calls of each entry, or those before a Ctrl-C; the table gets their sum and a line for each.
+
+    A file of counts gets a line a batch, and what it has is not called again; no batch begins after `until`, a time of
+    the monotonic clock.
+    """
+    done = {} if counts is None else counted_before(counts)
     try:
-        make_calls(table, kinds, count, folder, only, hang)
+        for batch in range(-(-count // BATCH)):
+            size = min(BATCH, count - batch * BATCH)
+            if batch in done and done[batch]["size"] >= size:
+                continue
+            if time.monotonic() > until:
+                table.notes.append(f"{CALLS}: time is up before batch {batch} of {-(-count // BATCH)}")
+                break
+            done[batch] = {"core": core(), "batch": batch, "size": size, "calls": {}, "broken": []}
+            make_batch(table, done[batch], folder, only, hang)
+            if counts is not None:
+                with counts.open("a") as file:
+                    file.write(json.dumps(done[batch]) + "\n")
     except KeyboardInterrupt:
-        table.notes.append("calls of the extension: interrupted")
+        table.notes.append(f"{CALLS}: interrupted")
+    kinds = {}
+    records = [done[batch] for batch in sorted(done)]
+    for record in records:
+        for name, counted in record["calls"].items():
+            kinds.setdefault(name, Counter()).update(counted)
+    table.breaks |= {CALLS: told} if (told := [how for r in records for how in r["broken"]]) else {}
     table.tried(CALLS, sum(counted["calls"] for counted in kinds.values()))
     # Refused arguments alone would prove little.
     table.calls = kinds
 
 
-def make_calls(table, kinds, count, folder, only, hang):
-    for seed in range(-(-count // BATCH)):
-        size = min(BATCH, count - seed * BATCH)
-        command = [sys.executable, __file__, "--batch", str(seed), "--size", str(size), "--only", ",".join(only)]
-        last = "nothing yet"
-        for line in lines_of(command, folder, hang):
-            if line[:1] == "!":
-                table.broken(CALLS, f"batch {seed}: {last} {line[1:]}")
-            elif line[:1] != "=":
-                last = line.strip()
-                kinds.setdefault(last, Counter())["calls"] += 1
-            else:
-                kind = line[1:].partition(":")[0]
-                kinds[last][kind] += 1
-                if ":" in line:
-                    table.broken(CALLS, f"batch {seed}: {last}: {line[1:]}")
+def core():
+    """What tells one build of the extension from another."""
+    from ftlm import _core
+
+    return hashlib.sha256(Path(_core.__file__).read_bytes()).hexdigest()[:16]
+
+
+def counted_before(path):
+    """Batches in a file of counts by their number, the larger of two; a line that a kill cut off is none."""
+    text = path.read_text() if path.exists() else ""
+    if text and not text.endswith("\n"):
+        text = text[: text.rfind("\n") + 1]
+        path.write_text(text)
+    records = [json.loads(line) for line in text.splitlines()]
+    if any(r["core"] != core() for r in records):
+        sys.exit(f"{path} has counts of another build of the extension; name another file")
+    return {r["batch"]: r for r in sorted(records, key=lambda r: r["size"])}
+
+
+def make_batch(table, record, folder, only, hang):
+    """Make the calls of a batch, counted in its record as they come back."""
+    batch, kinds = record["batch"], record["calls"]
+    command = [sys.executable, __file__, "--batch", str(batch), "--size", str(record["size"]), "--only", ",".join(only)]
+    last = "nothing yet"
+
+    def broken(how):
+        record["broken"].append(how)
+        table.broken(CALLS, how)
+
+    for line in lines_of(command, folder, hang):
+        if line[:1] == "!":
+            broken(f"batch {batch}: {last} {line[1:]}")
+        elif line[:1] != "=":
+            last = line.strip()
+            kinds.setdefault(last, Counter())["calls"] += 1
+        else:
+            kind = line[1:].partition(":")[0]
+            kinds[last][kind] += 1
+            if ":" in line:
+                broken(f"batch {batch}: {last}: {line[1:]}")
 
 
 def table_of_calls(kinds):
@@ -396,6 +443,8 @@ def main():
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--only-calls", action="store_true", help="nothing but calls of the extension")
     parser.add_argument("--only", default="", help="entries of the extension to call, with commas between")
+    parser.add_argument("--counts", type=Path, help="file that keeps counts of these calls, and where they go on")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="no more of these calls after so many")
     parser.add_argument("--batch", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--show", action="store_true", help="with --batch and --size: the arguments of each call")
     parser.add_argument("--size", type=int, help=argparse.SUPPRESS)
@@ -404,6 +453,12 @@ def main():
     if given.batch is not None:
         call_batch(given.batch, given.size, only, given.show)
         return
+    if given.counts is not None:
+        if only:
+            parser.error("--counts is of every entry; leave --only out")
+        # What is damaged or of another build is said before anything is attacked.
+        given.counts = given.counts.resolve()
+        counted_before(given.counts)
     table = Table()
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="ftlm-attack-") as name:
@@ -416,7 +471,8 @@ def main():
             files(table, folder, given.files)
             presses(table, folder)
             kills(table, folder, given.kills)
-        calls(table, given.calls, folder, only)
+        until = time.monotonic() + 60 * given.minutes
+        calls(table, given.calls, folder, only, counts=given.counts, until=until)
         os.chdir("/")
     print(f"{table}\n{time.monotonic() - began:.0f} s")
     sys.exit(1 if table.breaks else 0)

@@ -62,6 +62,36 @@ def test_hostile_calls_end_in_an_answer_or_in_words(tmp_path):
     assert "entries answered no hostile call" in shown
 
 
+def test_calls_go_on_where_a_file_of_counts_ends(tmp_path, monkeypatch, capsys):
+    counts, calls = tmp_path / "counts.jsonl", ATTACK["calls"]
+    monkeypatch.setitem(calls.__globals__, "BATCH", 2)
+    monkeypatch.setitem(calls.__globals__, "lines_of", lambda command, folder, hang: made.append(command) or ANSWERED)
+    made, late = [], ATTACK["Table"]()
+    calls(late, 3, tmp_path, counts=counts, until=float("-inf"))
+    assert (made, late.counts, late.notes) == (
+        [],
+        {ATTACK["CALLS"]: 0},
+        [f"{ATTACK['CALLS']}: time is up before batch 0 of 2"],
+    )
+    calls(ATTACK["Table"](), 3, tmp_path, counts=counts)
+    # The second batch had one call of two, and what a kill cut off is made again.
+    counts.write_text(counts.read_text() + '{"core": "')
+    more = ATTACK["Table"]()
+    calls(more, 6, tmp_path, counts=counts)
+    assert [command[command.index("--batch") + 1] for command in made] == ["0", "1", "1", "2"]
+    assert more.calls == {"metrics": Counter(calls=3, DataError=3)}
+    assert more.breaks == {ATTACK["CALLS"]: [f"batch {k}: metrics took more than 5 s" for k in range(3)]}
+    assert len(counts.read_text().splitlines()) == 4
+    counts.write_text(counts.read_text().replace('"core": "', '"core": "f'))
+    with pytest.raises(SystemExit, match="another build of the extension"):
+        calls(ATTACK["Table"](), 6, tmp_path, counts=counts)
+    assert "took more than 5 s" in capsys.readouterr().err
+
+
+#: What a child writes that refuses a call, and hangs at the next.
+ANSWERED = ["metrics ", "=DataError", "!took more than 5 s"]
+
+
 def test_a_panic_is_seen(tmp_path):
     table = ATTACK["Table"]()
     ATTACK["calls"](table, 20, tmp_path, only=["panic_on_purpose", "metrics"])
