@@ -53,7 +53,11 @@ def call_batch(seed, count, only, show):
             call, given, named = sound.call(name)
             kept = sound.random.random() < hostile.SOUND
             if not kept:
-                given, named = hostile.attacked(name, given, named, sound.random)
+                try:
+                    given, named = hostile.attacked(name, given, named, sound.random)
+                except (MemoryError, ValueError):
+                    # The attacker's own: no memory, or a shape that NumPy cannot iterate over.
+                    continue
             os.write(1, f"{name} {f'{given} {named}' if show else ''}\n".encode(errors="backslashreplace"))
             try:
                 call(*given, **named)

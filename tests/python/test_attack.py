@@ -49,6 +49,16 @@ def test_hostile_values_leave_no_number_untouched():
     assert given[0][1].sum() == 16
 
 
+def test_a_fit_is_not_asked_for_more_time_than_an_attack_waits():
+    r = random.Random(0)
+    for name, at in HOSTILE["EVALUATIONS"].items():
+        _, given, named = HOSTILE["Sound"](0).call(name)
+        asked = [HOSTILE["attacked"](name, given, named, r)[0][at] for _ in range(2000)]
+        assert max(v for v in asked if isinstance(v, int)) == HOSTILE["MOST_EVALUATIONS"]
+        assert any(not isinstance(v, int) for v in asked)
+        assert any(isinstance(v, int) and v < 0 for v in asked)
+
+
 def test_hostile_calls_end_in_an_answer_or_in_words(tmp_path):
     table = ATTACK["Table"]()
     ATTACK["calls"](table, 4, tmp_path)
