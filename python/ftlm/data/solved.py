@@ -5,14 +5,33 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import msgspec
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET, Meta, UnsetType
 
 from ftlm.base.checks import check_pulses
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
 from ftlm.data.structures import Structure, check_decided
+
+
+class Against(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What speaks against a model.
+
+    Parameters
+    ----------
+    level
+        What it makes of the model: ``"do not use"`` or ``"with care"``.
+    reason
+        In a sentence.
+    remedy
+        What to do about it.
+    """
+
+    level: Literal["do not use", "with care"]
+    reason: Annotated[str, Meta(min_length=1)]
+    remedy: str = ""
 
 
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -39,6 +58,9 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     intervals
         95 % intervals by profile likelihood, of the values that have one; None for an end that is infinite. Those of
         the others are ± 1.96 standard errors. Not set where no value has one.
+    against
+        What spoke against the model when it was identified, as its verdict weighs it; not set where nothing did, and in
+        files of earlier versions, which are judged by their warnings.
     """
 
     method: str
@@ -50,6 +72,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     information: dict[str, float | None] = {}
     warnings: tuple[str, ...] = ()
     intervals: dict[str, tuple[float | None, float | None]] | UnsetType = UNSET
+    against: tuple[Against, ...] | UnsetType = UNSET
 
 
 @dataclass(frozen=True)
