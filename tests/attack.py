@@ -20,6 +20,8 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 #: Longest call, and what Ctrl-C may take of its own processor time [s].
 HANG, STOP = 5.0, 0.5
+#: So many times longer a call may be silent if it has not had that much of a processor: others may have it.
+PATIENCE = 30
 #: Calls of each entry that a child makes; half a second goes by before its first.
 BATCH = 200
 MEMORY = 4 << 30
@@ -71,25 +73,38 @@ def call_batch(seed, count, only, show):
             os.write(1, f"={told}\n".encode(errors="backslashreplace"))
 
 
+def spent(child):
+    """Processor time of a process [s]; infinite where the system does not tell it."""
+    try:
+        return time.clock_gettime((~child.pid << 3) | 2)
+    except (AttributeError, OSError):
+        return float("inf")
+
+
 def lines_of(command, folder, hang):
-    """Lines that a child writes, then in words how it ended if that was no good end; silence of `hang` s ends it."""
+    """Lines that a child writes, then in words how it ended if that was no good end.
+
+    It is ended by silence of `hang` s of its own processor time, and by a longer one whatever it does.
+    """
     with (
         (folder / "errors").open("w") as errors,
         subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=errors) as child,
     ):
-        started, at, buffer = False, time.monotonic(), b""
+        started, at, used, buffer = False, time.monotonic(), spent(child), b""
         os.set_blocking(child.stdout.fileno(), False)
         while True:
             got = child.stdout.read()
             if got:
-                started, at = True, time.monotonic()
+                started, at, used = True, time.monotonic(), spent(child)
                 *lines, buffer = (buffer + got).split(b"\n")
                 for line in lines:
                     yield line.decode()
             elif child.poll() is not None:
                 break
             # Python and NumPy are imported before the first line.
-            elif time.monotonic() - at > hang + (0 if started else 20):
+            elif (silent := time.monotonic() - at - (0 if started else 20)) > hang and (
+                silent > PATIENCE * hang or not spent(child) - used <= hang
+            ):
                 child.kill()
                 yield f"!took more than {hang:g} s"
                 return
