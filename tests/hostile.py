@@ -195,9 +195,7 @@ class Sound:
     def instrumental_variables(self):
         structures = [self.structure(0), self.structure(1)]
         fixed = [[None] * len(s[2]) for s in structures]
-        # Eight pulses may make a combination of four regressors by chance.
-        lengths = [self.one(16, 32, 64) for _ in range(self.one(1, 1, 2))]
-        runs = [(step, means, None) for step, means, _ in (self.record(m, sensor=False) for m in lengths)]
+        runs = [(step, means, None) for step, means, _ in self.runs()]
         return runs, structures, list(self.INPUTS), fixed, self.terms(), self.one(1, 4), 1e-4
 
     def experiments(self, own=False):
