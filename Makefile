@@ -48,7 +48,7 @@ test-slow: $(VENV)/.built
 	$(BIN)/python -m pytest -m slow --timeout 7200
 
 # Attacks from outside, for minutes, in a temporary folder; a table of what was tried and what broke. So many calls of
-# each entry of the extension: ATTACK_CALLS=100000 takes an hour, and goes on where it stopped with ATTACK_COUNTS=FILE.
+# each entry of the extension; with ATTACK_COUNTS=FILE they go on where they stopped, which ATTACK_CALLS=100000 may ask for.
 ATTACK_CALLS ?= 1300
 attack: $(VENV)/.built
 	$(BIN)/python tests/attack.py --calls $(ATTACK_CALLS) $(if $(ATTACK_COUNTS),--counts $(ATTACK_COUNTS))
