@@ -407,7 +407,6 @@ def test_a_working_folder_that_is_gone_is_one_line(written, tmp_path, monkeypatc
 PRESSED_AT = """
 import os, signal, sys
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from ftlm.__main__ import main
 class Presses:
     def find_spec(name, path, target=None):
         if name == pressed:
@@ -415,6 +414,7 @@ class Presses:
             os.kill(os.getpid(), signal.SIGINT)
 sys.meta_path.insert(0, Presses)
 pressed, sys.argv[1] = sys.argv[1], "--version"
+from ftlm.__main__ import main
 main()
 """
 
