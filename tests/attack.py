@@ -5,6 +5,8 @@ panic, a hang, an error without words, another answer or a live motor counts as 
 """
 
 import argparse
+import hashlib
+import json
 import os
 import random
 import resource
@@ -18,8 +20,10 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 #: Longest call, and what Ctrl-C may take of its own processor time [s].
 HANG, STOP = 5.0, 0.5
-#: Calls of each entry that a child makes.
-BATCH = 50
+#: So many times longer a call may be silent if it has not had that much of a processor: others may have it.
+PATIENCE = 30
+#: Calls of each entry that a child makes; half a second goes by before its first.
+BATCH = 200
 MEMORY = 4 << 30
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -51,39 +55,56 @@ def call_batch(seed, count, only, show):
             call, given, named = sound.call(name)
             kept = sound.random.random() < hostile.SOUND
             if not kept:
-                given, named = hostile.attacked(name, given, named, sound.random)
+                try:
+                    given, named = hostile.attacked(name, given, named, sound.random)
+                except (MemoryError, ValueError):
+                    # The attacker's own: no memory, or a shape that NumPy cannot iterate over.
+                    continue
             os.write(1, f"{name} {f'{given} {named}' if show else ''}\n".encode(errors="backslashreplace"))
             try:
                 call(*given, **named)
                 told = "sound" if kept else "answered"
             except BaseException as error:
                 told = type(error).__name__
-                # An object may remember a hostile call.
-                faulty = kept and ("." not in name or name.endswith("__new__"))
+                # An object may remember a hostile call, and no estimator solves whatever noise there may be.
+                faulty = kept and told != "ConvergenceError" and ("." not in name or name.endswith("__new__"))
                 if told not in WORDS | ASKED_FOR or faulty or (not str(error) and told in WORDS):
                     told = f"{told}: {' '.join(str(error).split())[:300]}: {given!r:.2000} {named}".replace("\n", " ")
             os.write(1, f"={told}\n".encode(errors="backslashreplace"))
 
 
+def spent(child):
+    """Processor time of a process [s]; infinite where the system does not tell it."""
+    try:
+        return time.clock_gettime((~child.pid << 3) | 2)
+    except (AttributeError, OSError):
+        return float("inf")
+
+
 def lines_of(command, folder, hang):
-    """Lines that a child writes, then in words how it ended if that was no good end; silence of `hang` s ends it."""
+    """Lines that a child writes, then in words how it ended if that was no good end.
+
+    It is ended by silence of `hang` s of its own processor time, and by a longer one whatever it does.
+    """
     with (
         (folder / "errors").open("w") as errors,
         subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=errors) as child,
     ):
-        started, at, buffer = False, time.monotonic(), b""
+        started, at, used, buffer = False, time.monotonic(), spent(child), b""
         os.set_blocking(child.stdout.fileno(), False)
         while True:
             got = child.stdout.read()
             if got:
-                started, at = True, time.monotonic()
+                started, at, used = True, time.monotonic(), spent(child)
                 *lines, buffer = (buffer + got).split(b"\n")
                 for line in lines:
                     yield line.decode()
             elif child.poll() is not None:
                 break
             # Python and NumPy are imported before the first line.
-            elif time.monotonic() - at > hang + (0 if started else 20):
+            elif (silent := time.monotonic() - at - (0 if started else 20)) > hang and (
+                silent > PATIENCE * hang or not spent(child) - used <= hang
+            ):
                 child.kill()
                 yield f"!took more than {hang:g} s"
                 return
@@ -94,34 +115,79 @@ def lines_of(command, folder, hang):
         yield f"!ended the process with {child.returncode}: {words}"
 
 
-def calls(table, count, folder, only=(), hang=HANG):
-    """So many calls of each entry, or those before a Ctrl-C; the table gets their sum and a line for each."""
-    kinds = {}
+def calls(table, count, folder, only=(), hang=HANG, counts=None, until=float("inf")):
+    """So many calls of each entry, or those before a Ctrl-C; the table gets their sum and a line for each.
+
+    A file of counts gets a line a batch, and what it has is not called again; no batch begins after `until`, a time of
+    the monotonic clock.
+    """
+    done = {} if counts is None else counted_before(counts)
     try:
-        make_calls(table, kinds, count, folder, only, hang)
+        for batch in range(-(-count // BATCH)):
+            size = min(BATCH, count - batch * BATCH)
+            if batch in done and done[batch]["size"] >= size:
+                continue
+            if time.monotonic() > until:
+                table.notes.append(f"{CALLS}: time is up before batch {batch} of {-(-count // BATCH)}")
+                break
+            done[batch] = {"core": core(), "batch": batch, "size": size, "calls": {}, "broken": []}
+            make_batch(table, done[batch], folder, only, hang)
+            if counts is not None:
+                with counts.open("a") as file:
+                    file.write(json.dumps(done[batch]) + "\n")
     except KeyboardInterrupt:
-        table.notes.append("calls of the extension: interrupted")
+        table.notes.append(f"{CALLS}: interrupted")
+    kinds = {}
+    records = [done[batch] for batch in sorted(done)]
+    for record in records:
+        for name, counted in record["calls"].items():
+            kinds.setdefault(name, Counter()).update(counted)
+    table.breaks |= {CALLS: told} if (told := [how for r in records for how in r["broken"]]) else {}
     table.tried(CALLS, sum(counted["calls"] for counted in kinds.values()))
     # Refused arguments alone would prove little.
     table.calls = kinds
 
 
-def make_calls(table, kinds, count, folder, only, hang):
-    for seed in range(-(-count // BATCH)):
-        size = min(BATCH, count - seed * BATCH)
-        command = [sys.executable, __file__, "--batch", str(seed), "--size", str(size), "--only", ",".join(only)]
-        last = "nothing yet"
-        for line in lines_of(command, folder, hang):
-            if line[:1] == "!":
-                table.broken(CALLS, f"batch {seed}: {last} {line[1:]}")
-            elif line[:1] != "=":
-                last = line.strip()
-                kinds.setdefault(last, Counter())["calls"] += 1
-            else:
-                kind = line[1:].partition(":")[0]
-                kinds[last][kind] += 1
-                if ":" in line:
-                    table.broken(CALLS, f"batch {seed}: {last}: {line[1:]}")
+def core():
+    """What tells one build of the extension from another."""
+    from ftlm import _core
+
+    return hashlib.sha256(Path(_core.__file__).read_bytes()).hexdigest()[:16]
+
+
+def counted_before(path):
+    """Batches in a file of counts by their number, the larger of two; a line that a kill cut off is none."""
+    text = path.read_text() if path.exists() else ""
+    if text and not text.endswith("\n"):
+        text = text[: text.rfind("\n") + 1]
+        path.write_text(text)
+    records = [json.loads(line) for line in text.splitlines()]
+    if any(r["core"] != core() for r in records):
+        sys.exit(f"{path} has counts of another build of the extension; name another file")
+    return {r["batch"]: r for r in sorted(records, key=lambda r: r["size"])}
+
+
+def make_batch(table, record, folder, only, hang):
+    """Make the calls of a batch, counted in its record as they come back."""
+    batch, kinds = record["batch"], record["calls"]
+    command = [sys.executable, __file__, "--batch", str(batch), "--size", str(record["size"]), "--only", ",".join(only)]
+    last = "nothing yet"
+
+    def broken(how):
+        record["broken"].append(how)
+        table.broken(CALLS, how)
+
+    for line in lines_of(command, folder, hang):
+        if line[:1] == "!":
+            broken(f"batch {batch}: {last} {line[1:]}")
+        elif line[:1] != "=":
+            last = line.strip()
+            kinds.setdefault(last, Counter())["calls"] += 1
+        else:
+            kind = line[1:].partition(":")[0]
+            kinds[last][kind] += 1
+            if ":" in line:
+                broken(f"batch {batch}: {last}: {line[1:]}")
 
 
 def table_of_calls(kinds):
@@ -396,6 +462,8 @@ def main():
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--only-calls", action="store_true", help="nothing but calls of the extension")
     parser.add_argument("--only", default="", help="entries of the extension to call, with commas between")
+    parser.add_argument("--counts", type=Path, help="file that keeps counts of these calls, and where they go on")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="no more of these calls after so many")
     parser.add_argument("--batch", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--show", action="store_true", help="with --batch and --size: the arguments of each call")
     parser.add_argument("--size", type=int, help=argparse.SUPPRESS)
@@ -404,6 +472,12 @@ def main():
     if given.batch is not None:
         call_batch(given.batch, given.size, only, given.show)
         return
+    if given.counts is not None:
+        if only:
+            parser.error("--counts is of every entry; leave --only out")
+        # What is damaged or of another build is said before anything is attacked.
+        given.counts = given.counts.resolve()
+        counted_before(given.counts)
     table = Table()
     began = time.monotonic()
     with tempfile.TemporaryDirectory(prefix="ftlm-attack-") as name:
@@ -416,7 +490,8 @@ def main():
             files(table, folder, given.files)
             presses(table, folder)
             kills(table, folder, given.kills)
-        calls(table, given.calls, folder, only)
+        until = time.monotonic() + 60 * given.minutes
+        calls(table, given.calls, folder, only, counts=given.counts, until=until)
         os.chdir("/")
     print(f"{table}\n{time.monotonic() - began:.0f} s")
     sys.exit(1 if table.breaks else 0)

@@ -25,6 +25,8 @@ SOUND, TWICE = 0.1, 0.3
 #: Rows or columns of an array beyond memory, all of them one number; a rig that is run on so many samples runs on.
 LARGE = 1 << 34
 ENDLESS = {"VirtualArm.rest", "VirtualArm.run"}
+#: Where a fit is told how often it may evaluate its cost, which it does; an attack asks it to so often at most.
+EVALUATIONS, MOST_EVALUATIONS = {"output_error": 9, "friction_error": 10}, 2000
 
 
 class OursError(Exception):
@@ -623,4 +625,7 @@ def attacked(name, given, named, r):
         spots = [path for path in places(arguments) if len(path) > 1]
         if spots:
             arguments = exchanged(arguments, r.choice(spots), lambda value: hostile(value, r, large))
+    at = EVALUATIONS.get(name)
+    if at is not None and isinstance(arguments[0][at], int):
+        arguments[0][at] = min(arguments[0][at], MOST_EVALUATIONS)
     return arguments

@@ -1,5 +1,28 @@
-"""``python -m ftlm`` is the command line."""
+"""``ftlm`` and ``python -m ftlm``: the command line, whose imports take a moment that may be interrupted as well."""
 
-from ftlm.cli import main
+import os
+import signal
+import threading
 
-main()
+
+def _leave(*_: object) -> None:
+    os.write(2, b"ftlm: interrupted; nothing was written\n")
+    os._exit(130)
+
+
+# An exception in the middle of an import may become any other one on its way through libraries.
+_OURS = (
+    signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    and threading.current_thread() is threading.main_thread()
+)
+if _OURS:
+    signal.signal(signal.SIGINT, _leave)
+from ftlm.cli import main  # noqa: E402
+
+if _OURS:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+
+__all__ = ["main"]
+
+if __name__ == "__main__":
+    main()

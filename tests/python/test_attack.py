@@ -49,6 +49,16 @@ def test_hostile_values_leave_no_number_untouched():
     assert given[0][1].sum() == 16
 
 
+def test_a_fit_is_not_asked_for_more_time_than_an_attack_waits():
+    r = random.Random(0)
+    for name, at in HOSTILE["EVALUATIONS"].items():
+        _, given, named = HOSTILE["Sound"](0).call(name)
+        asked = [HOSTILE["attacked"](name, given, named, r)[0][at] for _ in range(2000)]
+        assert max(v for v in asked if isinstance(v, int)) == HOSTILE["MOST_EVALUATIONS"]
+        assert any(not isinstance(v, int) for v in asked)
+        assert any(isinstance(v, int) and v < 0 for v in asked)
+
+
 def test_hostile_calls_end_in_an_answer_or_in_words(tmp_path):
     table = ATTACK["Table"]()
     ATTACK["calls"](table, 4, tmp_path)
@@ -60,6 +70,36 @@ def test_hostile_calls_end_in_an_answer_or_in_words(tmp_path):
     shown = str(table)
     assert f"| all | {4 * len(names)} |" in shown
     assert "entries answered no hostile call" in shown
+
+
+def test_calls_go_on_where_a_file_of_counts_ends(tmp_path, monkeypatch, capsys):
+    counts, calls = tmp_path / "counts.jsonl", ATTACK["calls"]
+    monkeypatch.setitem(calls.__globals__, "BATCH", 2)
+    monkeypatch.setitem(calls.__globals__, "lines_of", lambda command, folder, hang: made.append(command) or ANSWERED)
+    made, late = [], ATTACK["Table"]()
+    calls(late, 3, tmp_path, counts=counts, until=float("-inf"))
+    assert (made, late.counts, late.notes) == (
+        [],
+        {ATTACK["CALLS"]: 0},
+        [f"{ATTACK['CALLS']}: time is up before batch 0 of 2"],
+    )
+    calls(ATTACK["Table"](), 3, tmp_path, counts=counts)
+    # The second batch had one call of two, and what a kill cut off is made again.
+    counts.write_text(counts.read_text() + '{"core": "')
+    more = ATTACK["Table"]()
+    calls(more, 6, tmp_path, counts=counts)
+    assert [command[command.index("--batch") + 1] for command in made] == ["0", "1", "1", "2"]
+    assert more.calls == {"metrics": Counter(calls=3, DataError=3)}
+    assert more.breaks == {ATTACK["CALLS"]: [f"batch {k}: metrics took more than 5 s" for k in range(3)]}
+    assert len(counts.read_text().splitlines()) == 4
+    counts.write_text(counts.read_text().replace('"core": "', '"core": "f'))
+    with pytest.raises(SystemExit, match="another build of the extension"):
+        calls(ATTACK["Table"](), 6, tmp_path, counts=counts)
+    assert "took more than 5 s" in capsys.readouterr().err
+
+
+#: What a child writes that refuses a call, and hangs at the next.
+ANSWERED = ["metrics ", "=DataError", "!took more than 5 s"]
 
 
 def test_a_panic_is_seen(tmp_path):
@@ -74,13 +114,14 @@ def test_a_panic_is_seen(tmp_path):
     ("does", "told"),
     [
         ("os.abort()", ["first", "!ended the process with -6: "]),
-        ("time.sleep(60)", ["first", "!took more than 0.3 s"]),
+        ("time.sleep(60)", ["first", "!took more than 0.1 s"]),
+        ("while True: pass", ["first", "!took more than 0.1 s"]),
         ("sys.exit(0)", ["first"]),
         ("raise SystemError('no words')", ["first", "!ended the process with 1: "]),
     ],
 )
 def test_a_process_that_ends_or_hangs_is_seen(does, told, tmp_path):
     command = [sys.executable, "-c", f"import os, sys, time\nos.write(1, b'first\\n')\n{does}"]
-    lines = list(ATTACK["lines_of"](command, tmp_path, 0.3))
+    lines = list(ATTACK["lines_of"](command, tmp_path, 0.1))
     assert len(lines) == len(told)
     assert all(line.startswith(begin) for line, begin in zip(lines, told, strict=True))

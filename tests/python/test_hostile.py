@@ -6,6 +6,7 @@ import stat
 import subprocess
 import sys
 import threading
+import tomllib
 from concurrent.futures import Executor, Future
 from types import SimpleNamespace
 
@@ -400,3 +401,33 @@ def test_a_working_folder_that_is_gone_is_one_line(written, tmp_path, monkeypatc
         app(["record", "--duration", "0.1", "-o", "run.csv"], standalone_mode=True)
     assert ended.value.code == 3
     assert capsys.readouterr().err.startswith("ftlm: ")
+
+
+#: Ctrl-C when a module is looked for, as if it was pressed while the command line is imported.
+PRESSED_AT = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+class Presses:
+    def find_spec(name, path, target=None):
+        if name == pressed:
+            sys.meta_path.remove(Presses)
+            os.kill(os.getpid(), signal.SIGINT)
+sys.meta_path.insert(0, Presses)
+pressed, sys.argv[1] = sys.argv[1], "--version"
+from ftlm.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize("module", ["ftlm.cli", "numpy", "ftlm._core", "typer", "ftlm.cli.record"])
+def test_an_interrupt_while_the_command_line_is_imported_is_one_line(module, root):
+    done = subprocess.run([sys.executable, "-c", PRESSED_AT, module], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "ftlm: interrupted; nothing was written\n")
+    entry = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["scripts"]["ftlm"]
+    assert entry == "ftlm.__main__:main"
+
+
+def test_what_ignores_interrupts_goes_on_ignoring_them():
+    script = PRESSED_AT.replace("signal.default_int_handler", "signal.SIG_IGN", 1)
+    done = subprocess.run([sys.executable, "-c", script, "typer"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()[0], done.stderr) == (0, "ftlm", "")

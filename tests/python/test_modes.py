@@ -9,6 +9,8 @@ import pytest
 
 import ftlm
 from ftlm.frequency import dcgain, modes, steady_states
+from ftlm.identification.first import behaviour_tables
+from ftlm.identification.summary import behaviour_in_words
 from ftlm.solve.modes import _mode, zeros_of
 from ftlm.solve.stability import characteristic, right_zeros
 
@@ -149,6 +151,31 @@ def test_errors_of_orders_count():
     # ln T = -ln(2)/alpha
     share = math.hypot(math.log(2) / 0.64 * 0.01, 1 / (0.8 * 2) * 0.05)
     assert only.time_constant_error == pytest.approx(only.time_constant * share, rel=1e-3)
+
+
+def test_the_error_of_an_order_says_whether_a_steady_state_is_a_gain():
+    # Numbers: alpha, order and coefficient of D^nu y, of u. The output runs on as t^nu.
+    spread = np.zeros((5, 5))
+    spread[1, 1], spread[4, 4] = 0.02**2, 0.1**2
+    (near,) = steady_states(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))
+    assert (near.order, near.rate) == (pytest.approx(0.03), pytest.approx(2.0))
+    assert near.order_error == pytest.approx(0.02, rel=1e-3)
+    assert near.error == pytest.approx(0.05, rel=1e-3)
+    words = behaviour_in_words(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))
+    assert words[0].endswith("t^0.03/Γ(1.03); order 0.030 ± 0.020, which may be 0: a gain")
+    (table, _) = behaviour_tables(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))
+    assert "which may be 0: a gain" in str(table.to_html())
+    spread[1, 1] = 0.01**2
+    assert behaviour_in_words(model("D^1.5 y = -2 D^0.03 y + 4 u", spread))[0].endswith("; order 0.0300 ± 0.0100")
+    assert (
+        "0.97 ± 0.10, which may be 1: an integrator"
+        in behaviour_in_words(model("D^1.5 y = -2 D^0.97 y + 4 u", 100 * spread))[0]
+    )
+    # Orders that were given have no error, and alpha does not move what is left in the end.
+    spread[1, 1], spread[0, 0] = 0.0, 0.1**2
+    (given,) = steady_states(model("D^1.5 y = -2 y + 4 u", spread))
+    assert given.order_error == 0.0
+    assert behaviour_in_words(model("D^1.5 y = -2 y + 4 u", spread))[0].endswith("2.000 ± 0.050")
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import ftlm
+from ftlm.data.units import UNITS, spelled_unit
+from ftlm.files.cells import stated_unit
 from ftlm.files.roles import guessed_roles, known_unit, signal_names
 from test_files import messages, rows, write
 from test_strangers import command
@@ -45,6 +47,51 @@ def test_names_and_units_that_equations_and_runs_can_hold():
         assert ftlm.equation(f"D^alpha {name} = a0 {name} + b0 drive").equations
     units = {"Volt": "V", "deg": "deg", "degrees": "deg", "furlong": "", "U/min": "rpm", "": ""}
     assert {stated: known_unit(stated) for stated in units} == units
+
+
+def test_units_as_people_spell_them():
+    spelled = {
+        "grd": "deg", "Grad": "deg", "°": "°", "º": "°", "deg.": "deg", "Degrees": "deg", "°/s": "deg/s",
+        "Grad/s": "deg/s", "mA": "mA", "MA": "", "Amps": "A", "Vdc": "V", "VAC": "", "Nm": "Nm", "N m": "Nm", "nm": "",
+        "U/min": "rpm", "1/min": "rpm", "RPM": "rpm", "rev/min": "rpm", "min⁻¹": "rpm", "m/s²": "m/s²",
+        "m/s2": "m/s^2", "μm": "µm", "um": "µm", "℃": "", "° C": "°C", "Sek.": "", "%": "", "Ω": "",
+    }  # fmt: skip
+    assert {stated: known_unit(stated) for stated in spelled} == spelled
+    assert [known_unit(unit, "Oil Temperature") for unit in ("°", "Grad", "°C", "K")] == ["", "", "°C", "K"]
+    for word in ("furlong", "Zeit", "x" * 10**6, "U", "Motor"):
+        assert spelled_unit(word) is None
+    # What a file spells is converted as what ftlm knows.
+    assert all(known_unit(unit) in UNITS for unit in spelled)
+
+
+@pytest.mark.parametrize(
+    ("header", "unit"),
+    [
+        ("Zeit;Strom;Winkel\ns;A;grd", "deg"), ("Zeit;Strom;Winkel\nSek.;mA;°", "°"), ("Zeit;i;M\n[s];[A];[N m]", "Nm"),
+        ('"Zeit";"Strom";"Drehzahl"\n"s";"A";"U/min"', "rpm"), ("Zeit / s;Strom / A;Winkel / Grad", "deg"),
+        ("Zeit, s;Strom, A;Winkel, deg.", "deg"), ("Zeit in s;Strom in A;Winkel in °", "°"),
+        ("Zeit ; Strom ; Weg\ns ; A ; mm", "mm"), ("t / (s);Strom / (A);v / (m/s)", "m/s"),
+        ("Motor;;Geber\nZeit;Strom;Winkel\ns;A;Grad", "deg"),
+    ],
+)  # fmt: skip
+def test_units_are_no_names(tmp_path, header, unit):
+    path = write(tmp_path, header + "\n" + rows().replace(",", ";"))
+    opened = ftlm.open_file(path, inputs={"u": 1}, outputs={"y": 2})
+    assert not opened.problem
+    time, drive, answer = opened.columns
+    assert (time.role, known_unit(drive.unit)) == ("time", "mA" if "mA" in header else "A")
+    assert (known_unit(answer.unit), opened.options["units"]["y"]) == (unit, unit)
+    names = (stated_unit(c.name)[0] for c in (time, drive, answer))
+    assert all(name[0].isalpha() and spelled_unit(name) is None for name in names)
+    run = opened.load()
+    si, scale = UNITS[unit]
+    assert (run.units["y"], run.step) == (si, pytest.approx(0.01))
+    np.testing.assert_allclose(run["y"], scale * ftlm.load(path, **{**opened.options, "units": {}})["y"])
+
+
+def test_an_end_mark_of_old_programs_is_no_row(tmp_path):
+    whole = ftlm.open_file(write(tmp_path, "Time,u,y\n" + rows(), "a.csv"))
+    assert ftlm.open_file(write(tmp_path, "Time,u,y\n" + rows() + "\x1a", "b.csv")).rows == whole.rows
 
 
 def test_what_names_leave_open_is_asked_and_then_answered(tmp_path):

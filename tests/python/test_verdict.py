@@ -15,7 +15,9 @@ from typer.testing import CliRunner
 import ftlm
 from ftlm import cli
 from ftlm.fit import history
+from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.joint import fit_output_error
+from ftlm.identification import estimate as estimating
 from ftlm.identification.verdict import saved_verdict
 from ftlm.judge.concerns import KINDS, OTHER, SHOWN, concerns, kind_of
 from ftlm.report import model_page
@@ -204,6 +206,107 @@ def test_a_number_is_vague_by_its_own_size(found, checked):
     spread[a1, a1], spread[alpha, alpha] = 0.0, 0.3**2
     judged = worse(found, joint=replace(found.joint, covariance=spread, profiles={})).verdict(checked)
     assert judged.reason == f"the runs hardly tell alpha = {found.orders['alpha']:.3g} ± 0.3"
+
+
+def test_an_interval_without_end_speaks_against_a_delay_and_an_order(found, checked):
+    late = replace(found.model, structure=found.model.structure.with_delays({"u": 0.1}))
+    for name, low, high, reason in (
+        ("delay_u", -math.inf, 0.3, ""),  # it may well be 0
+        ("delay_u", 0.05, math.inf, "the runs do not bound delay_u"),
+        ("alpha", 1.5, math.inf, f"the runs hardly tell alpha = {found.orders['alpha']:.3g} ± "),
+    ):
+        open_ended = replace(found.joint, profiles={name: ProfileInterval(low, high, 0.95)})
+        judged = worse(found, joint=open_ended, model=late).verdict(checked)
+        assert judged.reason.startswith(reason)
+        assert judged.level == ("with care" if reason else "trust")
+
+
+def test_rough_intervals_speak_against_a_model(found, checked):
+    doubted = worse(found, warnings=(ROUGH,)).verdict(checked)
+    assert (doubted.level, doubted.remedy) == ("with care", "intervals='profile' finds them")
+    assert doubted.reason.startswith("some intervals are rough: the cost is no parabola along a0")
+
+
+#: Warnings as fits give them: of weight, and of numbers that are vague and not very.
+ROUGH = (
+    "the cost is no parabola along a0, and its profile there would take long: these intervals are rough; "
+    "intervals='profile' finds them"
+)
+TIED = "a0 and b0 cannot be told apart in these runs (correlation 0.9960)"
+
+
+@pytest.mark.parametrize("words", ["D y = 2 u", "D^2 y = 2 u", "D^2 y = -0.3 D y + u", "D^1.5 y = -D^0.5 y + u"])
+def test_an_integrator_is_no_fault(words):
+    assert saved_verdict(ftlm.Model(ftlm.equation(words)), []).reasons == (
+        "its file says nothing of how it was identified",
+    )
+
+
+def test_a_swing_that_nothing_damps_is_with_care(found, checked):
+    for words in ("D^2 y = -4 y + u", "D^2.5 y = -4 D^0.5 y + u"):
+        judged = saved_verdict(ftlm.Model(ftlm.equation(words)), [])
+        assert judged.level == "with care"
+        assert judged.reason == "a swing of 2 rad/s may never die away (damping 0)"
+    # The damping of the clean result is 0.27; it is not told apart from 0 where its own error is half of it.
+    order = found.joint.names.index("alpha")
+    for spread, told in ((1e-3, True), (0.3, False)):
+        covariance = np.array(found.model.estimate.covariance)
+        covariance[:] = 0.0
+        covariance[order, order] = spread**2
+        known = replace_estimate(found.model, covariance=tuple(map(tuple, covariance.tolist())))
+        judged = worse(found, model=known).verdict(checked)
+        assert judged.trusted == told
+        assert told or "may never die away (damping 0.27 ± " in judged.reason
+
+
+#: Faults by name: words of the plant, of the structure, what else identify is given, what it warns of.
+FAULTS = {
+    "none": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {}, []),
+    "not very vague": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {}, [TIED]),
+    "rough": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {}, [ROUGH]),
+    "on a bound": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {}, ["order alpha = 2 is on its bound; widen it"]),
+    "a missing mode": ("D^3 y = -6 D^2 y - 14 D y - 36 y + 24 u", "D^2 y = a1 D y + a0 y + b0 u", {}, []),
+    "no errors": ("D y = -2 y + 3 u", "D y = a0 y + b0 u", {"method": "multi-innovation"}, []),
+    "errors of instruments": (
+        "D y = -2 y + 3 u", "D y = a0 y + b0 u", {"method": "instrumental-variables"}, [],
+    ),
+    "explains nothing": ("D^2 y = -0.2 D y - 900 y + u", "D y = b u", {}, []),
+    "undamped": ("D^2 y = -4 y + u", "D^2 y = a0 y + b0 u", {}, []),
+    "integrates": ("D y = 3 u", "D y = b0 u", {}, []),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_saved_model_is_judged_as_its_result_was(fault, tmp_path, monkeypatch):
+    plant, words, given, warnings = FAULTS[fault]
+    real = estimating.uncertain
+    monkeypatch.setattr(estimating, "uncertain", lambda *args: [*real(*args), *warnings])
+    found = ftlm.identify(record(SQUARE, plant), ftlm.equation(words), **given)
+    other = record(CHIRP, plant, seed=2, name="chirp")
+    saved = ftlm.load_model(found.model.save(tmp_path / "m.json"))
+    for runs in ([], [other]):
+        live = found.verdict(found.validate(runs) if runs else None)
+        judged = saved_verdict(saved, [saved.compare(run) for run in runs])
+        assert (judged.level, judged.reasons) == (live.level, live.reasons)
+        assert live.trusted == (bool(runs) and fault in TRUSTED)
+
+
+TRUSTED = ("none", "not very vague", "errors of instruments", "integrates")
+
+
+def test_what_spoke_against_a_model_is_kept_in_words_alone(found, tmp_path):
+    document = json.loads(found.model.save(tmp_path / "m.json").read_text("utf-8"))
+    assert "against" not in document["estimate"]
+    for bad in ([{"level": "trust", "reason": "x"}], [{"level": "with care", "reason": ""}], ["x"], {}):
+        document["estimate"]["against"] = bad
+        (tmp_path / "m.json").write_text(json.dumps(document), encoding="utf-8")
+        with pytest.raises(ftlm.DataError, match="is no ftlm model"):
+            ftlm.load_model(tmp_path / "m.json")
+    document["estimate"]["against"] = [{"level": "do not use", "reason": "<script>x</script>"}]
+    (tmp_path / "m.json").write_text(json.dumps(document | {"schema": 8}), encoding="utf-8")
+    model = ftlm.load_model(tmp_path / "m.json")
+    assert saved_verdict(model, []).level == "do not use"
+    assert "<script>x" not in model_page(model, tmp_path / "m.html").read_text("utf-8")
 
 
 def test_residuals_below_a_thousandth_of_the_output_decide_nothing(found, checked):

@@ -29,6 +29,8 @@ USED_BY: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 #: What belongs to the search of orders: lattice methods use it only where an order is free.
 OF_SEARCHES = ("lattice", "criterion", "norm", "keep", "store", "executor")
+#: Innovation lengths that are laid side by side: those of the paper's tables.
+COMPARED_LENGTHS = (1, 3, 5, 7)
 #: Steps of refined instrumental variables a candidate; most stand still before.
 REFINEMENTS = 5
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import msgspec
-from msgspec import UNSET, UnsetType
+from msgspec import UNSET, Meta, UnsetType
 
 from ftlm.base.checks import check_pulses
 from ftlm.base.errors import ModelError
@@ -42,6 +43,24 @@ class Freedom(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     refinement: int = 1
 
 
+class Against(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What speaks against a model.
+
+    Parameters
+    ----------
+    level
+        What it makes of the model: ``"do not use"`` or ``"with care"``.
+    reason
+        In a sentence.
+    remedy
+        What to do about it.
+    """
+
+    level: Literal["do not use", "with care"]
+    reason: Annotated[str, Meta(min_length=1)]
+    remedy: str = ""
+
+
 class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What is known about how a model was identified, kept with it so that a report needs no other file.
 
@@ -68,6 +87,9 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         the others are ± 1.96 standard errors. Not set where no value has one.
     free
         What a joint fit found together, from which the next experiment is laid out. Not set for other methods.
+    against
+        What spoke against the model when it was identified, as its verdict weighs it; not set where nothing did, and in
+        files of earlier versions, which are judged by their warnings.
     """
 
     method: str
@@ -80,6 +102,7 @@ class Estimate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     warnings: tuple[str, ...] = ()
     intervals: dict[str, tuple[float | None, float | None]] | UnsetType = UNSET
     free: Freedom | UnsetType = UNSET
+    against: tuple[Against, ...] | UnsetType = UNSET
 
 
 @dataclass(frozen=True)

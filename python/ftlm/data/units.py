@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import unicodedata
 from collections.abc import Mapping
 
 from ftlm.base.checks import as_mapping, listed, nearest
@@ -20,6 +21,9 @@ UNITS: dict[str, tuple[str, float]] = {
     "rad/s": ("rad/s", 1.0), "deg/s": ("rad/s", math.pi / 180.0), "rpm": ("rad/s", 2.0 * math.pi / 60.0),
     "m/s": ("m/s", 1.0), "m/s^2": ("m/s^2", 1.0), "m/s²": ("m/s^2", 1.0), "g": ("m/s^2", 9.80665),
     "Pa": ("Pa", 1.0), "kPa": ("Pa", 1e3), "W": ("W", 1.0), "Hz": ("Hz", 1.0),
+    "hPa": ("Pa", 1e2), "MPa": ("Pa", 1e6), "mbar": ("Pa", 1e2), "bar": ("Pa", 1e5), "kN": ("N", 1e3),
+    "mN·m": ("N·m", 1e-3), "mNm": ("N·m", 1e-3), "kW": ("W", 1e3), "kHz": ("Hz", 1e3), "kV": ("V", 1e3),
+    "mm/s": ("m/s", 1e-3), "km/h": ("m/s", 1.0 / 3.6), "µm": ("m", 1e-6), "µA": ("A", 1e-6), "µV": ("V", 1e-6),
 }  # fmt: skip
 TIME_UNITS: dict[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "min": 60.0, "h": 3600.0}
 
@@ -30,9 +34,33 @@ _WRITTEN = {
     **dict.fromkeys(("msec", "millisecond", "milliseconds"), "ms"), "minute": "min", "minutes": "min",
     **dict.fromkeys(("usec", "microsecond", "microseconds"), "us"),
     **dict.fromkeys(("sekunde", "sekunden", "sek"), "s"), "millisekunden": "ms", "minuten": "min", "stunden": "h",
+    **dict.fromkeys(("millisec", "millisecs", "msek"), "ms"), "std": "h", "mikrosekunden": "us",
+}  # fmt: skip
+#: Other ways to write units of signals in files, without capitals and spaces; of those of "" nothing is converted.
+_SPELLED = {
+    **{name: unit for unit, names in {
+        "deg": "degree degrees degs grad grd winkelgrad", "rad": "radian radians radiant",
+        "deg/s": "°/s deg/sec dps grad/s grd/s degree/s degrees/s degrees/sec", "rad/s": "rad/sec rads/s rad·s^-1",
+        "rpm": "rpm u/min 1/min r/min rev/min min^-1 min-1 upm u.p.m r.p.m",
+        "A": "amp amps ampere amperes", "mA": "milliamp milliamps milliampere", "V": "volt volts vdc",
+        "mV": "millivolt millivolts", "m": "metre metres meter meters", "cm": "centimetre centimeter zentimeter",
+        "mm": "millimetre millimetres millimeter millimeters", "µm": "micron microns um", "µA": "ua", "µV": "uv",
+        "N": "newton newtons", "N·m": "newtonmeter newtonmetre newtonmetres newtonmeters",
+        "degC": "celsius gradcelsius gradc degcelsius", "K": "kelvin", "W": "watt watts", "Hz": "hertz",
+        "Pa": "pascal", "m/s^2": "m/s2 m/s^2 m/s/s m/sec^2 m/sec2", "m/s": "m/sec",
+    }.items() for name in names.split()},
+    **dict.fromkeys(
+        (
+            "%", "-", "db", "mhz", "mw", "kg", "l/min", "m3/h", "nm", "ohm", "ω", "mω", "kω", "ma", "1/s", "s^-1",
+            "a.u", "none", "count", "counts", "lsb", "j", "kj", "ah", "vac", "vrms", "arms", "degf", "°f", "ft", "inch",
+            "psi", "lbf", "kgf", "gauss", "mpa", "mn",
+        ),
+        "",
+    ),
 }  # fmt: skip
 _BRACKETED = re.compile(r"(.*?)\s*\[\s*([^\[\]]*?)\s*\]")
-_OTHERWISE = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*[/,]\s*(\S+)|_(\S+))")
+_OTHERWISE = re.compile(r"(.+?)(?:\s*\(\s*([^()]*?)\s*\)|\s*[/,]\s*(\S+)|\s+in\s+(\S+)|_(\S+))")
+_LONGEST_UNIT = 24
 _TIME_NAMES = frozenset(("t", "time", "seconds"))
 
 
@@ -40,15 +68,32 @@ def header_time(name: str) -> tuple[str, str | None]:
     """Split the name of a column of times into what it is called, without capitals, and the unit that it states.
 
     The unit is one of :data:`TIME_UNITS`, None where none is stated, and as it stands where square brackets hold
-    something else. Written as in ``time [ms]``, ``time (ms)``, ``time/ms``, ``time, ms`` or ``time_ms``.
+    something else. Written as in ``time [ms]``, ``time (ms)``, ``time/ms``, ``time, ms``, ``time in ms``, ``time_ms``.
     """
     folded = " ".join(name.split()).casefold()  # runs of spaces would cost their cube below
     bracketed = _BRACKETED.fullmatch(folded)
     if bracketed and bracketed[2]:
-        return bracketed[1], _WRITTEN.get(bracketed[2], bracketed[2])
+        return bracketed[1], _WRITTEN.get(bracketed[2].rstrip("."), bracketed[2])
     otherwise = _OTHERWISE.fullmatch(folded)
-    unit = None if otherwise is None else _WRITTEN.get(otherwise[2] or otherwise[3] or otherwise[4] or "")
+    stated = "" if otherwise is None else next((part for part in otherwise.groups()[1:] if part), "")
+    unit = _WRITTEN.get(stated.rstrip("."))
     return (folded, None) if otherwise is None or unit is None else (otherwise[1], unit)
+
+
+def spelled_unit(word: str) -> str | None:
+    """The unit of :data:`UNITS` that a word in a file means, "" where it is one of no conversion, None where none.
+
+    Short ones by their letters, since m and M differ; words without capitals; ``deg.``, ``N m`` and ``º`` as meant.
+    """
+    if len(word) > _LONGEST_UNIT:
+        return None
+    # The ordinal sign and the ring are typed for the degree; Ω and µ have two signs each.
+    text = unicodedata.normalize("NFC", word.replace("º", "°").replace("˚", "°")).replace("μ", "µ").replace(" ", "")
+    text = text.rstrip(".").replace("⁻¹", "^-1").replace("³", "3")
+    if text in UNITS:
+        return text or None
+    folded = text.casefold()
+    return "" if folded in _WRITTEN else _SPELLED.get(folded)
 
 
 def is_time_name(name: str) -> bool:
@@ -102,7 +147,7 @@ def checked_units(units: Mapping[str, str] | None, signals: tuple[str, ...]) -> 
         if not isinstance(unit, str) or unit not in UNITS:
             raise DataError(
                 f"unit {unit!r} of signal {signal!r} is unknown{nearest(unit, UNITS)}; "
-                f"the known units are {listed(UNITS)}; convert other data before loading"
+                f"the known units are {listed(UNITS, len(UNITS))}; convert other data before loading"
             )
     return {signal: UNITS[str(given.get(signal, ""))] for signal in signals}
 

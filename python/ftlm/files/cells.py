@@ -6,19 +6,11 @@ import csv
 import re
 
 from ftlm.base.errors import DataError
-from ftlm.data.units import TIME_UNITS, UNITS, header_time
+from ftlm.data.units import TIME_UNITS, header_time, spelled_unit
 
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?|[+-]?\d+,(?:[eE][+-]?\d+)?")
-#: What stands in rows of units beside what ftlm converts.
-_UNIT_WORDS = frozenset(
-    (
-        "volt", "volts", "amp", "amps", "ampere", "amperes", "second", "seconds", "sec", "degree", "degrees", "radian",
-        "radians", "metre", "meter", "newton", "kelvin", "celsius", "watt", "hertz", "pascal", "bar", "mbar", "%", "-",
-        "db", "khz", "mhz", "kw", "mw", "mpa", "kn", "kg", "l/min", "m³/h", "nm", "ohm", "ω", "µv", "uv", "ua", "µa",
-        "hpa", "1/min", "u/min", "a.u.", "none", "count", "counts", "lsb", "km/h", "um", "µm", "°", "j", "kj", "ah",
-        "vdc", "vac",
-    )
-)  # fmt: skip
+#: What stands before a unit at the end of a name, where it has no brackets.
+_BEFORE_UNITS = (" / ", ",", " in ")
 
 
 def number(cell: str, *, comma: bool = False) -> float:
@@ -57,14 +49,21 @@ def split(lines: list[str], separator: str | None, source: str, first: int) -> l
 
 
 def stated_unit(name: str) -> tuple[str, str]:
-    """What a column is called, and the unit that its name states in brackets, both as written; "" for none."""
+    """What a column is called, and the unit that its name states, both as written; "" for none.
+
+    Any in brackets; a known one in ``Strom / A``, ``Current, A`` and ``Winkel in Grad``.
+    """
     # Without regular expressions, whose time would grow with the cube of a long name's spaces.
     text = name.rstrip()
     opening = {"]": "[", ")": "("}.get(text[-1:])
     if opening is None:
+        for before in _BEFORE_UNITS:
+            bare, mark, unit = text.rpartition(before)
+            if mark and bare.strip() and spelled_unit(unit.strip()) is not None:
+                return bare.rstrip(), unit.strip()
         return name, ""
     bare, mark, unit = text[:-1].rpartition(opening)
-    bare, unit = bare.rstrip(), unit.strip()
+    bare, unit = bare.rstrip().removesuffix(" /").rstrip(), unit.strip()
     return (bare, unit) if mark and bare and unit and text[-1] not in unit else (name, "")
 
 
@@ -80,7 +79,7 @@ def is_unit(cell: str) -> bool:
     bracketed = _bracketed(cell)
     word = cell.strip() if bracketed is None else bracketed
     short = bracketed is not None and len(word) <= 12
-    return word in UNITS or word.casefold() in _UNIT_WORDS or is_time_unit(word) or short
+    return not word or spelled_unit(word) is not None or is_time_unit(word) or short
 
 
 def is_time_unit(word: str) -> bool:

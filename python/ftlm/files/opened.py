@@ -289,8 +289,9 @@ class _Opening:
             for name, spec in asked.items():
                 column = self.pool.find(spec, f"signal {name!r}")
                 roles[column.name] = (role, name)
-                if column.stated and name not in wanted.units and known_unit(column.stated) and header is None:
-                    wanted.units[name] = known_unit(column.stated)
+                unit = known_unit(column.stated, column.name)
+                if unit and name not in wanted.units and header is None:
+                    wanted.units[name] = unit
         said = []
         if guessed:
             inputs, outputs = listed(wanted.inputs.values(), 10), listed(wanted.outputs.values(), 10)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 
 from ftlm.data.names import CSV_TIME
-from ftlm.data.units import UNITS
+from ftlm.data.units import spelled_unit
 from ftlm.files.cells import stated_unit
 
 _DRIVES = frozenset(
@@ -22,11 +22,8 @@ _FOLLOWS = frozenset(
 )  # fmt: skip
 #: A motor is driven by its voltage, a cell answers with it.
 _EITHER = frozenset(["voltage", "volt", "volts", "spannung", "v"])
-_UNITS = {
-    "volt": "V", "volts": "V", "amp": "A", "amps": "A", "ampere": "A", "amperes": "A", "degree": "deg",
-    "degrees": "deg", "radian": "rad", "radians": "rad", "metre": "m", "meter": "m", "newton": "N", "kelvin": "K",
-    "celsius": "degC", "watt": "W", "hertz": "Hz", "pascal": "Pa", "u/min": "rpm", "1/min": "rpm",
-}  # fmt: skip
+#: Degrees of these are no angles.
+_WARM = frozenset(("temp", "temperature", "temperatur", "heat", "heater", "heating", "thermo"))
 
 
 def _words(column: str) -> set[str]:
@@ -52,11 +49,10 @@ def guessed_roles(columns: Sequence[str]) -> tuple[list[str], list[str]]:
     return (drives, follows) if drives and follows else ([], [])
 
 
-def known_unit(stated: str) -> str:
-    """The unit of ftlm that a file's unit is; "" where it is none."""
-    if stated in UNITS:
-        return stated
-    return _UNITS.get(stated.casefold(), "")
+def known_unit(stated: str, column: str = "") -> str:
+    """The unit of ftlm that a file's unit is; "" where it is none, or degrees of what may be a temperature."""
+    unit = spelled_unit(stated) or ""
+    return "" if unit in ("deg", "°") and _words(column) & _WARM else unit
 
 
 def signal_names(columns: Mapping[str, str]) -> dict[str, str]:

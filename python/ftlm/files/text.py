@@ -349,6 +349,9 @@ def _line_blocks(path: Path, stream: BinaryIO | _Limited, encoding: str) -> Iter
             data = carry + decoder.decode(block, final=not block)
         except UnicodeError as error:
             raise _undecodable(path, error, number_ + carry.count("\n"), encoding) from None
+        if not block:
+            # What old programs end a text with.
+            data = data.removesuffix("\x1a")
         if not newline:
             newline = "\r" if "\r" in data and "\n" not in data else "\n" if data else ""
         zero = data.find("\0")

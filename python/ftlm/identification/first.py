@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from markupsafe import Markup
 
 from ftlm.base.errors import FtlmError
+from ftlm.identification.summary import order_in_words
 from ftlm.identification.verdict import Verdict
 from ftlm.judge.concerns import SHOWN, concerns
 from ftlm.model.charts import pole_charts
@@ -78,13 +79,14 @@ def behaviour_tables(model: Model) -> list[Table]:
             above, below = (model.units.get(n, "") for n in (state.output, state.input))
             pair = Markup("{} from {}").format(symbol_html(state.output), symbol_html(state.input))
             unit = f"{above}/{below}" if above and below else ""
+            sure = order_in_words(state)
             if state.order > 0:
                 runs = f" t^{state.order:.4g}/Γ({state.order + 1:.4g})" if state.order != 1 else " per second"
-                rows.append([pair, state.rate, state.error, unit, f"none: it runs on, so much{runs}"])
+                rows.append([pair, state.rate, state.error, unit, f"none: it runs on, so much{runs}{sure}"])
             else:
                 back = state.order < 0
                 what = "0: it dies away" if back else "gain"
-                rows.append([pair, state.gain, None if back else state.error, unit, what])
+                rows.append([pair, state.gain, None if back else state.error, unit, f"{what}{sure}"])
         tables.append(
             Table("Steady state under a unit step", ("output", "value", "standard error", "unit", "what it is"), rows)
         )

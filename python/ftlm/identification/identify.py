@@ -8,6 +8,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any, Literal
 
+import msgspec
 from msgspec import UNSET
 
 from ftlm.base.errors import DataError, ModelError
@@ -26,6 +27,7 @@ from ftlm.identification.judged import Task
 from ftlm.identification.offsets import with_decided_offset
 from ftlm.identification.reference import by_reference, driven_by
 from ftlm.identification.result import Identification
+from ftlm.identification.verdict import against_result, against_saved
 from ftlm.identification.warnings import discretisation, growing, one_sided, silent, unexcited, unslowed
 from ftlm.judge.comparison import Comparison, compared_samples, free_runs
 from ftlm.judge.criteria import InformationCriteria, information_criteria
@@ -247,11 +249,16 @@ def judged(fit: Fit) -> Identification:
         pass
     warnings += [] if tests is None else _residual_warnings(fit, tests)
     unique = tuple(dict.fromkeys(warnings))
-    model = replace(model, estimate=_estimate(fit, comparison, criteria, unique))
-    return Identification(
-        model, fit.method, comparison, fit.searches, fit.settings, unique, fit.joint, tests, criteria, fit.task,
-        fit.errors,
+    known = _estimate(fit, comparison, criteria, unique)
+    result = Identification(
+        replace(model, estimate=known), fit.method, comparison, fit.searches, fit.settings, unique, fit.joint, tests,
+        criteria, fit.task, fit.errors,
     )  # fmt: skip
+    against = tuple(against_result(result))
+    if not (against or against_saved(known)):
+        return result
+    # Warnings alone do not say what weighs, so the file does.
+    return replace(result, model=replace(model, estimate=msgspec.structs.replace(known, against=against)))
 
 
 def _residual_warnings(fit: Fit, tests: Residuals) -> list[str]:

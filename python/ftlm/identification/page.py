@@ -14,6 +14,7 @@ from markupsafe import Markup
 from ftlm.base.output import check_free
 from ftlm.data.limits import WORDS
 from ftlm.data.run import Run
+from ftlm.data.settings import COMPARED_LENGTHS
 from ftlm.data.several import as_runs
 from ftlm.fit.joint import JointFit
 from ftlm.fit.recursion import multi_innovation_trace, trace_chart
@@ -26,7 +27,7 @@ from ftlm.identification.warnings import validate
 from ftlm.judge.charts import comparison_charts, input_charts, residual_charts, residual_series
 from ftlm.judge.comparison import Comparison, errors_table, initial_terms_table, warned
 from ftlm.judge.criteria import InformationCriteria, information_table
-from ftlm.judge.residuals import Residuals, resid, residual_table
+from ftlm.judge.residuals import LAGS, Residuals, resid, residual_table
 from ftlm.model.charts import bode_charts, response_frequencies
 from ftlm.model.model import Model
 from ftlm.model.typesetting import equations_html, parameter_table
@@ -49,10 +50,7 @@ SMALL_CHARTS = 24
 NOTEBOOK_POINTS = 600
 #: Points of a line of residuals in a small chart.
 SERIES_POINTS = 600
-#: Lags of the residual tests.
-LAGS = 25
-#: Innovation lengths of the paper's tables, and points of a convergence curve.
-INNOVATION_LENGTHS = (1, 3, 5, 7)
+#: Points of a convergence curve.
 TRACE_POINTS = 64
 #: Of a model with friction, where others have their stability.
 STICKS = "The body rests while friction holds it, so that no poles say how it comes to rest."
@@ -286,7 +284,7 @@ def _traces(result: Judged) -> list[Figure]:
             continue
         traces = [
             (f"p = {p}", multi_innovation_trace(run, at_orders, innovation_length=p, every=every, **options))
-            for p in sorted({*INNOVATION_LENGTHS, int(used["innovation_length"])})
+            for p in sorted({*COMPARED_LENGTHS, int(used["innovation_length"])})
         ]
         figures.append(trace_chart(traces, title=f"Error (45) of {symbol(solved.output)}, run {run.name}"))
     return figures

@@ -235,13 +235,15 @@ class Identification(Judged):
         equation says that an output equals itself.
 
         *With care*: a fit that falls by 20 points on validation, over all runs or on one, or leaves there more than a
-        tenth and three times as much as on its own runs, or more than a twentieth and five times as much; residuals
-        that follow an input; a closed loop with
-        coloured residuals; residuals that are not white (all three no smaller than a thousandth of the output); a fit
-        that did not stand still; a number that nothing tells, or a coefficient known to no more than half of itself, an
-        order to no more than 0.25; growth that cannot be told; an
-        offset that is hidden by what a run did before its start; every other warning of weight; no standard errors; no
-        validation.
+        tenth and three times as much as on its own runs, or more than a twentieth and five times as much; growth that
+        cannot be told, or a swing whose damping is not told apart from 0 (an integrator is no fault); residuals that
+        follow an input; a closed loop with coloured residuals; residuals that are not white (all three no smaller than
+        a thousandth of the output); a fit that did not stand still; a number that nothing tells, a coefficient known to
+        no more than half of itself, an order to no more than 0.25, a delay or a limit whose interval has no end; an
+        offset that is hidden by what a run did before its start; intervals that are rough and every other warning of
+        weight; no standard errors; no validation.
+
+        A saved model keeps what spoke against it, and is judged alike.
         """
         if not (validation is None or isinstance(validation, Comparison)):
             raise ModelError(f"validation is {type(validation).__name__}; give what validate(run) returns")

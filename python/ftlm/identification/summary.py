@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from ftlm.base.errors import FtlmError
+from ftlm.base.statistics import NORMAL_95
 from ftlm.data.equations import Equation, numeric
 from ftlm.data.orders import Order
 from ftlm.identification.judged import Judged
@@ -124,13 +125,24 @@ def gain_in_words(state: SteadyState, model: Model) -> str:
     pair = f"{state.output} from {state.input}"
     above, below = (model.units.get(n, "") for n in (state.output, state.input))
     unit = f" {above}/{below}" if above and below else ""
-    rate = with_error(state.rate, state.error)
+    rate, sure = with_error(state.rate, state.error), order_in_words(state)
     if state.order > 0:
         course = "per second" if state.order == 1 else f"t^{state.order:.4g}/Γ({state.order + 1:.4g})"
-        return f"{pair}: none, it integrates: {rate}{unit} {course}"
+        return f"{pair}: none, it integrates: {rate}{unit} {course}{sure}"
     if state.order < 0:
-        return f"{pair}: 0, a step dies away"
-    return f"{pair}: {rate}{unit}"
+        return f"{pair}: 0, a step dies away{sure}"
+    return f"{pair}: {rate}{unit}{sure}"
+
+
+def order_in_words(state: SteadyState) -> str:
+    """How sure the order is with which an output runs on, where that was estimated; and whether it may be another."""
+    error = state.order_error
+    if not error:
+        return ""
+    whole = float(round(state.order))
+    told = abs(state.order - whole) > NORMAL_95 * error
+    meaning = {0.0: "a gain", 1.0: "an integrator"}.get(whole, f"order {whole:g}")
+    return f"; order {with_error(state.order, error)}" + ("" if told else f", which may be {whole:g}: {meaning}")
 
 
 def fits_in_words(result: Judged, validation: Comparison | None) -> list[str]:

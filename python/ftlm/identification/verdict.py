@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, Literal, cast
 
 from markupsafe import Markup
+from msgspec import UNSET
 
+from ftlm.base.errors import FtlmError
+from ftlm.base.statistics import NORMAL_95
+from ftlm.data.solved import Against, Estimate
 from ftlm.identification.judged import Judged
 from ftlm.judge.comparison import LOST, USELESS, Comparison
 from ftlm.judge.concerns import BAD, CARE, KINDS, Kind, concerns, kind_of
@@ -17,6 +22,7 @@ from ftlm.judge.metrics import Metrics
 from ftlm.judge.residuals import NEGLIGIBLE
 from ftlm.model.model import Model
 from ftlm.paint.text import unbounded
+from ftlm.solve.modes import modes
 
 TRUST = "trust"
 NOT_TRIED = "no run that it was not fitted to has been tried"
@@ -101,11 +107,8 @@ def validated(result: Judged, comparison: Comparison) -> Validation:
     return Validation(**own, verdict=verdict(result, comparison))
 
 
-@dataclass(frozen=True)
-class _Against:
-    level: str
-    reason: str
-    remedy: str
+def _against(level: str, reason: str, remedy: str) -> Against:
+    return Against(cast(Literal["do not use", "with care"], level), reason, remedy)
 
 
 def verdict(result: Judged, validation: Comparison | None = None) -> Verdict:
@@ -113,15 +116,27 @@ def verdict(result: Judged, validation: Comparison | None = None) -> Verdict:
 
     Warnings of weight that no rule names count in the order of :data:`ftlm.judge.concerns.KINDS`.
     """
-    against = _most_serious([*_rules(result, validation)])
+    runs = () if validation is None else (validation,)
+    tried = validation is not None and _is_other(validation)
+    against = _most_serious(against_result(result), result.fit_percent, runs, tried)
     if against is not None:
         return against
     fits = ", ".join(f"{o} {f.fit:.3g} %" for o, f in (validation or result.comparison).output_error.items())
     return Verdict(TRUST, f"it predicts runs it was not fitted to ({fits}), residuals are noise, every number is known")
 
 
-def _most_serious(found: Sequence[_Against]) -> Verdict | None:
-    """The verdict of what speaks against a model; None where nothing does."""
+def _most_serious(
+    own: Sequence[Against], before: Mapping[str, float], runs: Sequence[Comparison], tried: bool
+) -> Verdict | None:
+    """The verdict of what speaks against a model by itself and on other runs; None where nothing does."""
+    found = [a for a in own if a.level == BAD]
+    for comparison in runs:
+        found += _useless("the validation run of ", comparison)
+    for comparison in runs:
+        found += _lost(before, comparison)
+    found += [a for a in own if a.level == CARE]
+    if not tried:
+        found.append(_against(CARE, NOT_TRIED, "validate(run), or --validation FILE"))
     bad = [a for a in found if a.level == BAD] + [a for a in found if a.level == CARE]
     if not bad:
         return None
@@ -130,51 +145,55 @@ def _most_serious(found: Sequence[_Against]) -> Verdict | None:
 
 def saved_verdict(model: Model, validation: Sequence[Comparison]) -> Verdict:
     """Judge a saved model by what its file knows of its identification, and by runs that it is compared with."""
-    known, found = model.estimate, [*_growing(model)]
-    for comparison in validation:
-        found += _useless("the validation run of ", comparison)
+    known, own = model.estimate, [*_growing(model)]
     if known is None:
-        found.append(_Against(CARE, "its file says nothing of how it was identified", "compare it with measured runs"))
+        own.append(_against(CARE, "its file says nothing of how it was identified", "compare it with measured runs"))
+        judged = _most_serious(own, {}, validation, True)
     else:
-        unseen = [n for n, e in known.standard_errors.items() if e is None]
-        if unseen:
-            reason = f"the runs do not tell {_listed(unseen)} apart"
-            found.append(_Against(BAD, reason, _KINDS["unseen"].remedy))
+        own += against_saved(known) if known.against is UNSET else known.against
         before = {n: f for n, f in known.fit.items() if f is not None}
-        for comparison in validation:
-            found += _lost(before, comparison)
-        for concern in concerns([w for w in known.warnings if not _of_noise(w, before)]):
-            if concern.kind.level in (BAD, CARE) and concern.kind.name not in ("unstable", "unseen"):
-                reason = f"{concern.kind.what}: {_first(concern.warnings[0])}"
-                found.append(_Against(concern.kind.level, reason, concern.kind.remedy))
-        if not known.standard_errors:
-            found.append(_Against(CARE, f"{known.method} gives no standard errors", "use method='output-error'"))
         seen = any(name in known.runs for c in validation for name, _, _ in c.per_run)
-        if not validation or seen:
-            found.append(_Against(CARE, NOT_TRIED, "give a run that the model has not seen"))
-    against = _most_serious(found)
-    if against is not None:
-        return against
+        judged = _most_serious(own, before, validation, bool(validation) and not seen)
+    if judged is not None:
+        return judged
     fits = ", ".join(f"{o} {f.fit:.3g} %" for c in validation for o, f in c.output_error.items())
     return Verdict(TRUST, f"it predicts runs it was not fitted to ({fits}), and nothing spoke against its fit")
 
 
-def _rules(result: Judged, validation: Comparison | None) -> Iterator[_Against]:
-    """What speaks against a result, in the order of weight within a level."""
+def against_saved(known: Estimate) -> list[Against]:
+    """What speaks against a model whose file says no more than warnings and standard errors."""
+    found = []
+    unseen = [n for n, e in known.standard_errors.items() if e is None]
+    if unseen:
+        found.append(_against(BAD, f"the runs do not tell {_listed(unseen)} apart", _KINDS["unseen"].remedy))
+    before = {n: f for n, f in known.fit.items() if f is not None}
+    for concern in concerns([w for w in known.warnings if not _of_noise(w, before)]):
+        if concern.kind.level in (BAD, CARE) and concern.kind.name not in ("unstable", "unseen"):
+            reason = f"{concern.kind.what}: {_first(concern.warnings[0])}"
+            found.append(_against(concern.kind.level, reason, concern.kind.remedy))
+    if not known.standard_errors:
+        found.append(_against(CARE, f"{known.method} gives no standard errors", "use method='output-error'"))
+    return found
+
+
+def against_result(result: Judged) -> list[Against]:
+    """What speaks against a result by itself, whatever it is compared with, in the order of weight within a level."""
+    return [*_rules(result)]
+
+
+def _rules(result: Judged) -> Iterator[Against]:
     kinds = {c.kind.name: c for c in concerns(result.warnings)}
 
-    def of(kind: Kind, reason: str = "", remedy: str = "") -> _Against:
-        return _Against(kind.level, reason or kind.what, remedy or kind.remedy)
+    def of(kind: Kind, reason: str = "", remedy: str = "") -> Against:
+        return _against(kind.level, reason or kind.what, remedy or kind.remedy)
 
-    yield from _free_runs(result, validation, kinds.keys())
+    yield from _free_runs(result)
     errors, joint = result.standard_errors, result.joint
     unseen = [n for n, e in errors.items() if not math.isfinite(e)]
     if unseen:
         yield of(_KINDS["unseen"], f"the runs do not tell {_listed(unseen)} apart")
     if "identity" in kinds:
         yield of(_KINDS["identity"])
-    if validation is not None:
-        yield from _lost(result.fit_percent, validation)
     yield from _residuals(result)
     if joint is not None and not joint.converged:
         kinds.pop("provisional", None)
@@ -182,6 +201,9 @@ def _rules(result: Judged, validation: Comparison | None) -> Iterator[_Against]:
     vague = [_vague(result, n) for n in errors if n not in unseen and _is_vague(result, n)]
     if vague:
         yield of(_KINDS["vague"], f"the runs hardly tell {_listed(vague)}")
+    endless = [n for n, p in result.profiles.items() if _is_of_input(result, n) and math.isinf(p.high)]
+    if endless:
+        yield of(_KINDS["vague"], f"the runs do not bound {_listed(endless)}")
     hidden = dict.fromkeys(o for run in result.comparison.offsets for o, values in run.items() if not values)
     if hidden:
         words = f"the offset of {_listed(list(hidden))} is not told apart from what a run did before its start"
@@ -192,44 +214,57 @@ def _rules(result: Judged, validation: Comparison | None) -> Iterator[_Against]:
         if name not in judged and concern.kind.level in (BAD, CARE):
             yield of(concern.kind, f"{concern.kind.what}: {_first(concern.warnings[0])}")
     if not errors:
-        yield _Against(
+        yield _against(
             CARE, f"{result.method} gives no standard errors, so nothing says how sure its numbers are",
             "use method='output-error'",
         )  # fmt: skip
-    if validation is None or not _is_other(validation):
-        yield _Against(CARE, NOT_TRIED, "validate(run), or --validation FILE")
 
 
-def _free_runs(result: Judged, validation: Comparison | None, kinds: object) -> Iterator[_Against]:
+def _free_runs(result: Judged) -> Iterator[Against]:
     """What free runs say: whether they stay, and what they explain."""
     if not all(math.isfinite(f.nr) for f in result.output_error.values()):
-        yield _Against(BAD, _KINDS["range"].what, _KINDS["range"].remedy)
+        yield _against(BAD, _KINDS["range"].what, _KINDS["range"].remedy)
     yield from _growing(result.model)
     yield from _useless("", result.comparison)
-    if validation is not None:
-        yield from _useless("the validation run of ", validation)
 
 
-def _growing(model: Model) -> Iterator[_Against]:
-    """Poles with a positive real part; with friction no poles say what a body does."""
+def _growing(model: Model) -> Iterator[Against]:
+    """Poles with a positive real part, and swings that never die away; with friction no poles say what a body does.
+
+    A pole at the origin is an integrator, which machines are.
+    """
     if model.structure.has_friction:
         return
     stable = model.stability(coupling=model.structure.coupling)
     if math.isnan(stable.unstable_poles):
-        yield _Against(CARE, "whether its free run grows cannot be told", _KINDS["unstable"].remedy)
+        yield _against(CARE, "whether its free run grows cannot be told", _KINDS["unstable"].remedy)
     elif stable.unstable_poles > 0:
         count = int(stable.unstable_poles)
         poles = f"{count} pole{'s' if count > 1 else ''} with a positive real part"
-        yield _Against(BAD, f"{_KINDS['unstable'].what} ({poles})", _KINDS["unstable"].remedy)
+        yield _against(BAD, f"{_KINDS['unstable'].what} ({poles})", _KINDS["unstable"].remedy)
+    else:
+        with contextlib.suppress(FtlmError):
+            yield from _undamped(model)
 
 
-def _useless(where: str, comparison: Comparison) -> Iterator[_Against]:
+def _undamped(model: Model) -> Iterator[Against]:
+    """Swings of which nothing says that they die away: no term damps them, or hardly anything tells how much."""
+    for mode in modes(model, coupling=model.structure.coupling):
+        if mode.swings and mode.damping - NORMAL_95 * (mode.damping_error or 0.0) <= 0.0:
+            spread = "" if mode.damping_error is None else f" ± {mode.damping_error:.2g}"
+            words = f"a swing of {mode.frequency:.4g} rad/s may never die away (damping {mode.damping:.2g}{spread})"
+            remedy = "add the term that damps it, or record until it has died away"
+            yield _against(CARE, words, remedy)
+            return
+
+
+def _useless(where: str, comparison: Comparison) -> Iterator[Against]:
     """Outputs that the free run explains by less than half, over all runs or on one: a large run hides a small one."""
     for run, errors in _each(comparison):
         useless = [o for o, f in errors.items() if not f.nr <= USELESS]
         if useless:
             shown = ", ".join(f"{o} (fit {errors[o].fit:.3g} %{run})" for o in useless)
-            yield _Against(BAD, f"the free run explains little of {where}{shown}", _KINDS["useless"].remedy)
+            yield _against(BAD, f"the free run explains little of {where}{shown}", _KINDS["useless"].remedy)
             return
 
 
@@ -241,7 +276,7 @@ def _each(comparison: Comparison) -> Iterator[tuple[str, Mapping[str, Metrics]]]
             yield f" on {name}", errors
 
 
-def _lost(before: Mapping[str, float], validation: Comparison) -> Iterator[_Against]:
+def _lost(before: Mapping[str, float], validation: Comparison) -> Iterator[Against]:
     """Outputs whose fit on validation is far below that on estimation: by points, or by how much more is left over."""
     for run, errors in _each(validation):
         for output, figures in errors.items():
@@ -250,7 +285,7 @@ def _lost(before: Mapping[str, float], validation: Comparison) -> Iterator[_Agai
             left, own = 100.0 - figures.fit, 100.0 - before[output]
             if not (left <= own + LOST and all(left <= times * own or left <= little for times, little in FAR_MORE)):
                 words = f"the fit of {output} falls from {before[output]:.3g} to {figures.fit:.3g} % on validation{run}"
-                yield _Against(CARE, words, _KINDS["lost"].remedy)
+                yield _against(CARE, words, _KINDS["lost"].remedy)
                 return
 
 
@@ -262,10 +297,10 @@ def _of_noise(warning: str, fits: Mapping[str, float]) -> bool:
     return bool(named) and all(100.0 - fits[o] <= 100.0 * NEGLIGIBLE for o in named)
 
 
-def _residuals(result: Judged) -> Iterator[_Against]:
+def _residuals(result: Judged) -> Iterator[Against]:
     """What residual tests say: a loop, an input that they follow, a colour."""
     if result.residuals is None:
-        yield _Against(CARE, "the runs are too short for residual tests", "record a longer run")
+        yield _against(CARE, "the runs are too short for residual tests", "record a longer run")
         return
     looped = "reference" in result.settings
     judged = {o: r for o, r in result.residuals.outputs.items() if not r.nr <= NEGLIGIBLE}
@@ -273,16 +308,16 @@ def _residuals(result: Judged) -> Iterator[_Against]:
     following = {o: [s for s, t in r.judged.items() if t.failed] for o, r in judged.items()}
     if any(following.values()):
         words = ", ".join(f"{o} still follow {_listed(signals)}" for o, signals in following.items() if signals)
-        yield _Against(CARE, f"residuals of {words}: it leaves something out", _KINDS["residuals"].remedy)
+        yield _against(CARE, f"residuals of {words}: it leaves something out", _KINDS["residuals"].remedy)
     for output, tests in judged.items():
         if tests.feedback and not tests.whiteness.passed and not looped:
             words = f"{_listed(tests.feedback)} answers {output}, a closed loop, and what comes back biases the numbers"
-            yield _Against(CARE, words, _KINDS["loop"].remedy)
+            yield _against(CARE, words, _KINDS["loop"].remedy)
     # With a reference the loop is known: its noise is no part of what the model was estimated from, nor what it lacks.
     coloured = [] if looped else [o for o, r in judged.items() if not r.whiteness.passed]
     if coloured:
         words = f"residuals of {_listed(coloured)} are not white: it leaves something out"
-        yield _Against(CARE, words, _KINDS["residuals"].remedy)
+        yield _against(CARE, words, _KINDS["residuals"].remedy)
 
 
 def _is_vague(result: Judged, name: str) -> bool:
@@ -290,7 +325,7 @@ def _is_vague(result: Judged, name: str) -> bool:
     error = result.standard_errors[name]
     numbers = {**result.coefficients, **({} if result.joint is None else result.joint.coefficients)}
     if name in result.orders:
-        return error > VAGUE_ORDER
+        return error > VAGUE_ORDER or (name in result.profiles and math.isinf(result.profiles[name].high))
     if name not in numbers:
         # A delay or a limit may well be 0.
         return False
@@ -298,6 +333,12 @@ def _is_vague(result: Judged, name: str) -> bool:
         known = result.profiles[name]
         return known.is_open or 0.0 in known
     return error > VAGUE_SHARE * abs(numbers[name])
+
+
+def _is_of_input(result: Judged, name: str) -> bool:
+    """Whether a number is a delay, a saturation or a dead zone: each may well be 0, and none may have no end."""
+    structure = result.model.structure
+    return name in {f"delay_{s}" for s in structure.delay} | {limit.name for limit in structure.limits}
 
 
 def _vague(result: Judged, name: str) -> str:

@@ -93,8 +93,11 @@ KINDS = (
         "vague", CARE, "the runs hardly tell some numbers", "fix a number, leave a term out, or record a richer input",
         (
             "cannot be told", "is not different from 0", "do not bound",
-            "what is seen of friction", "free numbers, but", "too few for orders", "intervals are rough",
+            "what is seen of friction", "free numbers, but", "too few for orders",
         ),
+    ),
+    Kind(
+        "rough", CARE, "some intervals are rough", "intervals='profile' finds them", ("intervals are rough",),
     ),
     Kind(
         "step", CARE, "the sampling is coarse for this model", "sample faster, raise m, or trust its fast poles less",

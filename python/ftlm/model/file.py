@@ -23,8 +23,9 @@ from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
 MAX_MODEL_BYTES = 1 << 20
 #: Schema of a model that every version since the first reads, of one that has an offset, of one that has intervals by
 #: profile likelihood or whose sensor filter names what is no output, of one that has friction, of
-#: one whose inputs have limits, of one whose friction falls with speed, and of one that says what was free in its fit.
-SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA, STRIBECK_SCHEMA, FREE_SCHEMA = 2, 3, 4, 5, 6, 7, 8
+#: one whose inputs have limits, of one whose friction falls with speed, and of one that says what was free in its fit or
+#: what spoke against it.
+SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA, STRIBECK_SCHEMA, FIT_SCHEMA = 2, 3, 4, 5, 6, 7, 8
 
 
 class TermFile(msgspec.Struct, forbid_unknown_fields=True):
@@ -216,12 +217,13 @@ def schema_of(
 ) -> int:  # fmt: skip
     """Schema of a model: the least that has all of it, so that what has less is as it was."""
     profiled = estimate is not None and estimate.intervals is not UNSET
+    doubted = estimate is not None and estimate.against is not UNSET
     named = sensor is not None and not isinstance(sensor.signals, UnsetType)
     known = estimate is not None and estimate.free is not UNSET
     return max(
         SCHEMA if isinstance(offset, UnsetType) else OFFSET_SCHEMA, PROFILE_SCHEMA if profiled or named else SCHEMA,
         SCHEMA if isinstance(limits, UnsetType) else LIMIT_SCHEMA, *(e.friction_schema for e in equations),
-        FREE_SCHEMA if known else SCHEMA,
+        FIT_SCHEMA if known or doubted else SCHEMA,
     )  # fmt: skip
 
 

@@ -8,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ftlm.data.settings import COMPARED_LENGTHS
 from ftlm.paint.text import Exact
 
 #: The paper's p, its number of pulses, and its four angles in the order n = 1 … 4.
-INNOVATION_LENGTHS = (1, 3, 5, 7)
+INNOVATION_LENGTHS = COMPARED_LENGTHS
 POINTS = 2048
 OUTPUTS = ("theta11", "theta12", "theta21", "theta22")
 #: Letters of the orders and of the coefficients, in the order of the tables' columns.

@@ -279,6 +279,8 @@ class SteadyState:
         Order with which it runs on: 0 for none, 1 for an integrator, below 0 where it returns to 0.
     rate
         Coefficient of t^order/Gamma(order + 1) in the end; the gain where the order is 0.
+    order_error
+        Standard error of the order, 0 where it was given; None without a covariance.
     """
 
     output: str
@@ -287,6 +289,7 @@ class SteadyState:
     error: float | None
     order: float
     rate: float
+    order_error: float | None = None
 
 
 def steady_states(model: Solved) -> tuple[SteadyState, ...]:
@@ -301,21 +304,24 @@ def steady_states(model: Solved) -> tuple[SteadyState, ...]:
     check_unlimited(model, "a steady state")
     pairs = _final(model)
     covariance = None if model.estimate is None else model.estimate.covariance
-    errors: dict[tuple[str, str], float] = {}
+    errors: dict[tuple[str, str], tuple[float, float]] = {}
     if covariance is not None:
         matrix, values = np.asarray(covariance, dtype=np.float64), model_numbers(model)
-        slopes = {pair: np.zeros(values.size) for pair in pairs}
+        slopes = {pair: np.zeros((2, values.size)) for pair in pairs}
         for k in np.flatnonzero(np.any(matrix != 0, axis=1)):
             step = STEP * max(abs(values[k]), 1e-3)
             shift = step * np.eye(values.size)[k]
             above, below = (_final(with_numbers(model, values + side)) for side in (shift, -shift))
             for pair, slope in slopes.items():
-                slope[k] = (above[pair][1] - below[pair][1]) / (2 * step)
-        errors = {pair: math.sqrt(max(float(v @ matrix @ v), 0.0)) for pair, v in slopes.items()}
+                slope[:, k] = np.subtract(above[pair], below[pair]) / (2 * step)
+        for pair, (turn, slope) in slopes.items():
+            variances = [float(v @ matrix @ v) for v in (turn, slope)]
+            errors[pair] = (math.sqrt(max(variances[0], 0.0)), math.sqrt(max(variances[1], 0.0)))
     out = []
     for (output, signal), (order, rate) in pairs.items():
         gain = rate if abs(order) < SEEN_ORDER else 0.0 if order < 0 else math.copysign(math.inf, rate)
-        out.append(SteadyState(output, signal, gain, errors.get((output, signal)), order, rate))
+        turned, error = errors.get((output, signal), (None, None))
+        out.append(SteadyState(output, signal, gain, error, order, rate, turned))
     return tuple(out)
 
 
