@@ -42,8 +42,17 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
 ///
 /// # Errors
 /// [`Error::Singular`] where rounding cannot tell its rows apart, [`Error::Length`].
+///
+/// ```
+/// assert_eq!(ftlm::small::scaled_inverse(&[2.0, 0.0, 0.0, 4e-9], 2), Ok(vec![0.5, 0.0, 0.0, 2.5e8]));
+/// // Of nothing, nothing.
+/// assert_eq!(ftlm::small::scaled_inverse(&[], 0), Ok(vec![]));
+/// ```
 pub fn scaled_inverse(matrix: &[f64], k: usize) -> Result<Vec<f64>> {
     check_length("matrix", k * k, matrix.len())?;
+    if k == 0 {
+        return Ok(Vec::new());
+    }
     // Rows, then columns, to unit largest element: what is then nearly singular is so whatever the units.
     let largest = |values: &mut dyn Iterator<Item = f64>| values.fold(0.0_f64, |a, v| a.max(v.abs()));
     let mut a = DMatrix::from_row_slice(k, k, matrix);

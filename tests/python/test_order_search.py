@@ -847,3 +847,13 @@ def test_the_oldest_machine_ranks_a_stage_as_the_newest(drive, plant, with_noise
         finally:
             _core.portable(False)
     assert tables[0] == tables[1]
+
+
+def test_instruments_of_an_equation_whose_coefficients_are_all_known_estimate_nothing() -> None:
+    u = np.repeat([1.0, -1.0, 1.0, 1.0, -1.0], 40)
+    blank = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": 0 * u})
+    y = ftlm.Model(ftlm.equation("D^1.5 y = -1 D^0.5 y + 1 u")).simulate(blank)["y"]
+    run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": y})
+    words = ftlm.equation("D^alpha y = -1 D^mu y + 1 u")
+    found = ftlm.search_orders(run, words, ftlm.lattice(step=0.1), coefficients="instrumental-variables")
+    assert found.orders == pytest.approx({"alpha": 1.5, "mu": 0.5})

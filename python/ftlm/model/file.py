@@ -22,9 +22,8 @@ from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
 #: Largest model file read: a model is a few kilobytes.
 MAX_MODEL_BYTES = 1 << 20
 #: Schema of a model that every version since the first reads, of one that has an offset, of one that has intervals by
-#: profile likelihood or whose sensor filter names what is no output, of one that has friction, of
-#: one whose inputs have limits, of one whose friction falls with speed, and of one that says what was free in its fit or
-#: what spoke against it.
+#: profile likelihood or whose sensor filter names what is no output, of one that has friction, of one whose inputs have
+#: limits, of one whose friction falls with speed, and of one that says what was free in its fit or what spoke against.
 SCHEMA, OFFSET_SCHEMA, PROFILE_SCHEMA, FRICTION_SCHEMA, LIMIT_SCHEMA, STRIBECK_SCHEMA, FIT_SCHEMA = 2, 3, 4, 5, 6, 7, 8
 
 
