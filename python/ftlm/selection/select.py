@@ -52,7 +52,7 @@ def select(
     as well as the best (what is left over is within 1 %, or, up to 5 %, three or more folds do not tell the difference
     from 0 at 95 %, or all samples are very strong evidence), the one with the least Schwarz criterion, samples counted
     as the colour of the residuals lets them; of those alike in that the one with the fewest numbers, of the lowest
-    order, best determined.
+    order, best where unseen.
 
     Parameters
     ----------
