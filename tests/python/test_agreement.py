@@ -77,6 +77,22 @@ def test_what_parts_are_is_what_is_identified_of_them(changed):
     assert changed.crossed[1][0] == alone.model.compare(run.slice(0.0, 6.0)).fit_percent
 
 
+def test_a_part_begins_as_its_own_fit_found():
+    """A run that looks like rest and is not: what another part's model is told of it is what its own fit was."""
+    step = 0.1
+    u = np.sign(np.sin(0.025 * np.arange(1200)))
+    u[:300] = 2.0
+    blank = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": 0 * u})
+    y = ftlm.Model(ftlm.equation("D^0.7 y = -0.3 y + u")).simulate(blank)["y"]
+    first = 300 + int(np.argmin(np.abs(y[300:500])))
+    y = y + 0.02 * np.random.default_rng(0).standard_normal(y.size)
+    y[first] = 0.0
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u[first:]}, outputs={"y": y[first:]})
+    told = ftlm.agreement(run, ftlm.equation("D^alpha y = a y + b u"))
+    assert told.results[0].model.structure.initial == "history"
+    assert min(fit["y"] for row in told.crossed for fit in row) > 90
+
+
 def test_several_runs_are_parts_by_themselves():
     runs = [replace_name(changing([v], seed=k), f"day {k}") for k, v in enumerate([40.0, 40.0, 50.0])]
     found = ftlm.agreement(runs, SECOND, threads=1)

@@ -6,7 +6,7 @@ import itertools
 import math
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -328,7 +328,7 @@ def agreement(
             )
         if progress is not None:
             progress(len(results), len(pieces))
-    crossed = tuple(tuple(_crossed(r, p, r is s) for p, s in zip(pieces, results, strict=True)) for r in results)
+    crossed = tuple(tuple(_crossed(r, p, s) for p, s in zip(pieces, results, strict=True)) for r in results)
     distance, degrees = together(results)
     return Agreement(tuple(names), tuple(results), tuple(differences(results)), distance, degrees, crossed)
 
@@ -355,12 +355,13 @@ def _named(pieces: Sequence[Run]) -> list[str]:
     return [f"{name} ({k})" for k, name in enumerate(names, 1)]
 
 
-def _crossed(result: Identification, piece: Run, own: bool) -> dict[str, float]:
-    """Fit of a part's model on a part; none where its free run is not finite there."""
-    if own:
+def _crossed(result: Identification, piece: Run, own: Identification) -> dict[str, float]:
+    """Fit of a part's model on a part, which begins as its own fit found; none where the free run is not finite."""
+    if result is own:
         return dict(result.fit_percent)
+    begun = replace(result.model.structure, initial=own.model.structure.initial)
     try:
-        return dict(compare(result.model, piece).fit_percent)
+        return dict(compare(replace(result.model, structure=begun), piece).fit_percent)
     except FtlmError:
         return {}
 
