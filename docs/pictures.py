@@ -194,7 +194,7 @@ def next_experiment(folder: Path) -> Figure:
         bars.plot(np.full(len(seeds), k), found[k], "C0.", alpha=0.5, label="found" if k == 0 else None)
     bars.axhline(1.0, color="C1", linewidth=0.9, label="the paper's square")
     bars.set(xticks=range(5), xticklabels=orders, ylabel="times smaller", ylim=(0.8, None))
-    bars.legend(fontsize="small", ncols=3)
+    bars.legend(fontsize="small", ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), frameon=False)
     return figure
 
 
