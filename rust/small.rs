@@ -44,7 +44,7 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
 /// [`Error::Singular`] where rounding cannot tell its rows apart, [`Error::Length`].
 ///
 /// ```
-/// assert_eq!(ftlm::small::scaled_inverse(&[2.0, 0.0, 0.0, 4e-9], 2), Ok(vec![0.5, 0.0, 0.0, 2.5e8]));
+/// assert_eq!(ftlm::small::scaled_inverse(&[2.0, 0.0, 0.0, 0.25], 2), Ok(vec![0.5, 0.0, 0.0, 4.0]));
 /// // Of nothing, nothing.
 /// assert_eq!(ftlm::small::scaled_inverse(&[], 0), Ok(vec![]));
 /// ```
