@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import mpmath
 import numpy as np
@@ -13,7 +14,10 @@ from scipy.special import gamma
 
 import ftlm
 import loops
+from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.joint import JointFit, fit_output_error
+from ftlm.fit.problem import FreeProblem
+from ftlm.solve.sampled import sampled as one_grid
 
 STEP = 0.1
 #: (0.5 s + 1)/(s + 1): y' = 0.5 u' + u - y.
@@ -120,3 +124,41 @@ def test_a_ramp_that_starts_with_a_jump_is_differentiated_more_often_than_the_ou
         rest = quad(lambda s, e=end: np.exp(-2.0 * (e - s)) * s ** (1.0 - excess), 0.0, end)[0]
         exact = now - 2.0 * (jumps * kink + ramps * rest)
         assert samples[k] == pytest.approx(exact, abs=2e-6), k
+
+
+#: What is made of a corner t at 0: b t^(1 - excess) E(a t^alpha), term by term.
+CORNERS = [(1.4, 2.0, -3.0), (1.4, 1.6, -3.0), (1.9, 2.0, -40.0), (1.4, 1.0, -3.0), (0.9, 0.9, -2.0)]
+
+
+def answer_to_corners(alpha: float, order: float, a: float, corners: np.ndarray, step: float) -> np.ndarray:
+    """D^alpha y = a y + D^order u for u with these changes of its slope at the samples, by the series of Mittag-Leffler."""
+    t = step * np.arange(corners.size)
+    with np.errstate(divide="ignore"):
+        powers = [alpha * (k + 1) - order + 1.0 for k in range(90)]
+        terms = [a**k * np.where(t > 0, t, 0.0) ** p / gamma(p + 1.0) for k, p in enumerate(powers)]
+    return np.asarray(np.convolve(corners, np.sum(terms, axis=0))[: corners.size])
+
+
+@pytest.mark.parametrize(("alpha", "order", "a"), CORNERS)
+def test_samples_at_corners_are_read_to_second_order(alpha: float, order: float, a: float) -> None:
+    # Half of what a pulse answers to the corner in it would leave h^(1 + alpha - order): at 0.6 above alpha h^0.4.
+    rng = np.random.default_rng(4)
+    step, rows = 0.05, 41
+    u = np.concatenate([[0.0], np.cumsum(rng.standard_normal(rows - 1))]) * step
+    corners = np.diff(np.diff(u) / step, prepend=0.0)
+    truth = answer_to_corners(alpha, order, a, np.append(corners, 0.0), step)
+    run = ftlm.Run.from_arrays(step=step, inputs={"u": u}, outputs={"y": truth}, intersample={"u": "foh"})
+    structure = replace(ftlm.equation(f"D^{alpha} y = a y + b D^{order} u"), initial="rest")
+    problem = FreeProblem.of(structure)
+    scale = float(np.max(np.abs(truth)))
+    fitted, free = [], []
+    model = ftlm.Model(replace(ftlm.equation(f"D^{alpha} y = {a:g} y + 1 D^{order} u"), initial="rest"))
+    for every in (8, 16, 32):
+        grid = Grid(problem, [run], [1.0 / scale], every)
+        values = {"a": a, "b": 1.0}
+        start = Attempt([], [values[n] for n in problem.coefficients], "truth", {})
+        fitted.append(float(np.max(np.abs(grid.evaluated(start).outcome["residuals"]))))
+        free.append(float(np.max(np.abs(one_grid(model, run, every, None)[0][0] - truth)[1:-1])) / scale)
+    for errors in (fitted, free):
+        assert errors[-1] < 1e-3
+        assert all(fine < coarse / 3.0 for coarse, fine in pairwise(errors)), errors

@@ -146,11 +146,13 @@ pub(super) fn add_slope(
     column.iter_mut().zip(experiment.weighted(&direct.through(driven))).for_each(|(v, s)| *v += s);
 }
 
-/// Pulses see a jump of a held signal at a sample too early: the mean of the pulses on either side holds half of what
-/// the first pulse after it answers, of which only the direct gain is there at the sample. Without this a first-order
-/// equation is off by a share of the step.
+/// Pulses see a jump of a held signal, or a corner of a linear one, at a sample too early: the mean of the pulses on
+/// either side holds half of what the first pulse after it answers, of which only the direct gain is there at the sample.
+/// Without this a first-order equation is off by a share of the step, and one that differentiates what drives it by 0.6
+/// by the step to the power of 0.4.
 pub(super) struct Early {
-    /// Half the jump of each held signal at each compared sample, and its derivative with respect to its free number.
+    /// Half of what the mean of the first pulse after each compared sample has of the jump or corner of each signal there,
+    /// and its derivative with respect to its free number.
     jumps: Vec<Option<(Vec<f64>, Vec<f64>)>>,
 }
 
@@ -158,12 +160,17 @@ pub(super) struct Early {
 const SHIFT: f64 = 1e-5;
 
 impl Early {
-    /// The jumps of what holds in between.
+    /// The jumps of what holds in between, and the corners of what is linear there.
     pub(super) fn of(model: &FreeModel, experiment: &Experiment, acted: &[(Vec<f64>, Vec<f64>)]) -> Self {
         let jumps = (0..experiment.record.len())
             .map(|signal| {
                 // Corners of samples at times of their own are known one by one.
-                experiment.instants.get(signal).filter(|instant| instant.held && experiment.own.is_none())?;
+                let instant = experiment.instants.get(signal).filter(|_| experiment.own.is_none())?;
+                if !instant.held {
+                    // What lies behind an actuator with a free number has none that are known.
+                    instant.values.as_ref().filter(|_| model.law_of(signal).is_none())?;
+                    return Some((experiment.lacking(signal).iter().map(|v| -v).collect(), Vec::new()));
+                }
                 let still = (experiment.record.signal(signal).to_vec(), Vec::new());
                 Some(match model.law_of(signal) {
                     Some(d) => experiment.lacking_behind(signal, &acted[d]),
