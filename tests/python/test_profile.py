@@ -298,7 +298,7 @@ def test_what_one_end_does_not_need_goes_to_the_others(found: ftlm.Identificatio
     free = profiled(valley, valley.names, 0.95)
     took = {n: i.evaluations for n, i in free.intervals.items()}
     # Dealt out evenly alone, this budget would not do for the number that takes most.
-    scarce = sum(took.values()) + 10 * len(took)
+    scarce = sum(took.values()) + 8 * len(took)
     assert max(took.values()) > scarce / len(took)
     dealt = profiled(valley, valley.names, 0.95, most=scarce)
     assert dealt.left == ()
@@ -377,13 +377,15 @@ def test_identify_goes_on_from_a_lower_optimum_and_says_so(bent: ftlm.Run, monke
     def beside(cls: type[Valley], grid: object, values: np.ndarray, shift: np.ndarray) -> Valley:
         valley = at(cls, grid, values, shift)
         calls.append(values)
-        if len(calls) > 1:
+        # The first is on a coarser grid, which is not taken here.
+        if len(calls) > 2:
             return valley
         orders, coefficients, delays = valley.grid.problem.split((valley.best.values + valley.errors).tolist())
         off = valley.grid.descend(Attempt(orders, coefficients, "beside", {}, delays), 1, plain=True)
         return replace(valley, best=off)
 
     monkeypatch.setattr(profiling.Valley, "at", classmethod(beside))
+    monkeypatch.setattr(profiling, "NEARBY", -1.0)
     structure = ftlm.equation("D^2 y = c D y + a y + b u", initial="rest")
     same = ftlm.identify(run, structure, threads=1, intervals="profile")
     # The fit was right all the while: its residuals do not fall, and its starts stay told.

@@ -53,7 +53,8 @@ def fit_any_start(
         many = fitted(start, refine=False, raced=raced)
         kept = _shorter(many, runs, structure, loss, refine=False)
         if kept.growth is None and many.growth is None:
-            fine = fit_output_error(runs, replace(structure, initial=kept.initial), near=kept, loss=loss)
+            asked = replace(structure, initial=kept.initial)
+            fine = fit_output_error(runs, asked, near=kept, loss=loss, raced=raced)
             fine = replace(fine, starts=many.starts, origin=many.origin)
             return fine if kept is not many else _shorter(fine, runs, structure, loss, refine=True)
         # Where a free run may grow, the starts of the race are asked on every grid.

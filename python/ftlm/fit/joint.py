@@ -30,7 +30,7 @@ from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.race import SAME_COST, finalists, race
 from ftlm.fit.robust import Robust, huber_shares, same_shares, scales
-from ftlm.fit.steady import Growth, steadied
+from ftlm.fit.steady import Growth, grows, steadied
 from ftlm.fit.twins import twin_words
 from ftlm.fit.uncertainty import covariance, deviation
 from ftlm.solve.instants import compared_values
@@ -186,7 +186,7 @@ def fit_output_error(
     A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
     everything free by name, and is the only one; known ones stand beside the automatic ones; `near` is a fit of the
     same structure to nearly the same runs, to go on from on its grid and with its weights. What a race reached is put
-    into `raced`, and taken from there where the same fit is made again. Without `refine` the grid is
+    into `raced`, and taken from there where the same fit is made again or gone on with. Without `refine` the grid is
     not refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
     all samples, not between starts.
 
@@ -208,7 +208,7 @@ def fit_output_error(
     if near is not None:
         attempt = given(problem, dict(zip(near.names, near.values.tolist(), strict=True)))
         grid = Grid(problem, runs, [1.0 / max(near.noise[o], 1e-300) for o in outputs], near.refinement)
-        return ended(*with_settled_weights(attempt, grid, loss), [], loss, refine=refine)
+        return ended(*with_settled_weights(attempt, grid, loss), raced or [], loss, refine=refine)
     noise = {o: first_noise(runs, structure, o, sizes[o]) for o in outputs}
     # Starts are compared with every output weighing alike: noise decides where the optimum is, not how to get near it.
     alike = Grid(problem, runs, [1.0 / (COARSE_SHARE * sizes[o]) for o in outputs])
@@ -249,7 +249,8 @@ def ended(best: Attempt, grid: Grid, reached: Sequence[Attempt], loss: Loss, *, 
     best, grid, growth = steadied(best, grid, reached)
     if growth is not None and not growth.kept:
         best, grid = with_settled_weights(best, grid, loss)
-    optimum = refined(best, grid, loss) if refine else Optimum(best, grid, best.values, settled=True)
+    others = reached[:1]
+    optimum = refined(best, grid, loss, others) if refine else Optimum(best, grid, best.values, settled=True)
     starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
     return replace(joint_fit(optimum, starts), growth=growth)
 
@@ -276,7 +277,8 @@ def winner(contenders: Sequence[Attempt], near: Grid) -> Attempt:
             if attempt is contenders[-1] and not ends:
                 raise
     best = near.finer.ranked(ends)[0] if len(ends) > 1 else ends[0]
-    return near.lowest(best, LAST_LAP, ended=best.converged)
+    # In logarithms it had its lap.
+    return near.lowest(best, FINAL_LAP, ended=True)
 
 
 def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -> tuple[Attempt, Grid]:
@@ -304,8 +306,12 @@ class Optimum:
     settled: bool
 
 
-def refined(best: Attempt, grid: Grid, loss: Loss = "squares") -> Optimum:
-    """Halve the step until that moves the estimate by little of its standard error."""
+def refined(best: Attempt, grid: Grid, loss: Loss = "squares", others: Sequence[Attempt] = ()) -> Optimum:
+    """Halve the step until that moves the estimate by little of its standard error.
+
+    A coarse grid may lead along a flat valley to where equations end, and there a finer one leads nowhere: then others
+    have their way on it as well.
+    """
     estimate, settled = best.values, False
     clock = Clock.of(grid.problem, grid.runs)
     before: Attempt | None = None
@@ -316,6 +322,8 @@ def refined(best: Attempt, grid: Grid, loss: Loss = "squares") -> Optimum:
         except FtlmError:
             # Where two grids point there may be no free run.
             finer, fine_grid = with_settled_weights(best, grid.finer, loss)
+        if finer.outcome["status"] == "wall" and before is None:
+            finer, fine_grid = freed(finer, fine_grid, others, loss)
         grid = fine_grid
         errors = clock.errors(finer.values, covariance(finer, grid))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
@@ -330,6 +338,25 @@ def refined(best: Attempt, grid: Grid, loss: Loss = "squares") -> Optimum:
         settled = any(bool(np.all(way <= REFINED * errors)) for way in moved)
         before, best, estimate = best, finer, limit
     return Optimum(best, grid, nearer(best, grid, estimate, clock, settled=settled), settled)
+
+
+def freed(stuck: Attempt, grid: Grid, others: Sequence[Attempt], loss: Loss) -> tuple[Attempt, Grid]:
+    """What an attempt that a wall stopped came to, or another one on its grid if that leaves less."""
+    best, least = (stuck, grid), likelihood(stuck, grid)
+    for other in others:
+        try:
+            there = with_settled_weights(other, grid, loss)
+        except FtlmError:
+            continue
+        if likelihood(*there) < least and not (grid.steady and grows(grid.problem, there[0])):
+            best, least = there, likelihood(*there)
+    return best
+
+
+def likelihood(attempt: Attempt, grid: Grid) -> float:
+    """Minus the logarithm of the likelihood per sample, but for a constant."""
+    levels = grid.levels(attempt).values()
+    return math.fsum(math.log(max(level, 1e-300) / w) for level, w in zip(levels, grid.weights, strict=True))
 
 
 def expected(problem: FreeProblem, clock: Clock, best: Attempt, before: Attempt | None) -> Attempt:

@@ -6,10 +6,11 @@ more than noise explains (Venzon & Moolgavkar, doi:10.2307/2347496; Raue et al.,
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from statistics import NormalDist
 from typing import Any
 
@@ -33,6 +34,8 @@ BENT = 0.1
 #: way from the optimum.
 NEAR = 0.1
 FOUND = 0.02
+#: A valley is looked at on half as fine a grid where its optimum is no further off than this share of standard errors.
+NEARBY = 2.0
 #: Evaluations of one refit, and refits an end at most.
 LAP = 120
 REFITS = 40
@@ -102,6 +105,13 @@ class Valley:
         # Where a growing optimum was left, its valley is not this one.
         steady = joint.growth is not None and not joint.growth.kept
         grid = Grid(problem, runs, weights, joint.refinement, shares=joint.shares, steady=steady)
+        if joint.settled and joint.refinement > 1:
+            # Half as fine a grid moved the optimum by less than its errors, and how steep it is by less still.
+            with contextlib.suppress(FtlmError):
+                coarse = replace(grid, every=joint.refinement // 2)
+                found = cls.at(coarse, joint.on_grid, np.zeros(len(problem.names)))
+                if found.best.converged and np.all(np.abs(found.best.values - joint.on_grid) <= NEARBY * found.errors):
+                    return replace(found, shift=joint.values - found.best.values)
         return cls.at(grid, joint.on_grid, joint.values - joint.on_grid)
 
     @classmethod

@@ -29,13 +29,15 @@ VANISHED = 1e-8
 #: Starts that tell how fine the grid must be on which all compete, chosen by this many evaluations.
 PIONEERS = 3
 GLANCE = 2
+#: A coarse grid tells where starts lead if a finer one moves no number of the best by more than this share.
+MOVED = 0.1
 #: Behind the first, a start goes on while a lap lowers its cost by this share: what has come to rest overtakes nobody.
 ON_THE_WAY = 0.05
 #: All get as many as those ahead where the best is above the noise by this factor.
 ABOVE_FLOOR = 2.0
 #: Coarse fits that continue on all samples.
 FINALISTS = 3
-#: ... unless their coarse cost exceeds the best one's by this factor.
+#: ... unless their coarse cost exceeds the best one's by this factor: on few samples, too, nobody that far behind goes on.
 CONTENDER = 3.0
 #: Two costs closer than this share are the same optimum.
 SAME_COST = 1e-3
@@ -125,7 +127,7 @@ def raced(
         going = FINALISTS if isinstance(less, Whole) else FEWEST
         runners = one_of_each(laps.run(coarse, runners, GLANCE, less.problem))[:going]
         ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
-        ended = laps.run(coarse, ended[:FINALISTS], SECOND_LAP, less.problem)
+        ended = laps.run(coarse, finalists(ended), SECOND_LAP, less.problem)
         there = [less.embedded(a, problem) for a in ended[:1]]
         wholes += there if isinstance(less, Whole) else []
         reached = sorted(reached + there, key=lambda a: a.level)
@@ -142,15 +144,16 @@ def raced(
         # An offset of each run hides which of the measured signals drives: also from where it ends without.
         plain = replace(alike, problem=FreeProblem.of(replace(problem.structure, offset="none")))
         reached = sorted(reached + race(plain, floor, threads, None)[:FINALISTS], key=lambda a: a.level)
-    # Those that came to the same optimum go on as one.
+    # Those that came to the same optimum go on as one, and those that are far behind not at all.
     reached = distinct(reached)
-    ahead = max(FEWEST, len(reached) // RUNNERS)
-    rest = reached[ahead:]
-    reached = laps.run(coarse, reached[:ahead], SECOND_LAP)
+    contenders = in_reach(reached)
+    ahead = contenders[: max(FEWEST, len(reached) // RUNNERS)]
+    rest, lost = contenders[len(ahead) :], reached[len(contenders) :]
+    reached = laps.run(coarse, ahead, SECOND_LAP)
     if reached and reached[0].level > ABOVE_FLOOR * floor:
         # Noise alone would leave less: those behind may yet be on the way to where it does.
         rest = on_the_way(coarse, rest, laps)
-    reached = coarse.finer.ranked(reached + rest)
+    reached = coarse.finer.ranked(reached + rest) + lost
     if progress is not None:
         progress(len(starts), len(starts))
     return reached, coarse
@@ -170,8 +173,9 @@ def with_history(
     laps = Laps(len(reached), threads, None)
     levels = [math.inf if a is None else a.level for a in laps.each(coarse, reached, 0)]
     order = sorted(range(len(reached)), key=lambda i: levels[i])
-    ahead = laps.run(coarse, [reached[i] for i in order[:FEWEST]], FIRST_LAP)
-    return distinct(ahead + [reached[i] for i in sorted(order[FEWEST:])])
+    going = [i for i in order[:FEWEST] if levels[i] <= CONTENDER * levels[order[0]]]
+    ahead = coarse.finer.ranked(laps.run(coarse, [reached[i] for i in going], FIRST_LAP))
+    return distinct(ahead + [reached[i] for i in sorted(order[len(going) :])])
 
 
 def thinned(grid: Grid) -> Grid:
@@ -183,16 +187,31 @@ def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> tuple[Gr
     """A grid on which starts may compete, as far as a few of them tell, and where they are after a glance.
 
     A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its
-    own: all start anew on half the step.
+    own: all start anew on the grid on which those few no longer move.
     """
-    while True:
-        glanced = one_of_each(laps.run(coarse, starts, GLANCE))
-        if coarse.every >= FINEST or len(starts) <= PIONEERS:
-            return coarse, glanced
-        reached = laps.run(coarse, glanced[:PIONEERS], FIRST_LAP)
+    first, glanced = coarse, one_of_each(laps.run(coarse, starts, GLANCE))
+    if len(starts) <= PIONEERS:
+        return coarse, glanced
+    before, pioneers = list[tuple[Grid, Attempt]](), glanced[:PIONEERS]
+    while coarse.every < FINEST:
+        reached = laps.run(coarse, pioneers, FIRST_LAP)
         if reached and not coarse.matters(reached[0]):
-            return coarse, glanced
-        coarse = coarse.finer
+            break
+        before += [(coarse, reached[0])] if reached else []
+        # Where none has a scheme, others may on half the step.
+        coarse, pioneers = coarse.finer, reached or one_of_each(laps.run(coarse.finer, starts, GLANCE))[:PIONEERS]
+    else:
+        reached = pioneers
+    if coarse is first:
+        return coarse, glanced
+    told = before if reached else []
+    near = (grid for grid, best in told if np.allclose(best.values, reached[0].values, rtol=MOVED, atol=0.0))
+    if (grid := next(near, None)) is not None:
+        glanced = one_of_each(laps.run(grid, starts, GLANCE))
+        if sum(1 + len(a.alike) for a in glanced) == len(starts):
+            # This coarser grid has the same optimum, a little moved: of those that come to one place there one goes on.
+            starts = distinct(laps.run(grid, glanced, FIRST_LAP))
+    return coarse, one_of_each(laps.run(coarse, starts, GLANCE))
 
 
 def on_the_way(coarse: Grid, behind: Sequence[Attempt], laps: Laps) -> list[Attempt]:
@@ -234,8 +253,12 @@ def without_vanished(problem: FreeProblem, start: Attempt, ended: Attempt) -> At
 
 def finalists(reached: Sequence[Attempt]) -> list[Attempt]:
     """Those that go on on all samples: the best of different optima, unless they are far behind."""
-    kept = distinct(reached)[:FINALISTS]
-    return [a for a in kept if a.level <= CONTENDER * kept[0].level]
+    return in_reach(distinct(reached)[:FINALISTS])
+
+
+def in_reach(reached: Sequence[Attempt]) -> list[Attempt]:
+    """Those of attempts, best first, that are not far behind the best."""
+    return [a for a in reached if a.level <= CONTENDER * reached[0].level]
 
 
 def distinct(reached: Sequence[Attempt]) -> list[Attempt]:

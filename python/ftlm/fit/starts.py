@@ -266,6 +266,8 @@ def whole_orders(problem: FreeProblem) -> list[float]:
 
 def zoom(problem: FreeProblem, structure: Structure, records: list[Record], row: Row, threads: int) -> Row:
     """Follow a row downhill on ever finer lattices around it."""
+    if not row.orders:
+        return row
     bounds = dict(zip(problem.orders, problem.bounds, strict=True))
     for step in ZOOM_STEPS:
         for _ in range(ZOOM_ROUNDS):

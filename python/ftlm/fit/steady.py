@@ -36,7 +36,8 @@ class Growth:
     kept
         Whether the growing one is the fit's, because the runs force it or there was no other.
     excess
-        Share by which residuals of the other one are larger (root mean square); infinite where there was none.
+        Share by which residuals of the other one are larger (root mean square); infinite where there was none, below 0
+        where the growing one was no optimum.
     at_limit
         Whether the other one stands where free runs begin to grow, no optimum of its own.
     """

@@ -102,7 +102,8 @@ def uncertain(joint: JointFit, problem: FreeProblem) -> list[str]:
 
 def _growth(joint: JointFit) -> list[str]:
     """Say what was made of an optimum whose free run grows."""
-    if joint.growth is None:
+    if joint.growth is None or joint.growth.excess <= 0.0:
+        # One that costs more than the stable one was none.
         return []
     excess = 100.0 * joint.growth.excess
     if not joint.growth.kept:

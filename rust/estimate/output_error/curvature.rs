@@ -23,6 +23,11 @@ impl Curvature {
         Self { count, matrix: vec![0.0; count * count], learnt: false, used: false }
     }
 
+    /// Whether it is of so many parameters.
+    pub(super) fn is_for(&self, count: usize) -> bool {
+        self.count == count
+    }
+
     /// An element of the matrix.
     pub(super) fn at(&self, i: usize, j: usize) -> f64 {
         self.matrix[i * self.count + j]

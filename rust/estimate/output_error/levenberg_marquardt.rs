@@ -4,12 +4,14 @@
 //! rejected step costs no Jacobian. A problem says itself how a point moves: in which coordinates, and within which bounds.
 //! What stands on a bound and is pushed out of it is left out of step and gradient, so that the rest moves on.
 //!
-//! Where Gauss–Newton foretells the fall of the cost badly, what it leaves out is learnt (`curvature`).
+//! Where Gauss–Newton foretells the fall of the cost badly, what it leaves out is learnt (`curvature`); along a valley
+//! the search leaps (`valley`).
 //!
 //! A minimum is where the gradient vanishes, and nothing else is called one: the cosine between the residuals and every
 //! column that is free to move, the relative offset of Dennis & Schnabel (doi:10.1137/1.9781611971200, §7.2) and MINPACK.
 
 use super::curvature::Curvature;
+use super::valley::Valley;
 use crate::dense;
 use crate::error::{check_length, Error, Result};
 use crate::small::{self, back_substitute};
@@ -386,109 +388,215 @@ pub fn minimise<P: Problem>(
     start: P::Point,
     settings: Settings,
 ) -> Result<Minimum<P::Point, P::Evaluation>> {
-    let slopes_at = |point: &P::Point, evaluation: &P::Evaluation| -> Result<Vec<Vec<f64>>> {
-        let jacobian = problem.jacobian(point, evaluation)?;
-        let rows = problem.residuals(evaluation).len();
+    let mut search = Search { problem, settings, evaluations: 1, gain: f64::INFINITY, hit: false, corners: false };
+    let mut at = search.start(start)?;
+    if settings.evaluations == 0 {
+        return Ok(at.ended(1, Status::Exhausted));
+    }
+    at.jacobian = search.slopes(&at.point, &at.evaluation)?;
+    let mut valley = Valley::new();
+    loop {
+        let ended = match search.advance(&mut at)? {
+            Advance::Moved(step, gain) => {
+                valley.moved(&step, gain);
+                None
+            }
+            Advance::Ended(status) => Some(status),
+        };
+        if let Some(before) = valley.outcome(&at, search.evaluations, ended.is_some()) {
+            at = before;
+            search.anew();
+            continue;
+        }
+        if let Some(status) = ended {
+            return Ok(at.ended(search.evaluations, status));
+        }
+        if let Some(leap) = valley.leap(settings.evaluations - search.evaluations) {
+            if let Some(there) = search.landed(&at, &leap)? {
+                valley.left(std::mem::replace(&mut at, there), search.evaluations);
+                search.anew();
+            } else {
+                valley.fell();
+            }
+        }
+    }
+}
+
+/// A point with all that the next step from it is made of.
+pub(super) struct At<P: Problem> {
+    point: P::Point,
+    evaluation: P::Evaluation,
+    pub(super) cost: f64,
+    jacobian: Vec<Vec<f64>>,
+    trusted: bool,
+    damping: f64,
+    curvature: Curvature,
+    /// The last step in coordinates, and the gradient before it.
+    before: Option<(Vec<f64>, Vec<f64>)>,
+}
+
+impl<P: Problem> At<P> {
+    fn ended(self, evaluations: usize, status: Status) -> Minimum<P::Point, P::Evaluation> {
+        let Self { point, evaluation, cost, jacobian, .. } = self;
+        Minimum { point, evaluation, cost, jacobian, evaluations, status }
+    }
+}
+
+/// What one step came to: its coordinates and the share of the cost that fell, or the end.
+enum Advance {
+    Moved(Vec<f64>, f64),
+    Ended(Status),
+}
+
+/// What a search knows beside where it is.
+struct Search<'a, P> {
+    problem: &'a P,
+    settings: Settings,
+    evaluations: usize,
+    /// Share of the cost by which the last step lowered it.
+    gain: f64,
+    /// Whether the last step that was tried led where there is no value.
+    hit: bool,
+    /// Whether parameters stay that have corners.
+    corners: bool,
+}
+
+impl<P: Problem> Search<'_, P> {
+    fn slopes(&self, point: &P::Point, evaluation: &P::Evaluation) -> Result<Vec<Vec<f64>>> {
+        let jacobian = self.problem.jacobian(point, evaluation)?;
+        let rows = self.problem.residuals(evaluation).len();
         jacobian.iter().try_for_each(|column| check_length("column of the Jacobian", rows, column.len()))?;
         Ok(jacobian)
-    };
-    let mut point = start;
-    let mut current = problem.evaluate(&point)?;
-    point = problem.settled(&current, point);
-    let mut least = cost(problem.residuals(&current));
-    let mut evaluations = 1;
-    if settings.evaluations == 0 {
-        let (jacobian, status) = (Vec::new(), Status::Exhausted);
-        return Ok(Minimum { point, evaluation: current, cost: least, jacobian, evaluations, status });
     }
-    let mut jacobian = slopes_at(&point, &current)?;
-    let mut trusted = problem.trusted(&point);
-    let mut damping = FIRST_DAMPING;
-    let mut status = Status::Exhausted;
-    // The gradient's cosine at a minimum: its square is a share of the cost.
-    let flat = settings.tolerance.max(f64::EPSILON).sqrt();
-    let (mut gain, mut hit, mut corners) = (f64::INFINITY, false, false);
-    let mut curvature = Curvature::new(jacobian.len());
-    // The last step in coordinates, and the gradient before it.
-    let mut before: Option<(Vec<f64>, Vec<f64>)> = None;
-    'outer: while evaluations < settings.evaluations {
-        let linear = Linear::at(problem, &point, &jacobian, problem.residuals(&current), corners);
-        if let Some((taken, gradient)) = before.take() {
-            let change: Vec<f64> = linear.gradient_by_parameter().iter().zip(&gradient).map(|(a, b)| a - b).collect();
-            curvature.learn(&taken, &change, &linear.columns_along(&taken));
+
+    /// The start, without its derivatives.
+    fn start(&self, start: P::Point) -> Result<At<P>> {
+        let evaluation = self.problem.evaluate(&start)?;
+        let point = self.problem.settled(&evaluation, start);
+        let (cost, trusted) = (cost(self.problem.residuals(&evaluation)), self.problem.trusted(&point));
+        let (damping, curvature) = (FIRST_DAMPING, Curvature::new(0));
+        Ok(At { point, evaluation, cost, jacobian: Vec::new(), trusted, damping, curvature, before: None })
+    }
+
+    /// Forgets how the last steps went.
+    fn anew(&mut self) {
+        (self.gain, self.hit) = (f64::INFINITY, false);
+    }
+
+    /// Where a leap leads, in coordinates; none where the problem has no value or none that may be trusted.
+    fn landed(&mut self, from: &At<P>, leap: &[f64]) -> Result<Option<At<P>>> {
+        let next = self.problem.moved(&from.point, leap).0;
+        self.evaluations += 1;
+        let made = self.start(next).and_then(|mut there| {
+            there.jacobian = self.slopes(&there.point, &there.evaluation)?;
+            Ok(there)
+        });
+        match made {
+            Ok(there) if there.cost.is_finite() && (there.trusted || !from.trusted) => Ok(Some(there)),
+            Ok(_) | Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => Ok(None),
+            Err(error) => Err(error),
         }
-        let slope = linear.slope();
-        let level = slope <= flat * linear.norm;
-        let (newton, falls) = linear.step(LEAST_DAMPING);
-        let nowhere = problem.moved(&point, &linear.unscaled(&newton)).1 <= settings.tolerance;
-        // A flat gradient along a valley may still have far to go: a whole step says so, unless none has led anywhere.
-        if nowhere || (level && (falls <= settings.tolerance || gain <= settings.tolerance)) {
-            status = Status::Converged;
-            break;
-        }
-        if gain <= settings.tolerance && hit {
-            status = Status::Wall;
-            break;
-        }
-        hit = false;
+    }
+
+    /// One step that lowers the cost, or why there is none.
+    fn advance(&mut self, at: &mut At<P>) -> Result<Advance> {
+        let (problem, settings) = (self.problem, self.settings);
+        // The gradient's cosine at a minimum: its square is a share of the cost.
+        let flat = settings.tolerance.max(f64::EPSILON).sqrt();
         loop {
-            let curved = if curvature.used { linear.curved_step(damping, &curvature) } else { None };
-            if curvature.used && curved.is_none() && damping <= LARGEST_DAMPING {
-                damping *= FACTOR;
+            if self.evaluations >= settings.evaluations {
+                return Ok(Advance::Ended(Status::Exhausted));
+            }
+            let linear = Linear::at(problem, &at.point, &at.jacobian, problem.residuals(&at.evaluation), self.corners);
+            if at.curvature.is_for(at.jacobian.len()) {
+                if let Some((taken, gradient)) = at.before.take() {
+                    let now = linear.gradient_by_parameter();
+                    let change: Vec<f64> = now.iter().zip(&gradient).map(|(a, b)| a - b).collect();
+                    at.curvature.learn(&taken, &change, &linear.columns_along(&taken));
+                }
+            } else {
+                at.curvature = Curvature::new(at.jacobian.len());
+            }
+            let slope = linear.slope();
+            let level = slope <= flat * linear.norm;
+            let (newton, falls) = linear.step(LEAST_DAMPING);
+            let nowhere = problem.moved(&at.point, &linear.unscaled(&newton)).1 <= settings.tolerance;
+            // A flat gradient along a valley may still have far to go: a whole step says so, unless none has led anywhere.
+            if nowhere || (level && (falls <= settings.tolerance || self.gain <= settings.tolerance)) {
+                return Ok(Advance::Ended(Status::Converged));
+            }
+            if self.gain <= settings.tolerance && self.hit {
+                return Ok(Advance::Ended(Status::Wall));
+            }
+            self.hit = false;
+            match self.lowered(at, &linear, (slope, level))? {
+                Some(advance) => return Ok(advance),
+                // What has corners stays, and the rest goes on.
+                None => (self.corners, at.damping, self.gain) = (true, FIRST_DAMPING, f64::INFINITY),
+            }
+        }
+    }
+
+    /// Steps ever shorter until one lowers the cost; none where parameters with corners are to stay first.
+    fn lowered(&mut self, at: &mut At<P>, linear: &Linear, (slope, level): (f64, bool)) -> Result<Option<Advance>> {
+        let (problem, settings) = (self.problem, self.settings);
+        loop {
+            let curved = if at.curvature.used { linear.curved_step(at.damping, &at.curvature) } else { None };
+            if at.curvature.used && curved.is_none() && at.damping <= LARGEST_DAMPING {
+                at.damping *= FACTOR;
                 continue;
             }
             let first = if curved.is_some() { linear.projected } else { 0 };
-            let (step, falls) = curved.unwrap_or_else(|| linear.step(damping));
-            let (next, moved) = problem.moved(&point, &linear.unscaled(&step));
-            if moved <= settings.tolerance || damping > LARGEST_DAMPING {
+            let (step, falls) = curved.unwrap_or_else(|| linear.step(at.damping));
+            let steps = linear.unscaled(&step);
+            let (next, moved) = problem.moved(&at.point, &steps);
+            if moved <= settings.tolerance || at.damping > LARGEST_DAMPING {
                 // No step lowers the cost any more: at its bottom, for rounding, at a wall or at a corner.
-                if level || slope <= ROUNDING * problem.size(&current) {
-                    status = Status::Converged;
-                } else if hit {
-                    status = Status::Wall;
-                } else if !corners && (0..linear.scales.len()).any(|i| problem.kinked(&point, i)) {
-                    (corners, damping, gain) = (true, FIRST_DAMPING, f64::INFINITY);
-                    continue 'outer;
+                return Ok(if level || slope <= ROUNDING * problem.size(&at.evaluation) {
+                    Some(Advance::Ended(Status::Converged))
+                } else if self.hit {
+                    Some(Advance::Ended(Status::Wall))
+                } else if !self.corners && (0..linear.scales.len()).any(|i| problem.kinked(&at.point, i)) {
+                    None
                 } else {
-                    status = Status::Stalled;
-                }
-                break 'outer;
+                    Some(Advance::Ended(Status::Stalled))
+                });
             }
-            if evaluations >= settings.evaluations {
-                break 'outer;
+            if self.evaluations >= settings.evaluations {
+                return Ok(Some(Advance::Ended(Status::Exhausted)));
             }
-            evaluations += 1;
+            self.evaluations += 1;
             let trusts = problem.trusted(&next);
             // A step that lowers nothing, or leaves the numbers, is shortened.
             let tried = problem.evaluate(&next).and_then(|found| {
                 let reached = cost(problem.residuals(&found));
-                if !reached.is_finite() || (trusted && !trusts) {
+                if !reached.is_finite() || (at.trusted && !trusts) {
                     return Err(Error::Diverged { what: "step".into(), index: 0 });
                 }
-                if reached >= least {
+                if reached >= at.cost {
                     return Ok(None);
                 }
                 let settled = problem.settled(&found, next.clone());
-                Ok(Some((slopes_at(&settled, &found)?, found, reached, settled)))
+                Ok(Some((self.slopes(&settled, &found)?, found, reached, settled)))
             });
             match tried {
                 Ok(Some((slopes, found, reached, next))) => {
-                    gain = (least - reached) / least.max(f64::MIN_POSITIVE);
-                    (point, current, least, jacobian, trusted) = (next, found, reached, slopes, trusts);
+                    self.gain = (at.cost - reached) / at.cost.max(f64::MIN_POSITIVE);
+                    (at.point, at.evaluation, at.cost, at.jacobian, at.trusted) =
+                        (next, found, reached, slopes, trusts);
                     let told = linear.falls(&step, first);
-                    curvature.judge(told, told - linear.bent(&step, &curvature), gain);
-                    before = Some((linear.unscaled(&step), linear.gradient_by_parameter()));
-                    if gain >= FAIR * falls {
-                        damping = (damping / FACTOR).max(LEAST_DAMPING);
+                    at.curvature.judge(told, told - linear.bent(&step, &at.curvature), self.gain);
+                    at.before = Some((steps.clone(), linear.gradient_by_parameter()));
+                    if self.gain >= FAIR * falls {
+                        at.damping = (at.damping / FACTOR).max(LEAST_DAMPING);
                     }
-                    break;
+                    return Ok(Some(Advance::Moved(steps, self.gain)));
                 }
-                Ok(None) => hit = false,
-                Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => hit = true,
+                Ok(None) => self.hit = false,
+                Err(Error::Diverged { .. } | Error::LeadingZero { .. }) => self.hit = true,
                 Err(error) => return Err(error),
             }
-            damping *= FACTOR;
+            at.damping *= FACTOR;
         }
     }
-    Ok(Minimum { point, evaluation: current, cost: least, jacobian, evaluations, status })
 }

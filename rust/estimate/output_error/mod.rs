@@ -24,6 +24,7 @@ mod part;
 pub mod poles;
 mod sensitivities;
 mod shelf;
+mod valley;
 
 pub use experiment::{Experiment, Instant, OwnTimes};
 pub use fit::{fit, fit_steady, fit_until, Fit};

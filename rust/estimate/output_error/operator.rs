@@ -43,6 +43,11 @@ impl Operator {
         self.eta
     }
 
+    /// Whether it is the integral of this order, with or without a derivative.
+    pub(super) fn serves(&self, eta: f64, free: bool) -> bool {
+        self.eta.to_bits() == eta.to_bits() && self.free == free
+    }
+
     /// Of the integral.
     pub(super) fn kernel(&self) -> &[f64] {
         &self.series().0

@@ -125,7 +125,9 @@ impl Shelf {
             return known.clone();
         }
         let (m, step) = (grid.bare.m(), grid.bare.step());
-        let made = Rc::new(Operator::new(eta, free, m, step));
+        // Terms of one order are integrated alike, whatever they are of.
+        let alike = grid.operators.values().find(|o| o.serves(eta, free)).cloned();
+        let made = alike.unwrap_or_else(|| Rc::new(Operator::new(eta, free, m, step)));
         grid.operators.insert(place, made.clone());
         made
     }
