@@ -131,7 +131,7 @@ CORNERS = [(1.4, 2.0, -3.0), (1.4, 1.6, -3.0), (1.9, 2.0, -40.0), (1.4, 1.0, -3.
 
 
 def answer_to_corners(alpha: float, order: float, a: float, corners: np.ndarray, step: float) -> np.ndarray:
-    """D^alpha y = a y + D^order u for u with these changes of its slope at the samples, by the series of Mittag-Leffler."""
+    """D^alpha y = a y + D^order u for u with these changes of its slope at the samples, by Mittag-Leffler's series."""
     t = step * np.arange(corners.size)
     with np.errstate(divide="ignore"):
         powers = [alpha * (k + 1) - order + 1.0 for k in range(90)]

@@ -303,7 +303,8 @@ def test_what_one_end_does_not_need_goes_to_the_others(found: ftlm.Identificatio
     dealt = profiled(valley, valley.names, 0.95, most=scarce)
     assert dealt.left == ()
     for name, interval in dealt.intervals.items():
-        assert (interval.low, interval.high) == (free.intervals[name].low, free.intervals[name].high)
+        # A refit that was cut short goes on from where it was, by other steps.
+        assert (interval.low, interval.high) == pytest.approx((free.intervals[name].low, free.intervals[name].high))
     assert max(took, key=took.__getitem__) in profiled(valley, valley.names, 0.95, most=max(took.values())).left
 
 

@@ -242,3 +242,39 @@ fn large_residuals_bend_the_steps() {
     assert_eq!(found.status, Status::Converged, "{} evaluations, {}", found.evaluations, found.cost);
     check("Brown & Dennis", (2.0 * found.cost / 85_822.201_626_356_3 - 1.0).abs(), 1e-8);
 }
+
+/// Along y = x² the way to x = 12 is long beside what a step may leave the bottom, as with numbers that data hardly tell
+/// apart. Step by step, 2000 evaluations end at x = 9.6.
+#[test]
+fn leaps_shorten_the_way_along_a_curved_valley() {
+    let problem = Closed {
+        residuals: |x: &[f64]| Ok(vec![50.0 * (x[1] - x[0] * x[0]), 0.1 * (x[0] - 12.0), 3.0]),
+        jacobian: |x: &[f64]| vec![vec![-100.0 * x[0], 0.1, 0.0], vec![50.0, 0.0, 0.0]],
+    };
+    let settings = Settings { evaluations: 400, tolerance: 1e-12 };
+    let found = minimise(&problem, vec![0.0, 0.0], settings).unwrap();
+    assert_eq!(found.status, Status::Converged, "{} evaluations, {}", found.evaluations, found.cost);
+    check("end of the valley", (found.point[0] - 12.0).abs(), 1e-2);
+    check("cost", (found.cost / 4.5 - 1.0).abs(), 1e-8);
+}
+
+/// A leap that ends higher is taken back: residuals that grow beyond any bound wherever it may land.
+#[test]
+fn a_leap_that_leads_nowhere_is_taken_back() {
+    let tried = std::cell::RefCell::new(Vec::new());
+    let problem = Closed {
+        residuals: |x: &[f64]| {
+            tried.borrow_mut().push(x[0]);
+            let beyond = (x[0] - 3.0).max(0.0);
+            Ok(vec![50.0 * (x[1] - x[0] * x[0]), 0.1 * (x[0] - 3.0) + 1e3 * beyond, 3.0])
+        },
+        jacobian: |x: &[f64]| {
+            let slope = if x[0] > 3.0 { 1e3 + 0.1 } else { 0.1 };
+            vec![vec![-100.0 * x[0], slope, 0.0], vec![50.0, 0.0, 0.0]]
+        },
+    };
+    let found = minimise(&problem, vec![0.0, 0.0], Settings { evaluations: 600, tolerance: 1e-12 }).unwrap();
+    assert!(tried.borrow().iter().any(|x| *x > 3.0), "no leap went too far: the test says nothing");
+    check("end of the valley", (found.point[0] - 3.0).abs(), 1e-2);
+    check("cost", (found.cost / 4.5 - 1.0).abs(), 1e-6);
+}

@@ -37,7 +37,7 @@ ON_THE_WAY = 0.05
 ABOVE_FLOOR = 2.0
 #: Coarse fits that continue on all samples.
 FINALISTS = 3
-#: ... unless their coarse cost exceeds the best one's by this factor: on few samples, too, nobody that far behind goes on.
+#: ... unless their coarse cost exceeds the best one's by this factor; on few samples nobody as far behind goes on.
 CONTENDER = 3.0
 #: Two costs closer than this share are the same optimum.
 SAME_COST = 1e-3
