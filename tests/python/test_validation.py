@@ -276,3 +276,24 @@ def test_metrics_of_the_core_are_the_public_ones():
     y, prediction = np.random.default_rng(3).standard_normal((2, 50))
     found = ftlm.metrics(y, prediction)
     assert _core.metrics(y, y - prediction) == (found.error, found.rmse, found.nr, found.fit)
+
+
+def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest() -> None:
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.choice([-1.0, 1.0], size=60), 40)
+    truth = ftlm.Model(ftlm.equation("D^1.4 y = -4 y + 2 u", initial="rest"))
+    y = truth.simulate(ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": 0.0 * u}))["y"]
+    y = y + 0.002 * np.std(y) * rng.normal(size=u.size)
+    # Cut where it crosses zero, with speed.
+    start = next(k for k in range(800, 1600) if y[k] * y[k - 1] < 0)
+    moving = np.where(np.arange(u.size) == start, 0.0, y)
+    from_rest = ftlm.Run.from_arrays(step=0.05, inputs={"u": u[:800]}, outputs={"y": y[:800]}, name="from rest")
+    cut = ftlm.Run.from_arrays(step=0.05, inputs={"u": u[start:]}, outputs={"y": moving[start:]}, name="cut")
+    model = ftlm.Model(ftlm.equation("D^1.4 y = -4 y + 2 u"))
+    assert ftlm.compare(model, from_rest).warnings == ()
+    words = ftlm.compare(model, [from_rest, cut]).warnings
+    assert len(words) == 1
+    assert words[0].startswith("cut starts at zero and is simulated from rest")
+    assert "initial='history'" in words[0]
+    asked = ftlm.Model(replace(model.structure, initial="history"))
+    assert ftlm.compare(asked, cut).fit_percent["y"] > ftlm.compare(model, cut).fit_percent["y"] + 1.0

@@ -9,22 +9,14 @@ from functools import partial
 import numpy as np
 
 from ftlm.base.errors import FtlmError
-from ftlm.base.statistics import chi_squared, colour
-from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss
-from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.grid import Attempt
 from ftlm.fit.joint import JointFit, fit_output_error
 from ftlm.fit.problem import FreeProblem
-from ftlm.solve.motion import has_memory, history, misfit, missed, needed, together
-from ftlm.solve.sampled import FIRST_REFINEMENT, measured_samples, own_times, sampled
-
-#: A run whose first values look like rest is in motion where its residuals would ask for a history in this share of
-#: runs at rest only: a first value near zero is rare for a run in motion, and common for one at rest. At a share of
-#: 0.001 pasts that bias orders by five standard errors still go unseen, at 0.05 each twentieth run from rest pays.
-RARE = 0.01
+from ftlm.solve.motion import has_memory, history, misfit, needed, together
+from ftlm.solve.past import in_motion
 
 
 def fit_any_start(
@@ -111,22 +103,4 @@ def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:
     """Whether what a fit from rest leaves over asks for a history."""
     problem = FreeProblem.of(structure)
     numbers = problem.named(list(joint.coefficients.values()))
-    solved = structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs)
-    excess, terms, spread = 0.0, 0, 1.0
-    for run in runs:
-        ends = []
-        for start in ("rest", history(run, structure)):
-            model = Solved(replace(solved, initial=start))
-            try:
-                samples, found = sampled(model, run, FIRST_REFINEMENT, None, own_times(model, run))
-            except FtlmError:
-                return False
-            if not np.all(np.isfinite(samples)):
-                return False
-            ends.append(missed(measured_samples(model, run, FIRST_REFINEMENT), samples))
-            terms += sum(map(len, found.values())) if start != "rest" else 0
-        sizes = np.nanstd([run[o] for o in structure.outputs], axis=1).tolist()
-        excess += misfit([*ends[0]], [*ends[1]], sizes)
-        spread = max([spread, *map(colour, map(read, ends[1]))])
-    # Noise that is coloured is followed by slow terms in any run.
-    return terms > 0 and excess / spread > chi_squared(terms, RARE)
+    return in_motion(structure.with_orders(joint.orders).with_coefficients(numbers).with_inputs(joint.inputs), runs)

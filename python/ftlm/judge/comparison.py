@@ -23,6 +23,7 @@ from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, symbol_html
 from ftlm.solve.free_run import compared, respond
 from ftlm.solve.instants import compared_times
+from ftlm.solve.past import looked_like_rest
 from ftlm.solve.records import Record, check_m, default_m, equation_tuple, records, whole
 from ftlm.solve.refined import refined
 from ftlm.solve.sampled import Sampled, initial_exponents, measured_samples
@@ -195,10 +196,18 @@ def compared_samples(model: Solved, runs: Runs, free: Sequence[Sampled], *, m: i
         parts.append(_beside(model, rec, simulated, measured, sampled.initial, gaps=run.missing))
     times = [compared_times(run, model.structure) for run in runs]
     found = _comparison(model, runs, parts, m, times, sampled=True)
-    restless = [run.name for run, sampled in zip(runs, free, strict=True) if _moves(sampled)]
-    words = f"the free run on {', '.join(restless)} still moves with the step at the finest grid: the model is stiffer "
-    words += "than these samples can show, and its output error is provisional"
-    return replace(found, warnings=(*found.warnings, words)) if restless else found
+    warnings = list(found.warnings)
+    if restless := [run.name for run, sampled in zip(runs, free, strict=True) if _moves(sampled)]:
+        warnings.append(
+            f"the free run on {', '.join(restless)} still moves with the step at the finest grid: the model is stiffer "
+            "than these samples can show, and its output error is provisional"
+        )
+    if moving := looked_like_rest(model, runs):
+        warnings.append(
+            f"{', '.join(moving)} starts at zero and is simulated from rest, but what that leaves over dies away like "
+            "motion from before the start; give the model's structure initial='history' to have that estimated"
+        )
+    return replace(found, warnings=tuple(warnings))
 
 
 def _moves(sampled: Sampled) -> bool:

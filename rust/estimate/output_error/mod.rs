@@ -22,8 +22,10 @@ pub mod model;
 mod operator;
 mod part;
 pub mod poles;
+mod problem;
 mod sensitivities;
 mod shelf;
+mod step;
 mod valley;
 
 pub use experiment::{Experiment, Instant, OwnTimes};

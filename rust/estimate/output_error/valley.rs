@@ -4,8 +4,6 @@
 //! in one direction. What they came to together is repeated a few times over in one leap, from the end of which ordinary
 //! steps lead down to the bottom again; where they do not soon end below the point that was left, the search goes on there.
 
-use super::levenberg_marquardt::{At, Problem};
-
 /// Steps on which a leap is founded.
 const STEPS: usize = 4;
 /// Of the length of these steps the share that their sum has at least: else they lead nowhere together.
@@ -19,14 +17,14 @@ const REACH: f64 = 2.0;
 const FARTHEST: f64 = 16.0;
 
 /// The last steps of a search, and the point that it left by a leap.
-pub(super) struct Valley<P: Problem> {
+pub(super) struct Valley<P> {
     steps: Vec<Vec<f64>>,
     reach: f64,
-    /// Where it leapt from, and after how many evaluations.
-    left: Option<(At<P>, usize)>,
+    /// Where it leapt from, what it cost there, and after how many evaluations.
+    left: Option<(P, f64, usize)>,
 }
 
-impl<P: Problem> Valley<P> {
+impl<P> Valley<P> {
     /// Nothing known.
     pub(super) fn new() -> Self {
         Self { steps: Vec::new(), reach: REACH, left: None }
@@ -54,9 +52,9 @@ impl<P: Problem> Valley<P> {
         straight.then(|| sum.iter().map(|s| self.reach * s).collect())
     }
 
-    /// The search leapt from this point.
-    pub(super) fn left(&mut self, from: At<P>, evaluations: usize) {
-        self.left = Some((from, evaluations));
+    /// The search leapt from this point, at this cost.
+    pub(super) fn left(&mut self, from: P, cost: f64, evaluations: usize) {
+        self.left = Some((from, cost, evaluations));
     }
 
     /// A leap led nowhere.
@@ -66,9 +64,9 @@ impl<P: Problem> Valley<P> {
     }
 
     /// The point that was left, where the leap from it has come to nothing; a search that ends has no time left.
-    pub(super) fn outcome(&mut self, at: &At<P>, evaluations: usize, ends: bool) -> Option<At<P>> {
-        let (from, since) = self.left.take()?;
-        if at.cost < from.cost {
+    pub(super) fn outcome(&mut self, cost: f64, evaluations: usize, ends: bool) -> Option<P> {
+        let (from, least, since) = self.left.take()?;
+        if cost < least {
             self.reach = (2.0 * self.reach).min(FARTHEST);
             self.steps.clear();
             return None;
@@ -77,7 +75,7 @@ impl<P: Problem> Valley<P> {
             self.fell();
             return Some(from);
         }
-        self.left = Some((from, since));
+        self.left = Some((from, least, since));
         None
     }
 }
