@@ -43,6 +43,8 @@ struct OutputError<'a> {
     clock: Clock,
     /// Whether a free run that grows is no place to go.
     steady: bool,
+    /// Whether all coefficients keep their own coordinates, as where an optimum is followed and not looked for.
+    plain: bool,
     /// Coefficients that are solved for at every point.
     linear: Vec<usize>,
     /// What evaluations share, by experiment.
@@ -128,6 +130,10 @@ impl Problem for OutputError<'_> {
     /// Where the grids see all of each equation: a fit would follow noise with what they do not see.
     fn trusted(&self, point: &Point) -> bool {
         self.model.resolved(self.experiments, point) && !(self.steady && self.model.grows(point))
+    }
+
+    fn leaps(&self) -> bool {
+        self.plain
     }
 }
 
@@ -237,6 +243,7 @@ pub fn fit_until(
     point.inputs.iter_mut().zip(&model.inputs).for_each(|(t, d)| *t = t.clamp(d.bounds.0, d.bounds.1));
     // A single evaluation is of the start as it is.
     let linear = if settings.evaluations > 1 { model.linear() } else { Vec::new() };
+    let plain = !model.coordinates.iter().any(|c| matches!(c, Coordinate::Logarithm | Coordinate::ExcessLogarithm));
     let mut model = model.clone();
     // Solved for, they need no coordinate that keeps a sign.
     linear.iter().for_each(|&j| model.coordinates[j] = Coordinate::Plain);
@@ -249,7 +256,7 @@ pub fn fit_until(
     let shelves = RefCell::new(Shelf::of(experiments)?);
     let clock = Clock::of(&model, experiments);
     let start = (point.coefficients.iter().enumerate()).map(|(j, c)| clock.factor(j, &point.orders) * c).collect();
-    let problem = OutputError { model: &model, experiments, start, clock, steady, linear, shelves, stop };
+    let problem = OutputError { model: &model, experiments, start, clock, steady, plain, linear, shelves, stop };
     let found = minimise(&problem, point, settings)?;
     Ok(Fit {
         point: found.point,

@@ -142,7 +142,8 @@ pub fn minimise<P: Problem>(
         if let Some(status) = ended {
             return Ok(at.ended(search.evaluations, status));
         }
-        if let Some(leap) = valley.leap(settings.evaluations - search.evaluations) {
+        let left = if problem.leaps() { settings.evaluations - search.evaluations } else { 0 };
+        if let Some(leap) = valley.leap(left) {
             if let Some(there) = search.landed(&at, &leap)? {
                 let from = at.cost;
                 valley.left(std::mem::replace(&mut at, there), from, search.evaluations);

@@ -66,4 +66,9 @@ pub trait Problem {
     fn trusted(&self, _point: &Self::Point) -> bool {
         true
     }
+
+    /// Whether a search may leap along valleys: not where many starts are to find an optimum each, which a leap may pass.
+    fn leaps(&self) -> bool {
+        true
+    }
 }
