@@ -340,7 +340,7 @@ def test_a_reset_forgets():
 def test_what_cannot_be_realised_is_refused(options, words):
     with pytest.raises(ftlm.ModelError, match=words):
         control.Realised(PID, **{"rate": 500.0, **options})
-    with pytest.raises(ftlm.ModelError, match="Realised controllers"):
+    with pytest.raises(ftlm.ModelError, match="Realised or Lqg controllers"):
         control.HubLoops(PID)
 
 

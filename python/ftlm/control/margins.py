@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,7 +63,7 @@ class Plant:
         Names.
     rate
         Of the loop [Hz]: an answer acts a sample later and is held.
-    coupling
+    coupling, sensor
         See :func:`ftlm.frequency.frequency_response`.
     """
 
@@ -72,14 +72,22 @@ class Plant:
     input: str
     rate: float
     coupling: str
+    sensor: bool = False
+
+    def exact(self, w: Floats) -> Complex:
+        """Response of the model at frequencies [rad/s]."""
+        inputs = response_inputs(self.model, coupled=self.coupling == "simulated")
+        every = frequency_response(self.model, w, coupling=self.coupling, sensor=self.sensor)
+        return np.asarray(every[self.model.outputs.index(self.output), inputs.index(self.input)])
+
+    def held(self, w: Floats) -> Complex:
+        """The same behind the hold of a sampled input, below half the rate."""
+        turn = 1j * w / self.rate
+        return np.asarray(self.exact(w) * -np.expm1(-turn) / turn)
 
     def response(self, w: Floats) -> Complex:
-        """Response at frequencies below half the rate [rad/s], delay and hold included."""
-        inputs = response_inputs(self.model, coupled=self.coupling == "simulated")
-        every = frequency_response(self.model, w, coupling=self.coupling)
-        one = every[self.model.outputs.index(self.output), inputs.index(self.input)]
-        turn = 1j * w / self.rate
-        return np.asarray(one * np.exp(-turn) * -np.expm1(-turn) / turn)
+        """The same behind the loop's sample of delay, too."""
+        return np.asarray(self.held(w) * np.exp(-1j * w / self.rate))
 
     def integrates(self) -> float:
         """Order of the plant's own integral."""
@@ -94,6 +102,20 @@ class Plant:
         found = stability(self.model, coupling=self.coupling)
         return math.nan if found.on_axis else found.unstable_poles
 
+    def reached(self) -> bool:
+        """Whether the input does anything to the output."""
+        return bool(transfer_functions(self.model, coupling=self.coupling).numerators[self.output, self.input])
+
+    def check_stable(self) -> None:
+        """Refuse a model that is not stable; an integral is."""
+        grows = self.grows()
+        if grows != 0:
+            why = "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
+            raise ModelError(
+                f"the model is not stable ({why}): a loop that holds it cannot be judged by its margins; stabilise "
+                "it first, and identify what is then there"
+            )
+
     def samples(self, count: int, seed: int) -> list[Plant]:
         """Plants as the covariance of the model's numbers has them; none where it has no covariance."""
         estimate = self.model.estimate
@@ -106,10 +128,7 @@ class Plant:
         spread = vectors * np.sqrt(np.maximum(values, 0.0))
         drawn = np.random.default_rng(seed).standard_normal((count, len(values))) @ spread.T
         centre = model_numbers(self.model)
-        return [
-            Plant(with_numbers(self.model, centre + d), self.output, self.input, self.rate, self.coupling)
-            for d in drawn
-        ]
+        return [replace(self, model=with_numbers(self.model, centre + d)) for d in drawn]
 
 
 def grid(crossover: float, rate: float) -> Floats:

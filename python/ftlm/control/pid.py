@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
 from ftlm.base.arrays import Complex, Floats
 from ftlm.base.checks import nearest, real_number, whole_number
 from ftlm.base.errors import ModelError
+from ftlm.control.fractional import FractionalPid, Realised
 from ftlm.control.margins import Margins, Plant, grid, margins_of
 from ftlm.data.solved import Solved
 from ftlm.solve.frequency import check_unlimited, model_numbers, response_inputs
@@ -34,37 +35,6 @@ FLAT = (0.7, 1.4)
 
 
 @dataclass(frozen=True)
-class FractionalPid:
-    """kp + ki s^-lam + kd s^mu.
-
-    Parameters
-    ----------
-    kp, ki, kd
-        Gains, of the controller's output over the error.
-    lam, mu
-        Orders of the integral and of the derivative.
-    """
-
-    kp: float
-    ki: float
-    kd: float
-    lam: float
-    mu: float
-
-    def response(self, w: Floats) -> Complex:
-        """Exact response at frequencies above 0 [rad/s]."""
-        s = 1j * np.asarray(w, dtype=np.float64)
-        return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return asdict(self)
-
-    def __str__(self) -> str:
-        return f"{self.kp:.4g} + {self.ki:.4g} s^-{self.lam:.3g} + {self.kd:.4g} s^{self.mu:.3g}"
-
-
-@dataclass(frozen=True)
 class PidDesign:
     """A fractional PID with the margins of its loop.
 
@@ -80,6 +50,8 @@ class PidDesign:
         Margins at samples of the numbers from their covariance; none where the model has no covariance.
     flat
         Phase margin with 0.7, 1 and 1.4 times the plant's gain [degrees].
+    plants
+        Every output that the input moves, that which is controlled first.
     """
 
     pid: FractionalPid
@@ -87,6 +59,12 @@ class PidDesign:
     nominal: Margins
     samples: tuple[Margins, ...]
     flat: tuple[float, float, float]
+    plants: tuple[Plant, ...] = field(default=(), compare=False, repr=False)
+
+    def acting(self, w: Floats) -> tuple[tuple[str, ...], Complex, Complex]:
+        """The output it reads, its response to it and to the reference, at frequencies [rad/s], as it runs."""
+        response = Realised(self.pid, self.rate).response(w)
+        return (self.plants[0].output,), response[None], response
 
     @property
     def kept(self) -> float:
@@ -118,7 +96,7 @@ class PidDesign:
 def fractional_pid(
     model: Solved, *, output: str | None = None, input: str | None = None, crossover: float,
     phase_margin: float = 60.0, rate: float = 500.0, samples: int = 100, seed: int = 0,
-    coupling: Literal["simulated", "measured"] = "simulated",
+    coupling: Literal["simulated", "measured"] = "simulated", sensor: bool = False,
 ) -> PidDesign:  # fmt: skip
     """Tune a fractional PID on a model: crossover, phase margin, flat phase, and the best worst case of its intervals.
 
@@ -140,6 +118,8 @@ def fractional_pid(
         Of the samples.
     coupling
         ``"measured"``: the output's own equation alone.
+    sensor
+        Whether the loop reads what passed the model's sensor filter; by default the filter was of the run alone.
 
     Returns
     -------
@@ -159,7 +139,7 @@ def fractional_pid(
     within 5 % of the least there is) those are taken that give the loop most gain at a tenth of the crossover.
     Monje, Vinagre, Feliu and Chen (2008), doi:10.1016/j.conengprac.2007.08.006.
     """
-    plant = _plant(model, output, input, rate, coupling)
+    plant = plant_of(model, output, input, rate, coupling, sensor=sensor)
     wc = real_number("crossover", crossover)
     if not (math.isfinite(wc) and 0 < wc < math.pi * plant.rate / 4):
         raise ModelError(
@@ -174,11 +154,7 @@ def fractional_pid(
         raise ModelError(f"samples = {samples!r} is no whole number from 0 to 10000")
     if start is None or start < 0:
         raise ModelError(f"seed = {seed!r} is not a whole number from 0")
-    if plant.grows() != 0:
-        raise ModelError(
-            f"the model is not stable ({_why(plant)}): a loop that holds it cannot be judged by its margins; stabilise "
-            "it first, and identify what is then there"
-        )
+    plant.check_stable()
     drawn = plant.samples(count, start)
     target = np.exp(1j * (math.radians(asked) - math.pi)) / plant.response(np.array([wc]))[0]
     near = np.array([wc * (1 - 1e-5), wc * (1 + 1e-5)])
@@ -212,15 +188,21 @@ def fractional_pid(
         raise ModelError(
             f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
             f"numbers the loop is not stable or has less than {KEPT * asked:g} degrees of the phase margin; "
-            f"{_widest(model)}; "
+            f"{known_least(model)}; "
             "identify from a longer or richer run, or lower the crossover"
         )
     flat = tuple(judged(plant, factor).phase for factor in (FLAT[0], 1.0, FLAT[1]))
-    return PidDesign(best, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]))
+    others = [replace(plant, output=o) for o in model.outputs if o != plant.output]
+    moved = (plant, *(p for p in others if p.reached()))
+    return PidDesign(best, plant.rate, nominal, margins, (flat[0], flat[1], flat[2]), moved)
 
 
-def _plant(model: Solved, output: str | None, driver: str | None, rate: float, coupling: str) -> Plant:
+def plant_of(
+    model: Solved, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
+) -> Plant:
     """The input and output that are meant, or a refusal."""
+    if not isinstance(sensor, bool):
+        raise ModelError(f"sensor = {sensor!r} is neither True nor False")
     check_linear(model.equations, "a loop's margin")
     check_unlimited(model, "a loop's margin")
     if coupling not in ("simulated", "measured"):
@@ -240,12 +222,7 @@ def _plant(model: Solved, output: str | None, driver: str | None, rate: float, c
     value = real_number("rate", rate)
     if not (math.isfinite(value) and value > 0):
         raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
-    return Plant(model, names[0], names[1], value, coupling)
-
-
-def _why(plant: Plant) -> str:
-    grows = plant.grows()
-    return "a pole is on the imaginary axis" if math.isnan(grows) else f"{grows:g} of its poles are on the right"
+    return Plant(model, names[0], names[1], value, coupling, sensor)
 
 
 def _best(target: complex, slope: float, wc: float, w: Floats, curves: Complex) -> FractionalPid | None:
@@ -286,7 +263,7 @@ def _solved(target: complex, slope: float, wc: float, lam: float, mu: float) -> 
     return FractionalPid(kp, ki, kd, lam, mu)
 
 
-def _widest(model: Solved) -> str:
+def known_least(model: Solved) -> str:
     """Which coefficient or order is known least."""
     covariance = None if model.estimate is None else model.estimate.covariance
     if covariance is None:

@@ -1,9 +1,9 @@
-"""Fractional controllers one sample at a time, in bounded memory, and both hubs of the arm under them."""
+"""Fractional PID controllers, and the same one sample at a time in bounded memory."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -11,13 +11,43 @@ import numpy as np
 from ftlm.base.arrays import Complex, Floats
 from ftlm.base.checks import real_number, whole_number
 from ftlm.base.errors import ModelError
-from ftlm.control.pid import FractionalPid
 from ftlm.solve.approximation import LARGEST_ORDER, oustaloup
 
 #: Poles reach this many times beyond the band on both sides.
 REACH = 30.0
 #: Frequencies at which the error is measured.
 COMPARED = 200
+
+
+@dataclass(frozen=True)
+class FractionalPid:
+    """kp + ki s^-lam + kd s^mu.
+
+    Parameters
+    ----------
+    kp, ki, kd
+        Gains, of the controller's output over the error.
+    lam, mu
+        Orders of the integral and of the derivative.
+    """
+
+    kp: float
+    ki: float
+    kd: float
+    lam: float
+    mu: float
+
+    def response(self, w: Floats) -> Complex:
+        """Exact response at frequencies above 0 [rad/s]."""
+        s = 1j * np.asarray(w, dtype=np.float64)
+        return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return f"{self.kp:.4g} + {self.ki:.4g} s^-{self.lam:.3g} + {self.kd:.4g} s^{self.mu:.3g}"
 
 
 @dataclass(frozen=True)
@@ -145,38 +175,6 @@ class Realised:
             f"{self.pid} at {self.rate:g} Hz with {self.memory} numbers of memory: within {self.gain_error:.2g} dB and "
             f"{self.phase_error:.2g} degrees from {self.band[0]:.3g} to {self.band[1]:.3g} rad/s"
         )
-
-
-class HubLoops:
-    """A controller of each hub for :func:`ftlm.rig.control`: reference less hub angle in, current out.
-
-    Parameters
-    ----------
-    first, second
-        Of hub 1 and hub 2, called with an error [rad] and returning a current [A]; None leaves a hub without current.
-    """
-
-    def __init__(self, first: Realised | None, second: Realised | None = None) -> None:
-        if not isinstance(first, (Realised, type(None))) or not isinstance(second, (Realised, type(None))):
-            raise ModelError("first and second are Realised controllers, or None")
-        self.loops = (first, second)
-
-    def reset(self) -> None:
-        """Forgets what was."""
-        for loop in self.loops:
-            if loop is not None:
-                loop.reset()
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {f"hub{j}": None if loop is None else loop.to_dict() for j, loop in enumerate(self.loops, start=1)}
-
-    def __call__(self, time: float, angles: Floats, reference: Floats) -> tuple[float, float]:
-        """Both currents [A]."""
-        first, second = (
-            0.0 if loop is None else loop(float(reference[j] - angles[2 * j])) for j, loop in enumerate(self.loops)
-        )
-        return first, second
 
 
 def _power(power: float, reach: tuple[float, float], order: int) -> tuple[Floats, Floats, float]:

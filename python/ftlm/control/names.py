@@ -1,0 +1,49 @@
+"""Arguments that designs share: names and sums of outputs, numbers above 0."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from ftlm.base.arrays import Floats
+from ftlm.base.checks import nearest, real_number
+from ftlm.base.errors import ModelError
+
+
+def names_of(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:
+    """Outputs by name, all of them where none is named."""
+    if given is None:
+        return outputs
+    if isinstance(given, str) or not isinstance(given, Sequence) or not given or len(set(given)) < len(given):
+        raise ModelError(f"{what} = {given!r} is no list of outputs, each once; the input reaches {', '.join(outputs)}")
+    for name in given:
+        if name not in outputs:
+            raise ModelError(
+                f"{what} = {name!r} is not one of the outputs that the input reaches{nearest(name, outputs)}; they are "
+                f"{', '.join(outputs)}"
+            )
+    return tuple(given)
+
+
+def positive(name: str, value: object) -> float:
+    """A finite number above 0."""
+    number = real_number(name, value)
+    if not (math.isfinite(number) and number > 0):
+        raise ModelError(f"{name} = {value!r} is not a finite number above 0")
+    return number
+
+
+def sums(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
+    """A sum of outputs in words, such as "theta11 + theta12", as the row of its factors."""
+    row = np.zeros(len(outputs))
+    for part in str(text).split("+"):
+        name = part.strip()
+        if name not in outputs:
+            raise ModelError(
+                f"{what} = {text!r} is not a sum of outputs that the input reaches{nearest(name, outputs)}; they are "
+                f"{', '.join(outputs)}"
+            )
+        row[outputs.index(name)] += 1.0
+    return row

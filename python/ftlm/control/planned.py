@@ -1,0 +1,259 @@
+"""Inverse dynamics: the reference with which a loop moves a tip along a path, by the exact response of its model."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftlm.base.arrays import Complex, Floats
+from ftlm.base.checks import real_number, whole_number
+from ftlm.base.errors import DataError, ModelError
+from ftlm.control.margins import Plant
+from ftlm.control.names import positive, sums
+from ftlm.control.pid import known_least
+from ftlm.data.solved import Solved
+
+#: A period of the transform is so many times as long as the path: what is long ago has then died away.
+LONGER = 8
+#: Longest path that is inverted [rows].
+MOST = 100_000
+#: A reference that begins further off than this share of the move needs a longer rest before the path.
+UNREST = 1e-3
+#: More than this share of what a path itself as the reference leaves, and the intervals are too wide.
+SHARE_LEFT = 0.5
+#: Where the transform's frequency 0 is evaluated, as a share of its first one.
+SLOW = 1e-3
+
+
+class Loop(Protocol):
+    """A designed loop."""
+
+    @property
+    def rate(self) -> float:
+        """Samples per second."""
+
+    @property
+    def plants(self) -> tuple[Plant, ...]:
+        """What it moves, an output each."""
+
+    def acting(self, w: Floats) -> tuple[tuple[str, ...], Complex, Complex]:
+        """Outputs it reads, its response to each of them, shape (outputs, W), and to the reference, (W,)."""
+
+
+@dataclass(frozen=True)
+class PlannedMove:
+    """A reference that moves what was asked for along a path.
+
+    Parameters
+    ----------
+    reference
+        For the loop, a row a sample.
+    path
+        What is to be followed.
+    command
+        What the loop will ask for, as its linear model has it.
+    outputs
+        The model's outputs on the way.
+    left
+        RMS of what is off the path after its end, beyond which no more than one sample in forty of the model's numbers
+        is; None where it has no covariance.
+    plain
+        The same at the model's values if the path itself were the reference.
+    """
+
+    reference: Floats
+    path: Floats
+    command: Floats
+    outputs: dict[str, Floats]
+    left: float | None
+    plain: float
+
+    def __str__(self) -> str:
+        most = f"largest command {np.max(np.abs(self.command)):.3g}"
+        within = "" if self.left is None else f", at most {self.left:.2g} off it afterwards within the intervals"
+        return (
+            f"a path of {np.ptp(self.path):.4g} in {len(self.path)} samples: {most}{within}; the path itself as the "
+            f"reference would leave {self.plain:.2g}"
+        )
+
+
+def smooth_move(
+    size: float, duration: float, rate: float = 500.0, *, before: float = 0.3, after: float = 1.2
+) -> Floats:
+    """A path from rest to rest whose speed, acceleration and jerk are 0 at both ends: a polynomial of degree 7.
+
+    Parameters
+    ----------
+    size
+        Of the move, in the unit of what moves.
+    duration
+        Of it [s].
+    rate
+        Samples per second.
+    before, after
+        Rest on both sides [s].
+
+    Raises
+    ------
+    ModelError
+        Numbers that are none, a move of fewer than ten samples.
+    """
+    reach = real_number("size", size)
+    if not math.isfinite(reach):
+        raise ModelError(f"size = {size!r} is not a finite number")
+    times = positive("duration", duration), positive("rate", rate)
+    rests = [real_number(n, v) for n, v in (("before", before), ("after", after))]
+    if not all(0 <= r < math.inf for r in rests):
+        raise ModelError(f"before = {before!r} and after = {after!r} are not seconds from 0")
+    if times[0] * times[1] < 10:
+        raise ModelError(f"duration = {duration!r} s has fewer than ten samples at {times[1]:g} Hz; give it more time")
+    rows = (sum(rests) + times[0]) * times[1] + 1
+    if rows > MOST:
+        raise ModelError(f"a move of {rows:.4g} samples is longer than {MOST}; give it less time")
+    s = np.clip((np.arange(round(rows)) / times[1] - rests[0]) / times[0], 0.0, 1.0)
+    return np.asarray(reach * s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3))
+
+
+def inverse(
+    design: Loop, path: ArrayLike, *, of: str | None = None, limit: float = math.inf, samples: int = 40, seed: int = 0
+) -> PlannedMove:
+    """Find the reference with which a designed loop moves a sum of outputs, such as a tip, along a path.
+
+    Parameters
+    ----------
+    design : PidDesign or LqgDesign
+        The loop; its model's response is inverted as it is, fractional, with delay, hold and the controller as it runs.
+    path : array_like
+        What is to be followed, one row a sample at the loop's rate; at rest at both ends, and before its move for as
+        long as the reference has to begin earlier.
+    of : str, optional
+        An output of the model or a sum such as ``"theta11 + theta12"``; where the model has one output alone it needs
+        no name.
+    limit
+        Largest command.
+    samples, seed
+        Of the model's numbers, from their covariance, 0 to 10000.
+
+    Returns
+    -------
+    PlannedMove
+
+    Raises
+    ------
+    DataError
+        A path that is none.
+    ModelError
+        A path that needs more than the limit, or a reference that moves before the path's first row; intervals so wide
+        that more than half may be left of what the path itself as the reference leaves.
+
+    Notes
+    -----
+    In the frequency domain, where a tip that first moves backwards has a bounded inverse, which begins before the path
+    does: Bayo (1987), doi:10.1002/rob.4620040406.
+    """
+    rows = _path(path)
+    count, start = whole_number(samples), whole_number(seed)
+    if count is None or not 0 <= count <= 10_000:
+        raise ModelError(f"samples = {samples!r} is no whole number from 0 to 10000")
+    if start is None or start < 0:
+        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
+    most = real_number("limit", limit)
+    if not most > 0:
+        raise ModelError(f"limit = {limit!r} is not a number above 0")
+    names = tuple(p.output for p in design.plants)
+    row = sums("of", names[0] if of is None and len(names) == 1 else of, names)
+    size = 1 << math.ceil(math.log2(LONGER * len(rows)))
+    lead = size // 4
+    whole = _there_and_back(rows, size, lead)
+    w = np.asarray(2.0 * math.pi * np.fft.rfftfreq(size, 1.0 / design.rate), dtype=np.float64)
+    w[0] = SLOW * w[1]
+    inside = w < 0.999 * math.pi * design.rate
+    heard, acts, asks = design.acting(w[inside])
+
+    def moved(model: Solved) -> tuple[Complex, Complex]:
+        """Command and outputs of the closed loop by the reference."""
+        held = np.array([replace(p, model=model).response(w[inside]) for p in design.plants])
+        loop = np.sum([a * held[names.index(o)] for o, a in zip(heard, acts, strict=True)], axis=0)
+        command = asks / (1.0 + loop)
+        return command, held * command
+
+    command, outputs = moved(design.plants[0].model)
+    spectrum = np.fft.rfft(whole - rows[0])[inside]
+    needed = spectrum / (row @ outputs)
+
+    def back(part: Complex) -> Floats:
+        every = np.zeros(len(w), dtype=complex)
+        every[inside] = part
+        return np.asarray(np.fft.irfft(every, size)[lead : lead + len(rows)])
+
+    reference = back(needed) + rows[0]
+    move = float(np.ptp(rows))
+    off = float(np.max(np.abs(reference[:1] - rows[0])))
+    if off > UNREST * move:
+        raise ModelError(
+            f"the reference has to begin before the path does: at its first row it is {off:.3g} away from rest, more "
+            f"than {UNREST:g} of the move; let the path rest longer before its move"
+        )
+    asked = back(needed * command)
+    if np.max(np.abs(asked)) > most:
+        at = int(np.argmax(np.abs(asked)))
+        raise ModelError(
+            f"the path needs a command of {np.max(np.abs(asked)):.3g} at {at / design.rate:.4g} s, over the limit of "
+            f"{most:g}; give it more time, or a smaller move"
+        )
+    ends = int(np.flatnonzero(np.abs(rows - rows[-1]) > UNREST * move)[-1]) + 1
+    plain = _off(back(spectrum * (row @ outputs)) + rows[0], rows, ends)
+    left = [
+        _off(back(needed * (row @ moved(one.model)[1])) + rows[0], rows, ends)
+        for one in design.plants[0].samples(count, start)
+    ]
+    worst = float(np.quantile(left, 0.975)) if left else None
+    if worst is not None and not worst <= SHARE_LEFT * plain:
+        raise ModelError(
+            f"the intervals are too wide to design on: within them {worst:.2g} may be off the path after its end, and "
+            f"the path itself as the reference leaves {plain:.2g}; {known_least(design.plants[0].model)}; identify "
+            "from a longer or richer run (ftlm design-input lays it out)"
+        )
+    shown = {n: back(needed * line) for n, line in zip(names, outputs, strict=True)}
+    return PlannedMove(reference, rows, asked, shown, worst, plain)
+
+
+def _path(path: ArrayLike) -> Floats:
+    """A path as numbers, shape (rows,)."""
+    try:
+        raw = np.asarray(path)
+        good = raw.dtype.kind in "fiu" and raw.ndim == 1 and 16 <= raw.size <= MOST
+    except (TypeError, ValueError):
+        good = False
+    if not good:
+        raise DataError(f"path is no array of 16 to {MOST} numbers, one a sample")
+    rows = np.array(raw, dtype=np.float64)
+    bad = np.flatnonzero(~np.isfinite(rows))
+    if bad.size:
+        raise DataError(f"path is not finite at row {bad[0]} ({bad.size} such rows in all)")
+    if np.ptp(rows) == 0:
+        raise DataError("path stands still: there is nothing to follow")
+    for where, pair in (("begin", rows[:2]), ("end", rows[-2:])):
+        if abs(pair[1] - pair[0]) > UNREST * np.ptp(rows):
+            raise DataError(f"path does not {where} at rest; repeat its {'first' if where == 'begin' else 'last'} row")
+    return rows
+
+
+def _there_and_back(rows: Floats, size: int, lead: int) -> Floats:
+    """The path in a long period: at rest before it and behind it, and smoothly back to where it begins."""
+    whole = np.full(size, rows[-1])
+    whole[:lead] = rows[0]
+    whole[lead : lead + len(rows)] = rows
+    turn = size // 4
+    s = np.linspace(0.0, 1.0, turn)
+    whole[size - turn :] += (rows[0] - rows[-1]) * s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
+    return whole
+
+
+def _off(found: Floats, rows: Floats, ends: int) -> float:
+    """RMS of what is off a path behind its end."""
+    return float(np.sqrt(np.mean(np.square((found - rows)[min(ends, len(rows) - 1) :]))))

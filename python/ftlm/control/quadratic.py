@@ -1,0 +1,323 @@
+"""Linear-quadratic control on the poles of an identified model, judged on its exact response and its intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ftlm.base.arrays import Complex, Floats
+from ftlm.base.checks import real_number, whole_number
+from ftlm.base.errors import ModelError
+from ftlm.control.kalman import UNKNOWN, Observer, filtered, noises, plants_of
+from ftlm.control.margins import Margins, Plant, margins_of
+from ftlm.control.names import names_of, positive, sums
+from ftlm.control.pid import BROKEN, known_least
+from ftlm.control.realisation import Realisation, python_control, realised
+from ftlm.data.solved import Solved
+
+#: Largest sensitivity of a loop that is a design: a phase margin of 19 degrees and gain margins of 1.5 at least.
+SHARP = 3.0
+#: Frequencies of a Nyquist curve, and how far below the band it begins.
+POINTS, BELOW = 2500, 1e-2
+#: A pole of the controller this close to 1 is its integral.
+AT_ONE = 1e-7
+
+
+class Lqg:
+    """An observer and a state feedback, one sample at a time.
+
+    The first sample is safe: the observer begins at rest where the output stands, and what is asked for is answered
+    from there. It is told the currents that were cut at the limit, so that nothing winds up.
+
+    Parameters
+    ----------
+    observer
+        What it knows its states from.
+    feedback
+        Of the states, shape (1, states).
+    tracked
+        The output that follows the reference.
+    limit
+        Largest command.
+    """
+
+    def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
+        most = real_number("limit", limit)
+        if not most > 0:
+            raise ModelError(f"limit = {limit!r} is not a number above 0")
+        self.observer, self.tracked, self.limit = observer, tracked, most
+        realisation = observer.realisation
+        self.rate = realisation.rate
+        gains = np.array(feedback, dtype=np.float64).reshape(1, -1)
+        if gains.shape[1] != realisation.states or not np.isfinite(gains).all():
+            raise ModelError(f"feedback is no row of {realisation.states} finite numbers, one a state")
+        self.feedback = gains
+        self._a, self._b, self._c = observer.matrices
+        self._gains = np.append(gains, [[1.0]], axis=1)
+        self._ahead = _equilibrium(realisation, tracked)
+        self._factor = float(gains[0] @ self._ahead[:-1] + self._ahead[-1])
+        self.reset()
+
+    @property
+    def memory(self) -> int:
+        """Numbers that are remembered from one sample to the next."""
+        return len(self._a) + 1
+
+    @property
+    def estimate(self) -> dict[str, float]:
+        """Every output as it is thought to be at the next sample, and the unknown part of the input."""
+        states = np.zeros(len(self._a)) if self._states is None else self._states
+        shown = (self.observer.realisation.c @ states[:-1]).tolist()
+        return dict(zip(self.observer.realisation.outputs, shown, strict=True)) | {UNKNOWN: float(states[-1])}
+
+    def reset(self) -> None:
+        """Forgets everything."""
+        self._states: Floats | None = None
+        self._applied = 0.0
+
+    def __call__(self, measured: Sequence[float] | Floats, reference: float) -> float:
+        """The command for what is measured at a sample, in the observer's order, and what is asked for."""
+        y = np.asarray(measured, dtype=np.float64)
+        if self._states is None:
+            self._states = np.append(self.observer.rest(y), 0.0)
+        corrected = self._states + self.observer.gain @ (y - self._c @ self._states)
+        self._states = self._a @ corrected + self._b[:, 0] * self._applied
+        command = self._factor * reference - float(self._gains[0] @ self._states)
+        self._applied = min(max(command, -self.limit), self.limit)
+        return self._applied
+
+    def response(self, w: Floats) -> tuple[Complex, Complex]:
+        """Of the command to what is measured, shape (measured, W), and to the reference, (W,), without the limit."""
+        z = np.exp(1j * np.asarray(w, dtype=np.float64) / self.rate)
+        a, into = self._closed()
+        system = z[:, None, None] * np.eye(len(a)) - a
+        right = np.broadcast_to(np.column_stack([into, self._b]), (z.size, len(a), into.shape[1] + 1))
+        answer = (self._gains @ np.linalg.solve(system, right))[:, 0, :]
+        return np.asarray(-z[None] * answer[:, :-1].T), np.asarray(self._factor * (1.0 - answer[:, -1]))
+
+    def poles(self) -> Complex:
+        """Its own, in the plane of z."""
+        return np.asarray(np.linalg.eigvals(self._closed()[0]))
+
+    def _closed(self) -> tuple[Floats, Floats]:
+        """The controller from sample to sample, and what is measured into it."""
+        into = self._a @ self.observer.gain
+        return self._a - self._b @ self._gains - into @ self._c, into
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        realisation = self.observer.realisation
+        return {
+            "kind": "lqg", "rate": self.rate, "limit": self.limit if math.isfinite(self.limit) else None,
+            "input": realisation.input, "tracked": self.tracked, "measured": list(self.observer.measured),
+            "memory": self.memory, "gain_error_db": max(realisation.gain_error.values()),
+            "phase_error_degrees": max(realisation.phase_error.values()), "a": realisation.a.tolist(),
+            "b": realisation.b.tolist(), "c": realisation.c.tolist(), "correction": self.observer.gain.tolist(),
+            "feedback": self.feedback.tolist(),
+        }  # fmt: skip
+
+    def __str__(self) -> str:
+        return (
+            f"LQG at {self.rate:g} Hz with {self.memory} numbers of memory, from "
+            f"{', '.join(self.observer.measured)} to {self.observer.realisation.input}, {self.tracked} as asked for"
+        )
+
+
+@dataclass(frozen=True)
+class LqgDesign:
+    """A linear-quadratic controller with the margins of its loop on the exact model.
+
+    Parameters
+    ----------
+    controller
+        What runs.
+    realisation
+        Of the model, with its error.
+    nominal
+        Margins at the values of the model's numbers, at the plant's input.
+    samples
+        Margins at samples of the numbers from their covariance; none where the model has no covariance.
+    plants
+        The model's outputs as they are measured.
+    """
+
+    controller: Lqg
+    realisation: Realisation
+    nominal: Margins
+    samples: tuple[Margins, ...]
+    plants: tuple[Plant, ...]
+
+    @property
+    def rate(self) -> float:
+        """Of the loop [Hz]."""
+        return self.realisation.rate
+
+    @property
+    def kept(self) -> float:
+        """Share of the samples whose loop is stable; 1 where there are none."""
+        return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
+
+    def within(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
+        """Where 95 % of the samples have a margin."""
+        if not self.samples:
+            value = getattr(self.nominal, what)
+            return value, value
+        low, high = np.quantile([getattr(m, what) for m in self.samples], [0.025, 0.975])
+        return float(low), float(high)
+
+    def acting(self, w: Floats) -> tuple[tuple[str, ...], Complex, Complex]:
+        """Outputs it reads, its response to each of them and to the reference, at frequencies [rad/s]."""
+        heard, asked = self.controller.response(w)
+        return self.controller.observer.measured, -heard, asked
+
+    def controlled(self, limit: float) -> Lqg:
+        """The controller with a limit of its command, as a rig has it."""
+        return Lqg(self.controller.observer, self.controller.feedback, self.controller.tracked, limit=limit)
+
+    def __str__(self) -> str:
+        lines = [str(self.controller), f"realised by {self.realisation}", f"at the values: {self.nominal}"]
+        if self.samples:
+            phase, gain, peak = (self.within(n) for n in ("phase", "gain", "sensitivity"))
+            lines.append(
+                f"over the intervals ({len(self.samples)} samples, {100 * self.kept:.0f} % stable), 95 % between: "
+                f"phase margin {phase[0]:.3g} and {phase[1]:.3g} degrees, gain margin {gain[0]:.3g} and {gain[1]:.3g}, "
+                f"largest sensitivity {peak[0]:.3g} and {peak[1]:.3g}"
+            )
+        return "\n".join(lines)
+
+
+def lqg(
+    model: Solved, *, allowed: Mapping[str, float], effort: float, input: str | None = None,
+    output: str | None = None, measured: Sequence[str] | None = None, noise: Mapping[str, float] | None = None,
+    drift: float | None = None, rate: float = 500.0, limit: float = math.inf,
+    band: tuple[float, float] | None = None, poles: int | None = None, samples: int = 100, seed: int = 0,
+    coupling: Literal["simulated", "measured"] = "simulated", sensor: bool = False,
+) -> LqgDesign:  # fmt: skip
+    """Control a model of any orders from an observer of its states: linear-quadratic, with an integral.
+
+    Parameters
+    ----------
+    model
+        A linear model that is stable, an integral apart.
+    allowed : mapping
+        Deviations of outputs, or of sums such as ``"theta11 + theta12"`` (a tip), that are as dear as `effort`.
+    effort
+        Of the input, in its unit.
+    input, output : str, optional
+        What is controlled with, and the output that follows the reference: default the one that integrates, or the
+        first. Where the model has one input alone it needs no name.
+    measured, noise, rate, band, poles, coupling, sensor
+        See :func:`observer`.
+    drift
+        By how much an unknown part of the input may walk in a second; default a fifth of `effort`. The larger, the
+        faster is the observer, and the more of the noise is in the command.
+    limit
+        Largest command.
+    samples, seed
+        Of the model's numbers, from their covariance, 0 to 10000.
+
+    Returns
+    -------
+    LqgDesign
+        Its `controller` runs; margins are those of the controller as it runs on the exact response of the model.
+
+    Raises
+    ------
+    ModelError
+        As :func:`observer`; a loop whose largest sensitivity on the exact model is above 3, intervals so wide that it
+        is in more than a twentieth of their samples.
+
+    Notes
+    -----
+    The riccati equations are python-control's, on the sampled realisation; a sample of delay is counted. Such loops
+    have no guaranteed margins: Doyle (1978), doi:10.1109/TAC.1978.1101812. So they are judged by the argument principle
+    on the exact response.
+    """
+    count, start = whole_number(samples), whole_number(seed)
+    if count is None or not 0 <= count <= 10_000:
+        raise ModelError(f"samples = {samples!r} is no whole number from 0 to 10000")
+    if start is None or start < 0:
+        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
+    dear = positive("effort", effort)
+    walks = 0.2 * dear if drift is None else positive("drift", drift)
+    plants = plants_of(model, input, rate, coupling, sensor=sensor)
+    names = tuple(p.output for p in plants)
+    read = names_of("measured", measured, names)
+    weights = _weights(allowed, names)
+    tracked = _tracked(output, plants)
+    realisation = realised(plants, band, poles)
+    seen = filtered(realisation, read, noises(model, read, noise), walks)
+    c = realisation.c
+    cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
+    try:
+        gains, _, _ = python_control().dlqr(realisation.a, realisation.b, cost, np.eye(1) / dear**2)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise ModelError(f"no state feedback ({error}); allow for deviations of every output that integrates") from None
+    controller = Lqg(seen, gains, tracked, limit=limit)
+    w = np.geomspace(BELOW * realisation.band[0], 0.999 * math.pi * plants[0].rate, POINTS)
+    acting = -controller.response(w)[0]
+    own = controller.poles()
+    integral = int(np.sum(np.abs(own - 1.0) < AT_ONE))
+    grows = int(np.sum((np.abs(own) > 1.0) & (np.abs(own - 1.0) >= AT_ONE)))
+    heard = [plants[names.index(o)] for o in seen.measured]
+
+    def judged(which: Solved) -> Margins:
+        parts = [replace(p, model=which) for p in heard]
+        loop = np.sum(acting * np.array([p.response(w) for p in parts]), axis=0)
+        order = max(p.integrates() for p in parts)
+        return margins_of(loop, w, max(order, 0.0) + integral, parts[0].grows() + grows)
+
+    nominal = judged(model)
+    if not (nominal.stable and nominal.sensitivity <= SHARP):
+        raise ModelError(
+            f"the loop is no design on the exact response of the model ({nominal}): such loops have no guaranteed "
+            "margins; make effort smaller, drift larger or the noise smaller, or allow for larger deviations"
+        )
+    margins = tuple(judged(one.model) for one in plants[0].samples(count, start))
+    broken = [m for m in margins if not (m.stable and m.sensitivity <= SHARP)]
+    if len(broken) > BROKEN * len(margins):
+        raise ModelError(
+            f"the intervals are too wide to design on: in {len(broken)} of {len(margins)} samples of the model's "
+            f"numbers the loop is not stable or has a largest sensitivity above {SHARP:g}; {known_least(model)}; "
+            "identify from a longer or richer run (ftlm design-input lays it out), or make effort smaller"
+        )
+    return LqgDesign(controller, realisation, nominal, margins, tuple(plants))
+
+
+def _tracked(output: str | None, plants: Sequence[Plant]) -> str:
+    """The output that follows the reference."""
+    names = [p.output for p in plants]
+    if output is not None:
+        return names_of("output", [output], tuple(names))[0]
+    return next((p.output for p in plants if p.integrates() > 0.5), names[0])
+
+
+def _weights(allowed: Mapping[str, float], names: tuple[str, ...]) -> list[tuple[Floats, float]]:
+    """Rows of outputs that are summed up, and the deviations that are allowed for."""
+    if not isinstance(allowed, Mapping) or not allowed:
+        raise ModelError(
+            f"allowed = {allowed!r} is no mapping from outputs, or sums of them, to deviations; give such as "
+            f"{{{names[0]!r}: 0.01}}"
+        )
+    return [(sums("allowed", text, names), positive(f"allowed[{text!r}]", size)) for text, size in allowed.items()]
+
+
+def _equilibrium(realisation: Realisation, tracked: str) -> Floats:
+    """States and input at rest with the tracked output at 1."""
+    if tracked not in realisation.outputs:
+        raise ModelError(f"tracked = {tracked!r} is not one of the outputs {', '.join(realisation.outputs)}")
+    size = realisation.states
+    matrix = np.zeros((size + 1, size + 1))
+    matrix[:size, :size] = realisation.a - np.eye(size)
+    matrix[:size, size:] = realisation.b
+    matrix[size, :size] = realisation.c[realisation.outputs.index(tracked)]
+    try:
+        found = np.linalg.solve(matrix, np.eye(size + 1)[-1])
+    except np.linalg.LinAlgError:
+        raise ModelError(f"{tracked} cannot be held at a value by {realisation.input}: its steady gain is 0") from None
+    return np.asarray(found, dtype=np.float64)
