@@ -37,9 +37,9 @@ class FractionalPid:
     lam: float
     mu: float
 
-    def response(self, w: Floats) -> Complex:
+    def response(self, w: Floats | Complex) -> Complex:
         """Exact response at frequencies above 0 [rad/s]."""
-        s = 1j * np.asarray(w, dtype=np.float64)
+        s = 1j * np.asarray(w)
         return np.asarray(self.kp + self.ki * s**-self.lam + self.kd * s**self.mu)
 
     def to_dict(self) -> dict[str, Any]:
@@ -127,9 +127,9 @@ class Realised:
         """Numbers that are remembered from one sample to the next."""
         return len(self._integral.weights) + len(self._derivative.weights) + 1
 
-    def response(self, w: Floats) -> Complex:
+    def response(self, w: Floats | Complex) -> Complex:
         """Its own response at frequencies [rad/s], limit apart."""
-        z = np.exp(1j * np.asarray(w, dtype=np.float64) / self.rate)
+        z = np.exp(1j * np.asarray(w) / self.rate)
         return self.pid.kp + self._integral.response(z) + self._derivative.response(z)
 
     def reset(self) -> None:

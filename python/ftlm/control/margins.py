@@ -10,7 +10,14 @@ import numpy as np
 from ftlm.base.arrays import Complex, Floats
 from ftlm.base.errors import ModelError
 from ftlm.data.solved import Solved
-from ftlm.solve.frequency import frequency_response, model_numbers, response_inputs, transfer_functions, with_numbers
+from ftlm.solve.frequency import (
+    frequency_response,
+    model_numbers,
+    response_inputs,
+    transfer_functions,
+    value_at,
+    with_numbers,
+)
 from ftlm.solve.stability import stability
 
 #: Frequencies of a Nyquist curve, from a thousandth of the crossover to half the sampling rate.
@@ -74,18 +81,26 @@ class Plant:
     coupling: str
     sensor: bool = False
 
-    def exact(self, w: Floats) -> Complex:
-        """Response of the model at frequencies [rad/s]."""
+    def exact(self, w: Floats | Complex) -> Complex:
+        """Response of the model at frequencies [rad/s]; at complex ones, s = jw, without the sensor filter."""
+        if np.iscomplexobj(w):
+            transfer = transfer_functions(self.model, coupling=self.coupling)
+            s = 1j * np.asarray(w)
+            above, below = (
+                value_at({p: c for c, p in pairs}, s)
+                for pairs in (transfer.numerators[self.output, self.input], transfer.denominator[self.output])
+            )
+            return np.asarray(above / below * np.exp(-s * transfer.delay[self.input]))
         inputs = response_inputs(self.model, coupled=self.coupling == "simulated")
         every = frequency_response(self.model, w, coupling=self.coupling, sensor=self.sensor)
         return np.asarray(every[self.model.outputs.index(self.output), inputs.index(self.input)])
 
-    def held(self, w: Floats) -> Complex:
+    def held(self, w: Floats | Complex) -> Complex:
         """The same behind the hold of a sampled input, below half the rate."""
         turn = 1j * w / self.rate
         return np.asarray(self.exact(w) * -np.expm1(-turn) / turn)
 
-    def response(self, w: Floats) -> Complex:
+    def response(self, w: Floats | Complex) -> Complex:
         """The same behind the loop's sample of delay, too."""
         return np.asarray(self.held(w) * np.exp(-1j * w / self.rate))
 

@@ -61,7 +61,7 @@ class PidDesign:
     flat: tuple[float, float, float]
     plants: tuple[Plant, ...] = field(default=(), compare=False, repr=False)
 
-    def acting(self, w: Floats) -> tuple[tuple[str, ...], Complex, Complex]:
+    def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """The output it reads, its response to it and to the reference, at frequencies [rad/s], as it runs."""
         response = Realised(self.pid, self.rate).response(w)
         return (self.plants[0].output,), response[None], response

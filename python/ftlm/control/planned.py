@@ -17,16 +17,17 @@ from ftlm.control.names import positive, sums
 from ftlm.control.pid import known_least
 from ftlm.data.solved import Solved
 
-#: A period of the transform is so many times as long as the path: what is long ago has then died away.
-LONGER = 8
+#: The transform is so many times as long as the path, under a weight that falls to exp(-FALLS) over it: what was long
+#: ago is then not what comes again, which a memory without end would never forget.
+LONGER, FALLS = 8, 28.0
+#: A reference that is so many times as large as the move grows without end.
+GROWN = 20.0
 #: Longest path that is inverted [rows].
 MOST = 100_000
 #: A reference that begins further off than this share of the move needs a longer rest before the path.
 UNREST = 1e-3
 #: More than this share of what a path itself as the reference leaves, and the intervals are too wide.
 SHARE_LEFT = 0.5
-#: Where the transform's frequency 0 is evaluated, as a share of its first one.
-SLOW = 1e-3
 
 
 class Loop(Protocol):
@@ -40,7 +41,7 @@ class Loop(Protocol):
     def plants(self) -> tuple[Plant, ...]:
         """What it moves, an output each."""
 
-    def acting(self, w: Floats) -> tuple[tuple[str, ...], Complex, Complex]:
+    def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Outputs it reads, its response to each of them, shape (outputs, W), and to the reference, (W,)."""
 
 
@@ -167,11 +168,11 @@ def inverse(
     names = tuple(p.output for p in design.plants)
     row = sums("of", names[0] if of is None and len(names) == 1 else of, names)
     size = 1 << math.ceil(math.log2(LONGER * len(rows)))
-    lead = size // 4
-    whole = _there_and_back(rows, size, lead)
-    w = np.asarray(2.0 * math.pi * np.fft.rfftfreq(size, 1.0 / design.rate), dtype=np.float64)
-    w[0] = SLOW * w[1]
-    inside = w < 0.999 * math.pi * design.rate
+    # On a line right of all poles and left of the zeros that a tip has there: s = jw, its real part above 0.
+    fall = FALLS * design.rate / size
+    w: Complex = np.asarray(2.0 * math.pi * np.fft.rfftfreq(size, 1.0 / design.rate) - 1j * fall, dtype=np.complex128)
+    inside = w.real < 0.999 * math.pi * design.rate
+    weight = np.exp(-fall * np.arange(size) / design.rate)
     heard, acts, asks = design.acting(w[inside])
 
     def moved(model: Solved) -> tuple[Complex, Complex]:
@@ -182,13 +183,14 @@ def inverse(
         return command, held * command
 
     command, outputs = moved(design.plants[0].model)
-    spectrum = np.fft.rfft(whole - rows[0])[inside]
+    held = np.concatenate([rows, np.full(size - len(rows), rows[-1])]) - rows[0]
+    spectrum = np.fft.rfft(held * weight)[inside]
     needed = spectrum / (row @ outputs)
 
     def back(part: Complex) -> Floats:
         every = np.zeros(len(w), dtype=complex)
         every[inside] = part
-        return np.asarray(np.fft.irfft(every, size)[lead : lead + len(rows)])
+        return np.asarray((np.fft.irfft(every, size) / weight)[: len(rows)])
 
     reference = back(needed) + rows[0]
     move = float(np.ptp(rows))
@@ -199,6 +201,11 @@ def inverse(
             f"than {UNREST:g} of the move; let the path rest longer before its move"
         )
     asked = back(needed * command)
+    if not np.max(np.abs(reference - rows[0])) < GROWN * move:
+        raise ModelError(
+            "the reference grows beyond all bounds: what is asked for begins with a move the other way that is slower "
+            "than the path; give it more time, or ask for another output"
+        )
     if np.max(np.abs(asked)) > most:
         at = int(np.argmax(np.abs(asked)))
         raise ModelError(
@@ -241,17 +248,6 @@ def _path(path: ArrayLike) -> Floats:
         if abs(pair[1] - pair[0]) > UNREST * np.ptp(rows):
             raise DataError(f"path does not {where} at rest; repeat its {'first' if where == 'begin' else 'last'} row")
     return rows
-
-
-def _there_and_back(rows: Floats, size: int, lead: int) -> Floats:
-    """The path in a long period: at rest before it and behind it, and smoothly back to where it begins."""
-    whole = np.full(size, rows[-1])
-    whole[:lead] = rows[0]
-    whole[lead : lead + len(rows)] = rows
-    turn = size // 4
-    s = np.linspace(0.0, 1.0, turn)
-    whole[size - turn :] += (rows[0] - rows[-1]) * s**4 * (35.0 - 84.0 * s + 70.0 * s**2 - 20.0 * s**3)
-    return whole
 
 
 def _off(found: Floats, rows: Floats, ends: int) -> float:

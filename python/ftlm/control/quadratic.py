@@ -91,9 +91,9 @@ class Lqg:
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
 
-    def response(self, w: Floats) -> tuple[Complex, Complex]:
+    def response(self, w: Floats | Complex) -> tuple[Complex, Complex]:
         """Of the command to what is measured, shape (measured, W), and to the reference, (W,), without the limit."""
-        z = np.exp(1j * np.asarray(w, dtype=np.float64) / self.rate)
+        z = np.exp(1j * np.asarray(w) / self.rate)
         a, into = self._closed()
         system = z[:, None, None] * np.eye(len(a)) - a
         right = np.broadcast_to(np.column_stack([into, self._b]), (z.size, len(a), into.shape[1] + 1))
@@ -170,7 +170,7 @@ class LqgDesign:
         low, high = np.quantile([getattr(m, what) for m in self.samples], [0.025, 0.975])
         return float(low), float(high)
 
-    def acting(self, w: Floats) -> tuple[tuple[str, ...], Complex, Complex]:
+    def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Outputs it reads, its response to each of them and to the reference, at frequencies [rad/s]."""
         heard, asked = self.controller.response(w)
         return self.controller.observer.measured, -heard, asked
@@ -254,16 +254,19 @@ def lqg(
     seen = filtered(realisation, read, noises(model, read, noise), walks)
     c = realisation.c
     cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
+    no = "no state feedback brings the model to rest; allow for deviations of every output that integrates"
     try:
-        gains, _, _ = python_control().dlqr(realisation.a, realisation.b, cost, np.eye(1) / dear**2)
+        gains, _, own = python_control().dlqr(realisation.a, realisation.b, cost, np.eye(1) / dear**2)
     except (np.linalg.LinAlgError, ValueError) as error:
-        raise ModelError(f"no state feedback ({error}); allow for deviations of every output that integrates") from None
+        raise ModelError(f"{no} ({error})") from None
+    if np.max(np.abs(own)) >= 1.0 - AT_ONE:
+        raise ModelError(no)
     controller = Lqg(seen, gains, tracked, limit=limit)
     w = np.geomspace(BELOW * realisation.band[0], 0.999 * math.pi * plants[0].rate, POINTS)
     acting = -controller.response(w)[0]
-    own = controller.poles()
-    integral = int(np.sum(np.abs(own - 1.0) < AT_ONE))
-    grows = int(np.sum((np.abs(own) > 1.0) & (np.abs(own - 1.0) >= AT_ONE)))
+    poles_of_it = controller.poles()
+    at_one = np.abs(poles_of_it - 1.0) < AT_ONE
+    integral, grows = int(np.sum(at_one)), int(np.sum((np.abs(poles_of_it) > 1.0) & ~at_one))
     heard = [plants[names.index(o)] for o in seen.measured]
 
     def judged(which: Solved) -> Margins:

@@ -16,7 +16,7 @@ from ftlm.base.errors import ModelError
 from ftlm.control.margins import Plant
 from ftlm.solve.modes import modes
 
-#: Frequencies at which the exact response is fitted, and between which the fit is judged.
+#: Frequencies at which the exact response is fitted; the fit is judged between them, too.
 FITTED = 120
 #: Rounds in which poles move, and the share of themselves below which they stand still.
 ROUNDS, STILL = 30, 1e-6
@@ -119,7 +119,7 @@ def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: i
     integrates = [p.integrates() > 0.5 for p in plants]
     best: Realisation | None = None
     for count in counts:
-        found = _fit(1j * w, exact, integrates, _begun(own, low, high, count))
+        found = _fit(np.asarray(1j * w, dtype=np.complex128), exact, integrates, _begun(own, low, high, count))
         made = _sampled(library, plants, (low, high), *found)
         if best is None or _worst(made) < _worst(best):
             best = made
@@ -129,7 +129,7 @@ def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: i
     gain, phase = max(best.gain_error.values()), max(best.phase_error.values())
     if not (gain <= COARSE_DB and phase <= COARSE_DEGREES):
         raise ModelError(
-            f"{best.states} poles are off by up to {gain:.2g} dB and {phase:.2g} degrees between {low:.3g} and "
+            f"{best.states} states are off by up to {gain:.2g} dB and {phase:.2g} degrees between {low:.3g} and "
             f"{high:.3g} rad/s, so nothing is designed on them; use a narrower band"
             + ("" if poles is None else ", or more poles")
         )
@@ -275,8 +275,7 @@ def _sampled(
         tuple(p.output for p in plants), plants[0].input, rate, band, tuple(complex(p) for p in poles),
         np.asarray(system.A) * size[:, None] / size, np.asarray(system.B) * size[:, None], c / size, {}, {},
     )  # fmt: skip
-    # Between the frequencies that were fitted.
-    w = np.geomspace(*band, 2 * FITTED - 1)[1::2]
+    w = np.geomspace(*band, 2 * FITTED - 1)
     quotient = made.response(w) / np.array([p.held(w) for p in plants])
     for name, line in zip(made.outputs, quotient, strict=True):
         made.gain_error[name] = float(np.max(np.abs(20.0 * np.log10(np.abs(line)))))
