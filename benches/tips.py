@@ -1,0 +1,171 @@
+"""The same designs on models of the same run: how still the tip stands, and on which other plants they stay stable.
+
+python benches/tips.py seeds 0 1 2 …   identify a stage three ways, design alike, move; a line of JSON a seed
+python benches/tips.py plants          stiffness and delay perturbed: which designs stay stable
+python benches/tips.py table
+
+The arm, its run of ten seconds and its judge are those of benches/moves.py. Designs here use the whole of a stage's
+model, from its current to its tip, and not its pole alone: an observer with state feedback, and inverse dynamics.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import ftlm
+import moves
+from ftlm import control, rig
+
+RATE, ANGLE = moves.RATE, moves.ANGLE
+#: 20 degrees in half a second; rest before it for a reference that begins sooner, and a second behind it to be judged.
+SECONDS, BEFORE, AFTER = 0.5, 0.3, 1.1
+TIP = "theta11 + theta12"
+WHOLE = {"alpha1": 2.0, "alpha2": 2.0, "beta2": 0.0, "mu2": 1.0, "gamma1": 1.0}
+#: Deviations as dear as 1 A, how fast what is not modelled may walk, and the noise of encoder and gauge [rad].
+WEIGHTS = {
+    "allowed": {"theta11": 0.02, "theta12": 0.02}, "effort": 1.0, "drift": 0.5,
+    "noise": {"theta11": 3e-4, "theta12": 2e-4},
+}  # fmt: skip
+KEPT = Path(os.environ.get("KEPT", "tips.jsonl"))
+
+
+def structures():
+    """Three models of a stage: the arm's law with free orders and with whole ones, and whole orders without any law."""
+    law = ftlm.flexible_link(stage=1, sensor_filter="stock", offset="constant", friction="coulomb")
+    free = ftlm.equation(
+        "D^2 theta11 = k theta12 + e D theta12 + b D theta11 + g I1; "
+        "D^2 theta12 = a theta12 + d D theta12 + h D^2 theta11",
+        sensor_filter=ftlm.SensorFilter.low_pass(["theta12"]), offset="constant", coupling="simulated",
+    )  # fmt: skip
+    return {
+        "fractional": law.with_orders({"alpha1": 2.0}),
+        "integer": law.with_orders({n: WHOLE[n] for n in law.order_names}),
+        "integer, no law": free,
+    }
+
+
+def identified(run, structure):
+    """A model of a structure, on every fourth sample."""
+    thin = run.resample(0.008)
+    return ftlm.identify(thin.select([s for s in structure.signals if s in thin.signals]), structure).model
+
+
+def both(first):
+    """Hub 1 under a controller, hub 2 held by the plain one of benches/moves.py."""
+    hold = control.Realised(control.FractionalPid(20.0, 50.0, 0.5, 1.0, 1.0), RATE, limit=1.19)
+    return control.HubLoops(first, hold)
+
+
+def designs(model, samples=0):
+    """Both designs of a model and what runs; or why there is none."""
+    out = {}
+    for name in ("lqg", "pid"):
+        try:
+            if name == "lqg":
+                made = control.lqg(model, input="I1", samples=samples, **WEIGHTS)
+                out[name] = made, made.controlled(0.93)
+            else:
+                made = control.fractional_pid(
+                    model, output="theta11", input="I1", crossover=moves.CROSSOVER, phase_margin=moves.PHASE,
+                    rate=RATE, samples=samples,
+                )  # fmt: skip
+                out[name] = made, control.Realised(made.pid, RATE, limit=0.93)
+        except ftlm.ModelError as error:
+            out[name] = str(error)
+    return out
+
+
+def judged(controller, reference, ends, **options):
+    """RMS of the tip in the second after the path has ended, about its mean and about its goal [rad]."""
+    tip = moves.tip_of(controller, reference, **options)
+    if tip is None:
+        return None
+    after = tip[ends : ends + round(RATE)]
+    return [float(np.std(after)), float(np.sqrt(np.mean((after - ANGLE) ** 2)))]
+
+
+def of_seed(seed):
+    """Everything of a seed: the move's noise is another's than the run's."""
+    run = moves.own_run(seed)
+    path = control.smooth_move(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)
+    ends = round((BEFORE + SECONDS) * RATE)
+    found = {"seed": seed}
+    for kind, structure in structures().items():
+        began = time.process_time()
+        model = identified(run, structure)
+        took = time.process_time() - began
+        told = {"seconds": took, "fit": model.estimate.fit}
+        for name, made in designs(model).items():
+            if isinstance(made, str):
+                told[name] = {"refused": made}
+                continue
+            design, controller = made
+            loop = both(controller)
+            planned = control.inverse(design, path, of=TIP, samples=0)
+            told[name] = {
+                "plain": judged(loop, path, ends, seed=1000 + seed),
+                "inverse": judged(loop, planned.reference, ends, seed=1000 + seed),
+                "exactly": judged(loop, planned.reference, ends, seed=1000 + seed, parameters=quiet()),
+            }
+        # Whether its own intervals let it be designed on.
+        for name, made in designs(model, samples=40).items():
+            said = made if isinstance(made, str) else None
+            if said is None:
+                try:
+                    control.inverse(made[0], path, of=TIP, samples=40)
+                except ftlm.ModelError as error:
+                    said = str(error)
+            told[name]["within intervals"] = said
+        found[kind] = told
+    return found
+
+
+def quiet():
+    """The arm with gauges that have no noise and no steps: what is judged is then the tip itself."""
+    return replace(rig.ArmParameters.of("effective"), strain_noise=(0.0, 0.0), bits=0)
+
+
+def table():
+    """Ratios over the seeds."""
+    rows = {r["seed"]: r for r in map(json.loads, KEPT.read_text(encoding="utf-8").splitlines())}
+    rows = [rows[s] for s in sorted(rows)]
+    print(f"{len(rows)} seeds")
+
+    def left(kind, name, what, about=0):
+        values = [r[kind][name].get(what) for r in rows]
+        return np.array([np.nan if v is None else 1e3 * v[about] for v in values])
+
+    for name in ("lqg", "pid"):
+        own = left("fractional", name, "inverse")
+        for kind in structures():
+            plain, inverse, exact = (left(kind, name, w) for w in ("plain", "inverse", "exactly"))
+            goal = left(kind, name, "inverse", 1)
+            refused = sum(r[kind][name].get("within intervals") is not None for r in rows)
+            print(f"{name}, {kind}: plain {np.nanmedian(plain):.2f} ({np.isnan(plain).sum()} stopped), inverse "
+                  f"{np.nanmedian(inverse):.3f} (about the goal {np.nanmedian(goal):.3f}, without noise "
+                  f"{np.nanmedian(exact):.3f}, {np.isnan(inverse).sum()} stopped) mrad; plain over inverse "
+                  f"{np.nanmedian(plain / inverse):.1f}, least {np.nanmin(plain / inverse):.1f}; over fractional "
+                  f"{np.nanmedian(inverse / own):.2f}, {np.nanmin(inverse / own):.2f} to "
+                  f"{np.nanmax(inverse / own):.2f}; refused by their intervals {refused}")  # fmt: skip
+    return rows
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("what", choices=["seeds", "table"])
+    parser.add_argument("seeds", nargs="*", type=int)
+    given = parser.parse_args()
+    if given.what == "seeds":
+        for one in given.seeds or range(20):
+            line = json.dumps(of_seed(one))
+            with KEPT.open("a", encoding="utf-8") as file:
+                file.write(line + "\n")
+            print(f"seed {one}", file=sys.stderr, flush=True)
+    else:
+        table()
