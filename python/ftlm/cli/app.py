@@ -12,6 +12,7 @@ import typer
 from ftlm import _core
 from ftlm.cli.agreement import agreement
 from ftlm.cli.command import Command
+from ftlm.cli.control import control, shape
 from ftlm.cli.design import design_input
 from ftlm.cli.frequency import identify_frequency
 from ftlm.cli.identify import identify, resume, search, status
@@ -46,7 +47,7 @@ def version(
 
 for _command in (
     demo, page, record, open_, inspect, identify, identify_frequency, select, agreement, search, resume, status,
-    compare, resid, simulate, design_input, report, reproduce, orders, plot, export, doctor,
+    compare, resid, simulate, design_input, control, shape, report, reproduce, orders, plot, export, doctor,
 ):  # fmt: skip
     app.command(_command.__name__.rstrip("_").replace("_", "-"), cls=Command)(_command)
 

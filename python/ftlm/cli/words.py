@@ -26,6 +26,10 @@ OPTIONS = {
     "phase_unit": "--phase-unit", "negated": "--negated",
     "duration": "--duration", "peak": "--peak", "slew": "--slew", "limits": "--limit", "names": "--for",
     "noise": "--noise", "period": "--period", "like": "--like",
+    "crossover": "--crossover", "phase_margin": "--phase-margin", "effort": "--effort", "drift": "--drift",
+    "allowed": "--allowed", "band": "--band", "poles": "--poles", "samples": "--samples", "rate": "--rate",
+    "measured": "--measured", "limit": "--limit", "input": "--input", "output": "--output", "of": "--of",
+    "kind": "--kind", "modes_shaped": "--modes",
     "header": "--header", "dates": "--dates", "sheet": "--sheet",
 }  # fmt: skip
 #: ``force=True (--force)``, where the option stands beside the argument already.

@@ -1,5 +1,6 @@
 """Control on an identified model: shapers, fractional and linear-quadratic controllers, observers, inverse dynamics."""
 
+from ftlm.control.file import load_controller, save_controller
 from ftlm.control.fractional import FractionalPid, Realised
 from ftlm.control.hubs import HubLoops
 from ftlm.control.kalman import Observer, observer
@@ -11,5 +12,5 @@ from ftlm.control.realisation import Realisation
 from ftlm.control.shaper import Shaper, input_shaper
 
 __all__ = ["FractionalPid", "HubLoops", "Lqg", "LqgDesign", "Margins", "Observer", "PidDesign", "PlannedMove",
-           "Realisation", "Realised", "Shaper", "fractional_pid", "input_shaper", "inverse", "lqg", "observer",
-           "smooth_move"]  # fmt: skip
+           "Realisation", "Realised", "Shaper", "fractional_pid", "input_shaper", "inverse", "load_controller", "lqg",
+           "observer", "save_controller", "smooth_move"]  # fmt: skip

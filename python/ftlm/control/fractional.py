@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -114,7 +114,7 @@ class Realised:
         count = whole_number(order)
         if count is None or not 1 <= count <= LARGEST_ORDER:
             raise ModelError(f"order = {order!r} is no whole number from 1 to {LARGEST_ORDER}")
-        self.pid, self.rate, self.limit, self.band = pid, value, most, (low, high)
+        self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
         reach = (low / REACH, high * REACH)
         self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)
         self._derivative = _bank(pid.kd, *_power(pid.mu, reach, count), 1.0 / value)
@@ -126,6 +126,22 @@ class Realised:
     def memory(self) -> int:
         """Numbers that are remembered from one sample to the next."""
         return len(self._integral.weights) + len(self._derivative.weights) + 1
+
+    @property
+    def direct(self) -> float:
+        """What acts at once, besides kp and the lags."""
+        return self._integral.direct + self._derivative.direct
+
+    def lags(self) -> list[tuple[Literal["integral", "derivative"], tuple[float, float, float, float]]]:
+        """What each of its memories keeps, takes in of this error and of the last, and weighs."""
+        banks: tuple[tuple[Literal["integral", "derivative"], _Bank], ...] = (
+            ("integral", self._integral), ("derivative", self._derivative),
+        )  # fmt: skip
+        return [
+            (name, (float(k), float(n), float(b), float(w)))
+            for name, bank in banks
+            for k, n, b, w in zip(bank.keeps, bank.now, bank.before, bank.weights, strict=True)
+        ]
 
     def response(self, w: Floats | Complex) -> Complex:
         """Its own response at frequencies [rad/s], limit apart."""

@@ -206,8 +206,8 @@ def noises(model: Solved, measured: tuple[str, ...], given: Mapping[str, float] 
         value = (given or {}).get(name, left.get(name))
         if value is None:
             raise ModelError(
-                f"the noise of {name} is not known, since this model does not say what its fit left; give "
-                f"noise={{{name!r}: standard deviation}}"
+                f"the noise of {name} is not known, since this model does not say what its fit left; give its standard "
+                f"deviation, as noise={{{name!r}: 0.001}} (--noise {name}=0.001)"
             )
         out.append(positive(f"noise of {name}", value))
     return tuple(out)

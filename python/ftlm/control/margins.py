@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
@@ -56,6 +58,14 @@ class Margins:
             f"crossover {self.crossover:.4g} rad/s, phase margin {self.phase:.3g} degrees, gain margin "
             f"{self.gain:.3g}, largest sensitivity {self.sensitivity:.3g}"
         )
+
+
+def margins_told(nominal: Margins, samples: Sequence[Margins]) -> dict[str, Any]:
+    """Margins at the values and over samples, for JSON."""
+    told = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (nominal, *samples)]
+    for one in told:
+        one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
+    return {"nominal": told[0], "samples": told[1:]}
 
 
 @dataclass(frozen=True)

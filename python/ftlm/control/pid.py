@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from ftlm.base.arrays import Complex, Floats
 from ftlm.base.checks import nearest, real_number, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.control.fractional import FractionalPid, Realised
-from ftlm.control.margins import Margins, Plant, grid, margins_of
+from ftlm.control.margins import Margins, Plant, grid, margins_of, margins_told
 from ftlm.data.solved import Solved
 from ftlm.solve.frequency import check_unlimited, model_numbers, response_inputs
 from ftlm.solve.records import check_linear
@@ -78,6 +78,11 @@ class PidDesign:
             return value, value
         low, high = np.quantile([getattr(m, what) for m in self.samples], [0.025, 0.975])
         return float(low), float(high)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"design": "pid", "rate": self.rate, **self.pid.to_dict(), "phase_margin_at_gains": list(self.flat),
+                **margins_told(self.nominal, self.samples)}  # fmt: skip
 
     def __str__(self) -> str:
         lines = [f"fractional PID: {self.pid}", f"at the values: {self.nominal}"]
@@ -212,7 +217,9 @@ def plant_of(
     for what, name, known in (("output", output, model.outputs), ("input", driver, inputs)):
         if name is None and len(known) == 1:
             names.append(known[0])
-        elif name is None or name not in known:
+        elif name is None:
+            raise ModelError(f"the model has several {what}s: say which, {what}=…; it has {', '.join(known)}")
+        elif name not in known:
             raise ModelError(
                 f"{what} = {name!r} is not one of the model's{nearest(name, known)}; it has "
                 f"{', '.join(known) or 'none'}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -72,6 +72,11 @@ class PlannedMove:
     outputs: dict[str, Floats]
     left: float | None
     plain: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, without the rows."""
+        return {"rows": len(self.path), "largest_command": float(np.max(np.abs(self.command))), "left": self.left,
+                "plain": self.plain}  # fmt: skip
 
     def __str__(self) -> str:
         most = f"largest command {np.max(np.abs(self.command)):.3g}"

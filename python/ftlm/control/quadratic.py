@@ -14,7 +14,7 @@ from ftlm.base.arrays import Complex, Floats
 from ftlm.base.checks import real_number, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.control.kalman import UNKNOWN, Observer, filtered, noises, plants_of
-from ftlm.control.margins import Margins, Plant, margins_of
+from ftlm.control.margins import Margins, Plant, margins_of, margins_told
 from ftlm.control.names import names_of, positive, sums
 from ftlm.control.pid import BROKEN, known_least
 from ftlm.control.realisation import Realisation, python_control, realised
@@ -59,8 +59,9 @@ class Lqg:
         self.feedback = gains
         self._a, self._b, self._c = observer.matrices
         self._gains = np.append(gains, [[1.0]], axis=1)
-        self._ahead = _equilibrium(realisation, tracked)
-        self._factor = float(gains[0] @ self._ahead[:-1] + self._ahead[-1])
+        rest = _equilibrium(realisation, tracked)
+        #: Of the reference, so that in the end the output is where it is asked for.
+        self.ahead = float(gains[0] @ rest[:-1] + rest[-1])
         self.reset()
 
     @property
@@ -87,7 +88,7 @@ class Lqg:
             self._states = np.append(self.observer.rest(y), 0.0)
         corrected = self._states + self.observer.gain @ (y - self._c @ self._states)
         self._states = self._a @ corrected + self._b[:, 0] * self._applied
-        command = self._factor * reference - float(self._gains[0] @ self._states)
+        command = self.ahead * reference - float(self._gains[0] @ self._states)
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
 
@@ -98,7 +99,7 @@ class Lqg:
         system = z[:, None, None] * np.eye(len(a)) - a
         right = np.broadcast_to(np.column_stack([into, self._b]), (z.size, len(a), into.shape[1] + 1))
         answer = (self._gains @ np.linalg.solve(system, right))[:, 0, :]
-        return np.asarray(-z[None] * answer[:, :-1].T), np.asarray(self._factor * (1.0 - answer[:, -1]))
+        return np.asarray(-z[None] * answer[:, :-1].T), np.asarray(self.ahead * (1.0 - answer[:, -1]))
 
     def poles(self) -> Complex:
         """Its own, in the plane of z."""
@@ -178,6 +179,16 @@ class LqgDesign:
     def controlled(self, limit: float) -> Lqg:
         """The controller with a limit of its command, as a rig has it."""
         return Lqg(self.controller.observer, self.controller.feedback, self.controller.tracked, limit=limit)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, without the matrices."""
+        made = self.realisation
+        return {
+            "design": "lqg", "rate": self.rate, "input": made.input, "tracked": self.controller.tracked,
+            "measured": list(self.controller.observer.measured), "states": made.states, "band": list(made.band),
+            "gain_error_db": made.gain_error, "phase_error_degrees": made.phase_error,
+            **margins_told(self.nominal, self.samples),
+        }  # fmt: skip
 
     def __str__(self) -> str:
         lines = [str(self.controller), f"realised by {self.realisation}", f"at the values: {self.nominal}"]

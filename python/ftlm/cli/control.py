@@ -1,0 +1,169 @@
+"""The commands that design on a model: control and shape."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from typer import Option
+
+from ftlm import control as designs
+from ftlm.base.errors import ModelError
+from ftlm.base.output import COMMAND, check_free, write_atomically
+from ftlm.cli.command import command, show_json
+from ftlm.cli.options import Force, Json, Number, SavedModel, Text, Texts
+from ftlm.cli.words import in_options, numbers, several
+from ftlm.model.model import load_model
+
+#: Options that one design has and the other has not.
+OF_PID = ("crossover", "phase_margin")
+OF_LQG = ("allowed", "effort", "drift", "noise", "measured", "band", "poles")
+
+
+@command
+def control(
+    *, model: SavedModel,
+    design: Annotated[
+        Literal["pid", "lqg"], Option(help="A fractional PID, or an observer with state feedback.")
+    ] = "pid",
+    signal: Annotated[
+        Text, Option("--input", metavar="NAME", help="What is controlled with, if there are several.")
+    ] = None,
+    output: Annotated[Text, Option(metavar="NAME", help="What follows the reference, if there are several.")] = None,
+    crossover: Annotated[Number, Option(help="Of the PID: where the loop's gain is 1 [rad/s].")] = None,
+    phase_margin: Annotated[Number, Option(help="Of the PID: there [degrees]; default 60.")] = None,
+    allowed: Annotated[
+        Texts, Option(metavar="OUTPUT=A", help="Of LQG: a deviation as dear as --effort; sums such as a+b, too.")
+    ] = None,
+    effort: Annotated[Number, Option(help="Of LQG: of the input, in its unit.")] = None,
+    drift: Annotated[
+        Number, Option(help="Of LQG: what is unknown of the input walks so far in a second; default effort/5.")
+    ] = None,
+    noise: Annotated[
+        Texts, Option(metavar="OUTPUT=A", help="Of LQG: deviation of an output's noise; default what the fit left.")
+    ] = None,
+    measured: Annotated[Texts, Option(metavar="OUTPUT", help="Of LQG: an output it reads; default all.")] = None,
+    band: Annotated[
+        Text, Option(metavar="LOW:HIGH", help="Of LQG: where its poles stand for the model [rad/s].")
+    ] = None,
+    poles: Annotated[int | None, Option(help="Of LQG: their number; default what makes them good.")] = None,
+    rate: Annotated[float, Option(help="Of the loop [Hz].")] = 500.0,
+    limit: Annotated[Number, Option(help="Largest command.")] = None,
+    move: Annotated[
+        Text, Option(metavar="SIZE:SECONDS", help="Plan a smooth move of --of along which the loop leads it.")
+    ] = None,
+    of: Annotated[
+        Text, Option(metavar="OUTPUTS", help="What moves so, such as theta11+theta12; default --output.")
+    ] = None,
+    plan: Annotated[
+        Text, Option(metavar="FILE", help="Its reference, row by row, with command and path, .csv.")
+    ] = None,
+    samples: Annotated[int, Option(help="Of the model's numbers, from their covariance, to be judged.")] = 100,
+    seed: Annotated[int, Option(min=0, help="Of these samples.")] = 0,
+    out: Annotated[Text, Option("-o", "--out", metavar="FILE", help="Controller to write, .json.")] = None,
+    force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Design a controller on a model: margins, what its intervals leave of them, and what a machine runs, as a file."""
+    given = dict(locals())
+    check_free(out, plan, force=force, words=COMMAND)
+    for name, ending in ((out, ".json"), (plan, ".csv")):
+        if name is not None and Path(name).suffix.lower() != ending:
+            raise ModelError(f"{name} does not end in {ending}; name it so")
+    if plan is not None and move is None:
+        raise ModelError("--plan is of a move; give --move SIZE:SECONDS")
+    if of is not None and move is None:
+        raise ModelError("--of is of a move; give --move SIZE:SECONDS")
+    wrong = [n for n in (OF_LQG if design == "pid" else OF_PID) if given[n] not in (None, [])]
+    if wrong:
+        other = "lqg" if design == "pid" else "pid"
+        shown = ", ".join("--" + n.replace("_", "-") for n in wrong)
+        raise ModelError(f"{shown}: of --design {other}, not used with {design}; leave out what is not meant")
+    loaded = load_model(model)
+    most = np.inf if limit is None else limit
+    common: dict[str, Any] = {"input": signal, "output": output, "rate": rate, "samples": samples, "seed": seed}
+    found: designs.PidDesign | designs.LqgDesign
+    running: designs.Realised | designs.Lqg
+    if design == "pid":
+        if crossover is None:
+            raise ModelError("--crossover is missing: where the loop's gain is to be 1 [rad/s]")
+        found = designs.fractional_pid(
+            loaded, crossover=crossover, phase_margin=60.0 if phase_margin is None else phase_margin, **common
+        )
+        running = designs.Realised(found.pid, rate, limit=most)
+    else:
+        if effort is None or not allowed:
+            raise ModelError(
+                "--allowed OUTPUT=A and --effort A are missing: which deviations are as dear as which input"
+            )
+        low_high = None if band is None else several("--band", band, 2)
+        found = designs.lqg(
+            loaded, allowed=numbers("--allowed", allowed), effort=effort, drift=drift,
+            noise=numbers("--noise", noise) or None, measured=measured or None, limit=most, poles=poles,
+            band=None if low_high is None else (low_high[0], low_high[1]), **common,
+        )  # fmt: skip
+        running = found.controller
+    planned = None
+    if move is not None:
+        size, seconds = several("--move", move, 2)
+        path = designs.smooth_move(size, seconds, rate)
+        told = found.plants[0].output if design == "pid" else running.tracked  # type: ignore[union-attr]
+        planned = designs.inverse(found, path, of=of or told, limit=most, samples=min(samples, 40), seed=seed)
+    if out is not None:
+        designs.save_controller(running, out, model=f"{loaded.structure.name} ({Path(model).name})", force=force)
+    if plan is not None and planned is not None:
+        _written(planned, rate, plan, force=force)
+    if as_json:
+        show_json(found.to_dict() | {"planned": None if planned is None else planned.to_dict()})
+        return
+    for line in (found, *([running] if design == "pid" else []), *([planned] if planned is not None else [])):
+        print(in_options(str(line)))
+    for written in (out, plan):
+        if written is not None:
+            print(in_options(f"written: {written}"))
+
+
+@command
+def shape(
+    *, model: SavedModel,
+    kind: Annotated[Literal["zv", "zvd"], Option(help="zvd bears an error of the pole, at twice the delay.")] = "zv",
+    modes: Annotated[int, Option(help="How many modes, the least damped first.")] = 1,
+    coupling: Annotated[
+        Literal["simulated", "measured"], Option(help="Poles of the equations together, or of each alone.")
+    ] = "simulated",
+    rate: Annotated[float, Option(help="Of the reference [Hz].")] = 500.0,
+    out: Annotated[
+        Text, Option("-o", "--out", metavar="FILE", help="Its samples to write, .csv: convolve a reference with them.")
+    ] = None,
+    force: Force = False, as_json: Json = False,
+) -> None:  # fmt: skip
+    """Make an input shaper from the poles of a model: a reference split so that their vibrations cancel."""
+    check_free(out, force=force, words=COMMAND)
+    if out is not None and Path(out).suffix.lower() != ".csv":
+        raise ModelError(f"{out} does not end in .csv; name it so")
+    made = designs.input_shaper(load_model(model), kind, modes_shaped=modes, coupling=coupling)
+    taps = made.impulses(rate)
+    if out is not None:
+        rows = np.column_stack([np.arange(taps.size) / rate, taps])
+        _table(rows, ("time_s", "share"), out, force=force)
+    if as_json:
+        show_json(made.to_dict() | {"rate": rate, "samples": taps})
+        return
+    print(in_options(str(made)))
+    if out is not None:
+        print(in_options(f"written: {out}"))
+
+
+def _written(planned: designs.PlannedMove, rate: float, path: str, *, force: bool) -> None:
+    """A planned move as rows."""
+    time = np.arange(len(planned.path)) / rate
+    rows = np.column_stack([time, planned.reference, planned.command, planned.path, *planned.outputs.values()])
+    _table(rows, ("time_s", "reference", "command", "path", *planned.outputs), path, force=force)
+
+
+def _table(rows: np.ndarray[Any, Any], names: tuple[str, ...], path: str, *, force: bool) -> None:
+    text = io.StringIO()
+    text.write(",".join(names) + "\n")
+    np.savetxt(text, rows, fmt="%.12g", delimiter=",")
+    write_atomically(path, text.getvalue().encode(), force=force)
