@@ -4,6 +4,8 @@ python benches/tips.py seeds 0 1 2 …   identify a stage three ways, design ali
 python benches/tips.py plants          stiffness and delay perturbed: which designs stay stable
 python benches/tips.py table
 
+The last two write docs/tips.json, of which docs/control.md shows its pictures.
+
 The arm, its run of ten seconds and its judge are those of benches/moves.py. Designs here use the whole of a stage's
 model, from its current to its tip, and not its pole alone: an observer with state feedback, and inverse dynamics.
 """
@@ -34,6 +36,9 @@ WEIGHTS = {
 }  # fmt: skip
 #: Of the model's numbers, over which designs are judged.
 SAMPLES = 20
+#: A tip that moves more than so long after a move does not come to rest (RMS) [rad].
+RESTLESS = 2e-3
+OUT = Path(__file__).parent.parent / "docs" / "tips.json"
 KEPT = Path(os.environ.get("KEPT", "tips.jsonl"))
 
 
@@ -104,8 +109,12 @@ def of_seed(seed):
             except ftlm.ModelError as error:
                 # Its own intervals refuse it; what it would have done is told all the same.
                 refused = str(error)
-                design, controller = designed(name, model, 0)
-                planned = control.inverse(design, path, of=TIP, samples=0)
+                try:
+                    design, controller = designed(name, model, 0)
+                    planned = control.inverse(design, path, of=TIP, samples=0)
+                except ftlm.ModelError as worse:
+                    told[name] = {"refused": str(worse), "plain": None, "inverse": None, "exactly": None, "none": True}
+                    continue
             loop = both(controller)
             told[name] = {
                 "refused": refused,
@@ -115,6 +124,58 @@ def of_seed(seed):
             }
         found[kind] = told
     return found
+
+
+def plants(seed=0):
+    """Where each loop stays stable and how still each design leaves the tip: stiffness of link 1 times, delay."""
+    run = moves.own_run(seed)
+    models = {kind: identified(run, structure) for kind, structure in structures().items() if kind != "integer"}
+    fractional, whole = models["fractional"], models["integer, no law"]
+    pid, lqg = (designed(n, fractional, SAMPLES) for n in ("pid", "lqg"))
+    slow = {**WEIGHTS, "allowed": {"theta11": 0.2, "theta12": 0.2}}
+    calm = control.lqg(fractional, input="I1", samples=SAMPLES, **slow)
+    slower = control.fractional_pid(fractional, output="theta11", input="I1", crossover=moves.SLOW, samples=SAMPLES)
+    loops = {
+        "fractional PID, 40 rad/s": lambda: both(pid[1]),
+        "fractional PID, 12 rad/s": lambda: both(control.Realised(slower.pid, RATE, limit=0.93)),
+        "LQG": lambda: both(lqg[1]),
+        "LQG, ten times the deviations": lambda: both(calm.controlled(0.93)),
+        "LQG of whole orders": lambda: both(designed("lqg", whole, 0)[1]),
+        "LQR of the maker's model": moves.Lqr,
+    }
+    path = control.smooth_move(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)
+    ends = round((BEFORE + SECONDS) * RATE)
+    shaper = control.input_shaper(fractional, "zvd", coupling="measured")
+    still = {
+        "fractional PID": (lambda: both(pid[1]), path, ends),
+        "fractional PID, ZVD": (lambda: both(pid[1]), shaper.filter(path, RATE), ends + round(shaper.delay * RATE)),
+        "LQG, inverse": (lambda: both(lqg[1]), control.inverse(lqg[0], path, of=TIP, samples=0).reference, ends),
+        "LQG, ten times the deviations, inverse": (
+            lambda: both(calm.controlled(0.93)), control.inverse(calm, path, of=TIP, samples=0).reference, ends,
+        ),
+    }  # fmt: skip
+    gentle = control.smooth_move(ANGLE / 2, 0.8, RATE, before=0.1, after=2.6)
+    arm = rig.ArmParameters.of("effective")
+    found = {"stable": {n: [] for n in loops}, "still": {n: [] for n in still}}
+    for times in moves.STIFFNESS:
+        other = replace(arm, stage1=replace(arm.stage1, a=arm.stage1.a * times))
+        for delay in moves.DELAYS:
+            for name, made in loops.items():
+                tip = moves.tip_of(moves.Late(made(), delay), gentle, parameters=other, seed=5000)
+                # Of a second two and a half after the move: what is not at rest by then never will be.
+                left = None if tip is None else float(np.std(tip[-round(RATE) :]))
+                found["stable"][name].append([times, delay, left is not None and left < RESTLESS, left])
+            for name, (made, reference, until) in still.items():
+                after = np.concatenate([reference, np.full(round(0.4 * RATE), reference[-1])])
+                left = judged(moves.Late(made(), delay), after, until, parameters=other, seed=5000)
+                found["still"][name].append([times, delay, None if left is None else left[0]])
+        print(times, file=sys.stderr, flush=True)
+    traces = {}
+    for name in ("fractional PID", "fractional PID, ZVD", "LQG, inverse"):
+        made, reference, _ = still[name]
+        tip = moves.tip_of(made(), reference, seed=5000)
+        traces[name] = None if tip is None else tip[::4].round(6).tolist()
+    return {"plants": found, "traces": traces, "step": 4 / RATE, "path": path[::4].round(6).tolist()}
 
 
 def quiet():
@@ -137,19 +198,20 @@ def table():
         for kind in structures():
             plain, inverse, exact = (left(kind, name, w) for w in ("plain", "inverse", "exactly"))
             goal = left(kind, name, "inverse", 1)
+            none = sum("none" in r[kind][name] for r in rows)
             refused = sum(r[kind][name]["refused"] is not None for r in rows)
             print(f"{name}, {kind}: plain {np.nanmedian(plain):.2f} ({np.isnan(plain).sum()} stopped), inverse "
                   f"{np.nanmedian(inverse):.3f} (about the goal {np.nanmedian(goal):.3f}, without noise "
                   f"{np.nanmedian(exact):.3f}, {np.isnan(inverse).sum()} stopped) mrad; plain over inverse "
                   f"{np.nanmedian(plain / inverse):.1f}, least {np.nanmin(plain / inverse):.1f}; over fractional "
                   f"{np.nanmedian(inverse / own):.2f}, {np.nanmin(inverse / own):.2f} to "
-                  f"{np.nanmax(inverse / own):.2f}; refused by their intervals {refused}")  # fmt: skip
+                  f"{np.nanmax(inverse / own):.2f}; refused by their intervals {refused - none}, no design {none}")  # fmt: skip
     return rows
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=["seeds", "table"])
+    parser.add_argument("what", choices=["seeds", "plants", "table"])
     parser.add_argument("seeds", nargs="*", type=int)
     given = parser.parse_args()
     if given.what == "seeds":
@@ -159,4 +221,6 @@ if __name__ == "__main__":
                 file.write(line + "\n")
             print(f"seed {one}", file=sys.stderr, flush=True)
     else:
-        table()
+        told = {"seeds": table()} if given.what == "table" else plants()
+        before = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
+        OUT.write_text(json.dumps(before | told) + "\n", encoding="utf-8")

@@ -1,0 +1,209 @@
+"""Controllers as files, the commands control and shape: what they write runs, what is no input is refused in words."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import ftlm
+from ftlm import control
+from ftlm.cli.app import app
+from test_control import PID
+from test_quadratic import BROKEN, designed, model
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    path = tmp_path_factory.mktemp("models") / "m.json"
+    model(BROKEN).save(path)
+    return str(path)
+
+
+WORDS = ["control", "--design", "lqg", "--allowed", "hub=0.02", "--allowed", "bend=0.02", "--effort", "1", "--noise",
+         "hub=3e-4", "--noise", "bend=2e-4", "--samples", "0"]  # fmt: skip
+
+
+def run(*words):
+    return CliRunner().invoke(app, [str(w) for w in words])
+
+
+@pytest.mark.parametrize("kind", ["pid", "lqg"])
+def test_a_controller_comes_back_from_its_file_to_the_last_bit(kind, tmp_path):
+    limit = 0.9
+    made = (
+        control.Realised(PID, 250.0, limit=limit, order=4) if kind == "pid" else designed(samples=0).controlled(limit)
+    )
+    control.save_controller(made, tmp_path / "c.json", model="by hand")
+    read = control.load_controller(tmp_path / "c.json")
+    assert type(read) is type(made)
+    errors = np.random.default_rng(0).standard_normal((200, 2)) * 0.01
+    for e in errors:
+        given = (float(e[0]),) if kind == "pid" else (e, 0.1)
+        assert read(*given) == made(*given)
+    with pytest.raises(ftlm.DataError, match="exists"):
+        control.save_controller(made, tmp_path / "c.json")
+
+
+def test_a_pid_runs_from_the_numbers_of_its_file_alone(tmp_path):
+    """As the file says it, in plain Python."""
+    made = control.Realised(PID, 250.0, order=4)
+    control.save_controller(made, tmp_path / "c.json")
+    told = json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))["controller"]
+    assert "every lag becomes" in json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))["meaning"]
+    states, last = None, 0.0
+    for e in np.sin(np.arange(100) * 0.05) + 0.2:
+        if states is None:
+            states = [0.0 if g["of"] == "integral" else e * (g["now"] + g["before"]) / (1 - g["keep"])
+                      for g in told["lags"]]  # fmt: skip
+        else:
+            states = [g["keep"] * x + g["now"] * e + g["before"] * last
+                      for g, x in zip(told["lags"], states, strict=True)]  # fmt: skip
+        output = (told["kp"] + told["direct"]) * e
+        output += sum(g["weight"] * x for g, x in zip(told["lags"], states, strict=True))
+        assert made(float(e)) == pytest.approx(output, rel=1e-9)
+        last = e
+
+
+def test_an_lqg_runs_from_the_numbers_of_its_file_alone(saved, tmp_path):
+    out = tmp_path / "c.json"
+    assert run(*WORDS, saved, "--limit", 0.9, "-o", out).exit_code == 0
+    made = control.load_controller(out)
+    told = json.loads(out.read_text(encoding="utf-8"))["controller"]
+    a, b, c, correction, feedback = (np.array(told[n]) for n in ("a", "b", "c", "correction", "feedback"))
+    size = len(a)
+    whole = np.block([[a, b], [np.zeros((1, size)), np.eye(1)]])
+    x, u = np.zeros(size + 1), 0.0
+    rows = [told["outputs"].index(n) for n in told["measured"]]
+    for k in range(50):
+        y = np.array([0.01 * np.sin(0.1 * k), 0.002 * np.cos(0.3 * k) if k else 0.0])
+        x = x + correction @ (y - c[rows] @ x[:-1])
+        x = whole @ x + np.append(b[:, 0], 0.0) * u
+        u = float(np.clip(told["ahead"] * 0.3 - np.append(feedback[0], 1.0) @ x, -0.9, 0.9))
+        assert made(y, 0.3) == pytest.approx(u, abs=1e-9)
+
+
+def broken_files():
+    good = {"format": "ftlm-controller", "schema": 1, "written_by": "", "model": "", "meaning": ""}
+    pid = {"type": "pid", "kp": 1.0, "ki": 1.0, "kd": 0.0, "lam": 1.0, "mu": 1.0, "rate": 100.0, "limit": None,
+           "band": [1.0, 10.0], "order": 3, "direct": 0.0, "lags": []}  # fmt: skip
+    yield b"", "no ftlm controller"
+    yield b"[" * 100_000, "no ftlm controller"
+    yield json.dumps(good).encode(), "missing required field"
+    yield json.dumps(good | {"controller": pid | {"kp": "1"}}).encode(), "Expected `float`"
+    yield json.dumps(good | {"controller": pid | {"type": "bang"}}).encode(), "Invalid value 'bang'"
+    yield json.dumps(good | {"controller": pid, "schema": 2}).encode(), "upgrade ftlm"
+    yield json.dumps(good | {"controller": pid | {"rate": -1.0}}).encode(), "damaged: rate"
+    yield json.dumps(good | {"controller": pid | {"order": 10**6}}).encode(), "damaged: order"
+    yield json.dumps(good | {"controller": pid, "more": 1}).encode(), "unknown field `more`"
+    yield b" " * (1 << 21), "no controller is larger"
+
+
+@pytest.mark.parametrize("case", range(10))
+def test_what_is_no_controller_is_refused(case, tmp_path):
+    data, words = list(broken_files())[case]
+    path = tmp_path / "c.json"
+    path.write_bytes(data)
+    with pytest.raises(ftlm.DataError, match=words):
+        control.load_controller(path)
+    with pytest.raises(ftlm.DataError, match="cannot be read"):
+        control.load_controller(tmp_path / "none.json")
+    with pytest.raises(ftlm.ModelError, match="give a Realised or an Lqg"):
+        control.save_controller(PID, tmp_path / "p.json")
+
+
+def test_a_damaged_lqg_is_refused_by_what_is_wrong(tmp_path):
+    control.save_controller(designed(samples=0).controller, tmp_path / "c.json")
+    whole = json.loads((tmp_path / "c.json").read_text(encoding="utf-8"))
+    for key, value, words in (
+        ("a", [[1.0]], "has shape"),
+        ("feedback", [[1.0]], "feedback has shape"),
+        ("measured", ["hub", "bond"], "bond is not one of its outputs"),
+        ("rate", 0.0, "rate is not above 0"),
+        ("noise", [], "its noise"),
+        ("deviations", [1.0], "its errors"),
+        ("b", [1.0], "Expected `array`"),
+    ):
+        told = whole | {"controller": whole["controller"] | {key: value}}
+        (tmp_path / "c.json").write_text(json.dumps(told), encoding="utf-8")
+        with pytest.raises(ftlm.DataError, match=words):
+            control.load_controller(tmp_path / "c.json")
+
+
+def test_control_writes_a_controller_and_a_plan(saved, tmp_path):
+    out, plan = tmp_path / "c.json", tmp_path / "p.csv"
+    done = run(*WORDS, saved, "--move", "0.3:0.5", "--of", "hub+bend", "-o", out, "--plan", plan, "--limit", 5)
+    assert done.exit_code == 0, done.output
+    assert "realised by" in done.output
+    assert "phase margin" in done.output
+    rows = np.genfromtxt(plan, delimiter=",", names=True)
+    assert rows["path"][-1] == pytest.approx(0.3)
+    assert rows["hub"] + rows["bend"] == pytest.approx(rows["path"], abs=1e-6)
+    as_json = json.loads(run(*WORDS, saved, "--json", "--move", "0.3:0.5", "--of", "hub+bend").output)
+    assert as_json["nominal"]["stable"] is True
+    assert as_json["planned"]["rows"] == rows.size
+    pid = tmp_path / "pid.json"
+    done = run("control", saved, "--output", "hub", "--crossover", 30, "--samples", 0, "-o", pid)
+    assert done.exit_code == 0, done.output
+    assert isinstance(control.load_controller(pid), control.Realised)
+
+
+def test_shape_writes_what_a_reference_is_convolved_with(saved, tmp_path):
+    out = tmp_path / "s.csv"
+    done = run("shape", saved, "--kind", "zvd", "--rate", 200, "--coupling", "measured", "-o", out)
+    assert done.exit_code == 0, done.output
+    assert "ZVD shaper of" in done.output
+    rows = np.genfromtxt(out, delimiter=",", names=True)
+    shaper = control.input_shaper(ftlm.load_model(saved), "zvd", coupling="measured")
+    assert rows["share"] == pytest.approx(shaper.impulses(200.0), abs=1e-11)
+    assert json.loads(run("shape", saved, "--json").output)["kind"] == "zv"
+
+
+REFUSED = [
+    (("control", "MODEL", "--crossover", 40), "several outputs: say which, --output"),
+    (("control", "MODEL", "--output", "hub"), "--crossover is missing"),
+    (("control", "MODEL", "--output", "hub", "--crossover", 40, "--effort", 1), "--effort: of --design lqg"),
+    (("control", "MODEL", "--design", "lqg"), "--allowed OUTPUT=A and --effort A are missing"),
+    ((*WORDS, "MODEL", "--crossover", 40), "--crossover: of --design pid"),
+    ((*WORDS, "MODEL", "--allowed", "hob=1"), "did you mean 'hub'"),
+    ((*WORDS, "MODEL", "--noise", "hub"), "names 'hub' twice"),
+    ((*WORDS, "MODEL", "--band", "1"), "--band '1' is not 2 numbers"),
+    ((*WORDS, "MODEL", "--band", "9:1"), "is no interval"),
+    ((*WORDS, "MODEL", "--move", "0.3"), "--move '0.3' is not 2 numbers"),
+    ((*WORDS, "MODEL", "--move", "0.3:0.5", "--of", "tip"), "is not a sum of outputs"),
+    ((*WORDS, "MODEL", "--move", "9:0.5", "--of", "hub+bend", "--limit", "0.9"), "over the limit of 0.9"),
+    ((*WORDS, "MODEL", "--plan", "p.csv"), "give --move SIZE:SECONDS"),
+    ((*WORDS, "MODEL", "--of", "hub"), "give --move SIZE:SECONDS"),
+    ((*WORDS, "MODEL", "-o", "c.mat"), "does not end in .json"),
+    ((*WORDS, "MODEL", "--move", "0.3:0.5", "--plan", "p.txt"), "does not end in .csv"),
+    ((*WORDS, "MODEL", "--limit", -1), "limit = -1"),
+    ((*WORDS, "MODEL", "--rate", 0), "rate = 0"),
+    ((*WORDS, "MODEL", "--samples", -1), "samples = -1"),
+    ((*WORDS, "MODEL", "--input", "U"), "input = 'U' is not one"),
+    ((*WORDS, "no.json"), "cannot be read"),
+    (("shape", "MODEL", "--modes", 0), "modes_shaped = 0"),
+    (("shape", "MODEL", "--modes", 9), "modes that swing, and 9 are to be shaped"),
+    (("shape", "MODEL", "--rate", 1), "fewer than four samples"),
+    (("shape", "MODEL", "--kind", "zw"), "is not one of"),
+    (("shape", "MODEL", "-o", "s.json"), "does not end in .csv"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("case", range(len(REFUSED)))
+def test_what_the_commands_cannot_use_is_refused_in_words(case, saved, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words, said = REFUSED[case]
+    failed = run(*[saved if w == "MODEL" else w for w in words])
+    assert failed.exit_code in (2, 3), failed.output
+    assert said in " ".join(failed.output.split()), failed.output
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_model_that_is_not_stable_is_refused(tmp_path):
+    path = tmp_path / "u.json"
+    ftlm.Model(ftlm.equation("D^2 hub = 9 D hub + I")).save(path)
+    for words in (("control", path, "--crossover", 40), ("control", path, "--design", "lqg", "--allowed", "hub=1",
+                  "--effort", 1, "--noise", "hub=1e-3"), ("shape", path)):  # fmt: skip
+        failed = run(*words)
+        assert failed.exit_code == 2
+        assert "not stable" in failed.output
