@@ -44,7 +44,7 @@ KEPT = Path(os.environ.get("KEPT", "tips.jsonl"))
 
 def structures():
     """Three models of a stage: the arm's law with free orders and with whole ones, and whole orders without any law."""
-    law = ftlm.flexible_link(stage=1, sensor_filter="stock", offset="constant", friction="coulomb")
+    law = ftlm.flexible_link(stage=1, sensor_filter="stock", offset="constant", friction=True)
     free = ftlm.equation(
         "D^2 theta11 = k theta12 + e D theta12 + b D theta11 + g I1; "
         "D^2 theta12 = a theta12 + d D theta12 + h D^2 theta11",
@@ -205,7 +205,8 @@ def table():
                   f"{np.nanmedian(exact):.3f}, {np.isnan(inverse).sum()} stopped) mrad; plain over inverse "
                   f"{np.nanmedian(plain / inverse):.1f}, least {np.nanmin(plain / inverse):.1f}; over fractional "
                   f"{np.nanmedian(inverse / own):.2f}, {np.nanmin(inverse / own):.2f} to "
-                  f"{np.nanmax(inverse / own):.2f}; refused by their intervals {refused - none}, no design {none}")  # fmt: skip
+                  f"{np.nanmax(inverse / own):.2f}; refused by their intervals {refused - none}, "
+                  f"no design {none}")  # fmt: skip
     return rows
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import ftlm
+from ftlm import control
 from ftlm.demo import demo_run
 
 if TYPE_CHECKING:
@@ -114,41 +115,79 @@ def boxes() -> Figure:
 
 
 def moves() -> dict[str, Figure]:
-    """A move with and without its shaper, and where designs fail, from what the bench wrote."""
+    """Moves of the tip, where loops stay stable and how still designs leave it, from what the bench wrote; phases."""
     from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
 
-    measured = json.loads((Path(__file__).parent / "control.json").read_text(encoding="utf-8"))
+    measured = json.loads((Path(__file__).parent / "tips.json").read_text(encoding="utf-8"))
     move = Figure(figsize=(7, 3.2), layout="constrained")
     plot = move.add_subplot(xlabel="time [s]", ylabel="tip [degrees]")
-    for (name, tip), style in zip(measured["traces"].items(), ("C1", "C0"), strict=True):
-        t = np.arange(len(tip)) * measured["step"]
-        plot.plot(t, np.degrees(tip), style, linewidth=1.2, label=name)
-    plot.axhline(20, color="0.6", linewidth=0.6)
-    plot.legend()
-    contenders = measured["plants"]
-    worst, best = 5e-2, 5e-4
-    figure = Figure(figsize=(9, 5), layout="constrained")
-    figure.suptitle("tip after the move, RMS [mrad]; x: the rig stopped the run", fontsize="small")
-    for at, (name, rows) in enumerate(contenders.items(), start=1):
-        times, delays = (sorted({row[k] for row in rows}) for k in (0, 1))
-        left = {(a, b): c for a, b, c in rows}
-        grid = np.array([[left[a, b] or np.nan for a in times] for b in delays])
-        plot = figure.add_subplot(2, 3, at)
+    time = np.arange(len(measured["path"])) * measured["step"]
+    plot.plot(time, np.degrees(measured["path"]), color="0.6", linewidth=2.4, label="asked for")
+    for (name, tip), style in zip(measured["traces"].items(), ("C1", "C2", "C0"), strict=True):
+        if tip is not None:
+            t = np.arange(len(tip)) * measured["step"]
+            plot.plot(t, np.degrees(tip), style, linewidth=1.2, label=name)
+    plot.legend(fontsize="small", loc="lower right")
+    told = measured["plants"]
+    stable = Figure(figsize=(9, 5.2), layout="constrained")
+    stable.suptitle("filled: the loop comes to rest after a gentle move", fontsize="small")
+    for at, (name, rows) in enumerate(told["stable"].items(), start=1):
+        plot = stable.add_subplot(2, 3, at)
+        share = sum(row[2] for row in rows)
+        plot.set_title(f"{name}\n{share} of {len(rows)}", fontsize="small")
+        grid = _plants(plot, [[a, b, c] for a, b, c, _ in rows])
+        plot.imshow(grid, origin="lower", aspect="auto", cmap="Blues", vmin=0, vmax=1.6)
+    still = Figure(figsize=(9, 5.2), layout="constrained")
+    still.suptitle("tip in the second after 20 degrees, RMS [mrad]; x: the rig stopped the run", fontsize="small")
+    worst, best = 5e-2, 3e-4
+    for at, (name, rows) in enumerate(told["still"].items(), start=1):
+        plot = still.add_subplot(2, 2, at)
         plot.set_title(name, fontsize="small")
-        plot.imshow(
-            np.log(grid), origin="lower", aspect="auto", cmap="viridis_r", vmin=np.log(best), vmax=np.log(worst)
-        )
-        for i, b in enumerate(delays):
-            for j, a in enumerate(times):
-                value = left[a, b]
-                dark = value is not None and value > np.sqrt(best * worst)
-                shown = "x" if value is None else f"{1e3 * value:.2g}"
-                plot.text(j, i, shown, ha="center", va="center", fontsize=7, color="white" if dark else "black")
-        plot.set_xticks(range(len(times)), [f"{a:g}" for a in times], fontsize=7)
-        plot.set_yticks(range(len(delays)), [f"{1e3 * b:.0f}" for b in delays], fontsize=7)
-        plot.set_xlabel("stiffness of link 1, times", fontsize=7)
-        plot.set_ylabel("delay of the angles [ms]", fontsize=7)
-    return {"control-move": move, "control-plants": figure}
+        grid = _plants(plot, rows)
+        colours = np.log(np.clip(grid, best, worst))
+        plot.imshow(colours, origin="lower", aspect="auto", cmap="viridis_r", vmin=np.log(best), vmax=np.log(worst))
+        for (i, j), value in np.ndenumerate(grid):
+            shown = "x" if np.isnan(value) else f"{1e3 * value:.2g}"
+            dark = not np.isnan(value) and value > np.sqrt(best * worst)
+            plot.text(j, i, shown, ha="center", va="center", fontsize=7, color="white" if dark else "black")
+    return {"control-move": move, "control-stable": stable, "control-still": still, "control-phase": phases()}
+
+
+def _plants(plot: Axes, rows: list[list[float]]) -> np.ndarray:
+    """What was found by delay and stiffness, with both named on the axes."""
+    times, delays = (sorted({row[k] for row in rows}) for k in (0, 1))
+    found = {(a, b): c for a, b, c in rows}
+    plot.set_xticks(range(len(times)), [f"{a:g}" for a in times], fontsize=7)
+    plot.set_yticks(range(len(delays)), [f"{1e3 * b:.0f}" for b in delays], fontsize=7)
+    plot.set_xlabel("stiffness of link 1, times", fontsize=7)
+    plot.set_ylabel("delay of the angles [ms]", fontsize=7)
+    return np.array([[np.nan if found[a, b] is None else float(found[a, b]) for a in times] for b in delays])
+
+
+def phases() -> Figure:
+    """Phase of the open loop around its crossover: a fractional PID, and one whose orders are whole."""
+    from matplotlib.figure import Figure  # noqa: PLC0415 — only drawing needs it
+
+    hub = ftlm.Model(ftlm.equation("D^2 theta11 = -63 D^0.95 theta11 + 140 I1"))
+    design = control.fractional_pid(hub, crossover=40.0, phase_margin=60.0)
+    w = np.geomspace(8.0, 200.0, 300)
+    plant = design.plants[0].response(w)
+    # As many gains, and all that whole orders have left: the same crossover and margin, an integral of the same size.
+    at = design.plants[0].response(np.array([40.0]))[0]
+    wanted = np.exp(1j * np.radians(-120.0)) / at
+    slow = design.pid.ki * 40.0 ** (1.0 - design.pid.lam)
+    whole = control.FractionalPid(float(wanted.real), slow, float(wanted.imag + slow / 40.0) / 40.0, 1.0, 1.0)
+    figure = Figure(figsize=(7, 3.2), layout="constrained")
+    plot = figure.add_subplot(xlabel="frequency [rad/s]", ylabel="phase of the open loop [degrees]", xscale="log")
+    for name, pid, style in (("fractional PID", design.pid, "C0"), ("PID of whole orders", whole, "C1")):
+        loop = pid.response(w) * plant
+        plot.plot(w, np.degrees(np.unwrap(np.angle(loop))), style, linewidth=1.2, label=name)
+        for factor in (0.7, 1.0, 1.4):
+            cross = int(np.argmin(np.abs(np.log(np.abs(factor * loop)))))
+            plot.plot(w[cross], np.degrees(np.unwrap(np.angle(loop)))[cross], style + "o", markersize=5)
+    plot.axhline(-120.0, color="0.6", linewidth=0.8)
+    plot.legend(fontsize="small")
+    return figure
 
 
 def next_experiment(folder: Path) -> Figure:

@@ -72,6 +72,16 @@ def test_a_fractional_model_is_realised_within_the_error_that_is_said():
     assert np.all(np.abs(np.linalg.eigvals(made.a)) < 1.0 + 1e-12)
 
 
+@pytest.mark.parametrize("sensor", [False, True])
+def test_the_response_at_complex_frequencies_goes_on_from_the_real_ones(sensor):
+    passed = ftlm.SensorFilter.low_pass(["bend"])
+    made = ftlm.Model(ftlm.equation(BROKEN, coupling="simulated", delay={"I": 0.003}, sensor_filter=passed))
+    w = np.array([0.5, 17.0, 120.0])
+    for output in ("hub", "bend"):
+        plant = control.margins.Plant(made, output, "I", RATE, "simulated", sensor)
+        assert np.allclose(plant.response(w.astype(complex)), plant.response(w), rtol=1e-10)
+
+
 def test_too_few_poles_are_refused_with_what_they_are_off():
     with pytest.raises(ftlm.ModelError, match=r"3 states are off by up to .* dB and .* degrees .* narrower band"):
         designed(poles=2)

@@ -92,7 +92,7 @@ class Plant:
     sensor: bool = False
 
     def exact(self, w: Floats | Complex) -> Complex:
-        """Response of the model at frequencies [rad/s]; at complex ones, s = jw, without the sensor filter."""
+        """Response of the model at frequencies [rad/s], which may be complex: s = jw."""
         if np.iscomplexobj(w):
             transfer = transfer_functions(self.model, coupling=self.coupling)
             s = 1j * np.asarray(w)
@@ -100,10 +100,19 @@ class Plant:
                 value_at({p: c for c, p in pairs}, s)
                 for pairs in (transfer.numerators[self.output, self.input], transfer.denominator[self.output])
             )
-            return np.asarray(above / below * np.exp(-s * transfer.delay[self.input]))
+            return np.asarray(above / below * np.exp(-s * transfer.delay[self.input]) * self._seen(s))
         inputs = response_inputs(self.model, coupled=self.coupling == "simulated")
         every = frequency_response(self.model, w, coupling=self.coupling, sensor=self.sensor)
         return np.asarray(every[self.model.outputs.index(self.output), inputs.index(self.input)])
+
+    def _seen(self, s: Complex) -> Complex:
+        """What the sensor filter makes of it."""
+        passed = self.model.structure.sensor_filter if self.sensor else None
+        if passed is None:
+            return np.ones_like(s)
+        above, below = (value_at({o: c for c, o in part}, s) for part in (passed.numerator, passed.denominator))
+        power = (self.output in passed.signals) - (self.input in passed.signals)
+        return np.asarray((above / below) ** power)
 
     def held(self, w: Floats | Complex) -> Complex:
         """The same behind the hold of a sampled input, below half the rate."""

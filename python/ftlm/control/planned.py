@@ -137,8 +137,8 @@ def inverse(
         What is to be followed, one row a sample at the loop's rate; at rest at both ends, and before its move for as
         long as the reference has to begin earlier.
     of : str, optional
-        An output of the model or a sum such as ``"theta11 + theta12"``; where the model has one output alone it needs
-        no name.
+        An output of the model or a sum such as ``"theta11 + theta12"``, as the loop reads them; where the model has one
+        output alone it needs no name.
     limit
         Largest command.
     samples, seed
