@@ -132,6 +132,7 @@ def plants(seed=0):
     models = {kind: identified(run, structure) for kind, structure in structures().items() if kind != "integer"}
     fractional, whole = models["fractional"], models["integer, no law"]
     pid, lqg = (designed(n, fractional, SAMPLES) for n in ("pid", "lqg"))
+    rival = designed("lqg", whole, 0)
     slow = {**WEIGHTS, "allowed": {"theta11": 0.2, "theta12": 0.2}}
     calm = control.lqg(fractional, input="I1", samples=SAMPLES, **slow)
     slower = control.fractional_pid(fractional, output="theta11", input="I1", crossover=moves.SLOW, samples=SAMPLES)
@@ -140,7 +141,7 @@ def plants(seed=0):
         "fractional PID, 12 rad/s": lambda: both(control.Realised(slower.pid, RATE, limit=0.93)),
         "LQG": lambda: both(lqg[1]),
         "LQG, ten times the deviations": lambda: both(calm.controlled(0.93)),
-        "LQG of whole orders": lambda: both(designed("lqg", whole, 0)[1]),
+        "LQG of whole orders": lambda: both(rival[1]),
         "LQR of the maker's model": moves.Lqr,
     }
     path = control.smooth_move(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)

@@ -95,7 +95,7 @@ class Plant:
         """Response of the model at frequencies [rad/s], which may be complex: s = jw."""
         if np.iscomplexobj(w):
             transfer = transfer_functions(self.model, coupling=self.coupling)
-            s = 1j * np.asarray(w)
+            s: Complex = np.asarray(1j * np.asarray(w), dtype=np.complex128)
             above, below = (
                 value_at({p: c for c, p in pairs}, s)
                 for pairs in (transfer.numerators[self.output, self.input], transfer.denominator[self.output])
