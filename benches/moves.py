@@ -1,10 +1,9 @@
 """What a model is for: a tip that stands still after a move, from ten seconds of the arm's own run.
 
 python benches/moves.py seeds 0 1 2 …   identify, design and move, a line of JSON a seed (--kept FILE appends)
-python benches/moves.py plants          stiffness and delay perturbed: where each design fails; one move to be seen
 python benches/moves.py table --kept FILE
 
-The last two write docs/control.json, of which docs/control.md shows its pictures.
+The last one writes docs/control.json. Other plants, and designs on the whole stage, are in benches/tips.py.
 
 The arm is the virtual one as it is: friction, coupled stages, offsets, noise, quantisation; the run that is identified
 passes the stock filter. The judge is the measured tip, theta11 + theta12, in the second after the reference arrived.
@@ -14,7 +13,6 @@ import argparse
 import json
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -163,34 +161,6 @@ def of_seed(seed):
     return found
 
 
-def plants(seed=0):
-    """Where each design fails: stiffness of link 1 times, delay of the angles."""
-    run = own_run(seed)
-    contenders = {}
-    for kind in LINKS:
-        design, shapers, _ = designed(run, kind)
-        contenders[f"{kind}, zvd"] = (design.pid, shapers["zvd"].filter(ramp(), RATE))
-    contenders["fractional, unshaped"] = (contenders["fractional, zvd"][0], ramp())
-    hub = fitted(run, HUBS["fractional"])
-    slow = control.fractional_pid(hub, input="I1", crossover=SLOW, phase_margin=PHASE, rate=RATE)
-    contenders["fractional, zvd, slower loop"] = (slow.pid, contenders["fractional, zvd"][1])
-    contenders["LQR, unshaped"] = (None, ramp())
-    arm = rig.ArmParameters.of("effective")
-    found = {name: [] for name in contenders}
-    for times in STIFFNESS:
-        # Of link 1 alone: its hub feels the same spring.
-        softer = replace(arm, stage1=replace(arm.stage1, a=arm.stage1.a * times))
-        for delay in DELAYS:
-            for name, (pid, reference) in contenders.items():
-                controller = Late(Lqr(), delay) if pid is None else loops(pid, delay)
-                left = moved(controller, reference, parameters=softer, seed=5000)
-                found[name].append([times, delay, left])
-    pid, shaped = contenders["fractional, zvd"]
-    traces = {name: tip_of(loops(pid), reference, seed=5000)[::4].round(6).tolist()
-              for name, reference in (("unshaped", ramp()), ("shaped (zvd)", shaped))}  # fmt: skip
-    return {"plants": found, "traces": traces, "step": 4 / RATE}
-
-
 def written(told):
     """Put what was measured into the page's file."""
     kept = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
@@ -219,7 +189,7 @@ def table(kept):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=["seeds", "plants", "table"])
+    parser.add_argument("what", choices=["seeds", "table"])
     parser.add_argument("seeds", nargs="*", type=int)
     parser.add_argument("--kept", default="control.jsonl")
     given = parser.parse_args()
@@ -229,7 +199,5 @@ if __name__ == "__main__":
             with Path(given.kept).open("a", encoding="utf-8") as file:
                 file.write(line + "\n")
             print(line, flush=True)
-    elif given.what == "plants":
-        written(plants())
     else:
         written({"seeds": table(given.kept)})

@@ -1,10 +1,11 @@
 """The same designs on models of the same run: how still the tip stands, and on which other plants they stay stable.
 
 python benches/tips.py seeds 0 1 2 …   identify a stage three ways, design alike, move; a line of JSON a seed
-python benches/tips.py plants          stiffness and delay perturbed: which designs stay stable
+python benches/tips.py stable          stiffness and delay perturbed: which loops stay stable
+python benches/tips.py still           the same plants moved: how still the tip is then
 python benches/tips.py table
 
-The last two write docs/tips.json, of which docs/control.md shows its pictures.
+The last three write docs/tips.json, of which docs/control.md shows its pictures.
 
 The arm, its run of ten seconds and its judge are those of benches/moves.py. Designs here use the whole of a stage's
 model, from its current to its tip, and not its pole alone: an observer with state feedback, and inverse dynamics.
@@ -36,8 +37,8 @@ WEIGHTS = {
 }  # fmt: skip
 #: Of the model's numbers, over which designs are judged.
 SAMPLES = 20
-#: A tip that moves more than so long after a move does not come to rest (RMS) [rad].
-RESTLESS = 2e-3
+#: Plants on which stability is decided: stiffness of link 1 times, delay of the angles [s].
+FINE_STIFFNESS, FINE_DELAYS = np.linspace(0.3, 1.5, 25), np.linspace(0.0, 0.08, 33)
 OUT = Path(__file__).parent.parent / "docs" / "tips.json"
 KEPT = Path(os.environ.get("KEPT", "tips.jsonl"))
 
@@ -105,7 +106,7 @@ def of_seed(seed):
             refused = None
             try:
                 design, controller = designed(name, model, SAMPLES)
-                planned = control.inverse(design, path, of=TIP, samples=SAMPLES)
+                planned = control.inverse(design, path, of=TIP, samples=0)
             except ftlm.ModelError as error:
                 # Its own intervals refuse it; what it would have done is told all the same.
                 refused = str(error)
@@ -113,75 +114,118 @@ def of_seed(seed):
                     design, controller = designed(name, model, 0)
                     planned = control.inverse(design, path, of=TIP, samples=0)
                 except ftlm.ModelError as worse:
-                    told[name] = {"refused": str(worse), "plain": None, "inverse": None, "exactly": None, "none": True}
+                    told[name] = {"refused": str(worse), "plain": None, "inverse": None, "none": True}
                     continue
             loop = both(controller)
             told[name] = {
                 "refused": refused,
                 "plain": judged(loop, path, ends, seed=1000 + seed),
                 "inverse": judged(loop, planned.reference, ends, seed=1000 + seed),
-                "exactly": judged(loop, planned.reference, ends, seed=1000 + seed, parameters=quiet()),
             }
         found[kind] = told
     return found
 
 
-def plants(seed=0):
-    """Where each loop stays stable and how still each design leaves the tip: stiffness of link 1 times, delay."""
+def contenders(seed):
+    """Designs on models of a seed's run, by name: on the fractional one, and on the best of whole orders."""
     run = moves.own_run(seed)
     models = {kind: identified(run, structure) for kind, structure in structures().items() if kind != "integer"}
     fractional, whole = models["fractional"], models["integer, no law"]
-    pid, lqg = (designed(n, fractional, SAMPLES) for n in ("pid", "lqg"))
-    rival = designed("lqg", whole, 0)
-    slow = {**WEIGHTS, "allowed": {"theta11": 0.2, "theta12": 0.2}}
-    calm = control.lqg(fractional, input="I1", samples=SAMPLES, **slow)
-    slower = control.fractional_pid(fractional, output="theta11", input="I1", crossover=moves.SLOW, samples=SAMPLES)
-    loops = {
-        "fractional PID, 40 rad/s": lambda: both(pid[1]),
-        "fractional PID, 12 rad/s": lambda: both(control.Realised(slower.pid, RATE, limit=0.93)),
-        "LQG": lambda: both(lqg[1]),
-        "LQG, ten times the deviations": lambda: both(calm.controlled(0.93)),
-        "LQG of whole orders": lambda: both(rival[1]),
-        "LQR of the maker's model": moves.Lqr,
+    calm = {**WEIGHTS, "allowed": {"theta11": 0.2, "theta12": 0.2}}
+    slow = control.fractional_pid(fractional, output="theta11", input="I1", crossover=moves.SLOW, samples=SAMPLES)
+    return fractional, {
+        "fractional PID, 40 rad/s": designed("pid", fractional, SAMPLES)[0],
+        "fractional PID, 12 rad/s": slow,
+        "LQG": designed("lqg", fractional, SAMPLES)[0],
+        "LQG, ten times the deviations": control.lqg(fractional, input="I1", samples=SAMPLES, **calm),
+        "LQG of whole orders": designed("lqg", whole, 0)[0],
     }
+
+
+def stable(seed=0):
+    """Whether each loop is stable on the arm's own linear law: stiffness of link 1 times, delay of the angles."""
+    _, loops = contenders(seed)
+    w = np.geomspace(0.01, 0.999 * np.pi * RATE, 4000)
+    arm = rig.ArmParameters.of("linear")
+    acting = {name: (made.acting(w)[:2], integrals(made)) for name, made in loops.items()}
+    acting["LQR of the maker's model"] = (("theta11", "theta12"), maker(w)), 0.0
+    found = {name: [] for name in acting}
+    for times in FINE_STIFFNESS:
+        law = replace(arm, stage1=replace(arm.stage1, a=arm.stage1.a * float(times))).model()
+        plants = {o: control.margins.Plant(law, o, "I1", RATE, "simulated") for o in ("theta11", "theta12")}
+        seen = {o: plant.response(w) for o, plant in plants.items()}
+        grows = plants["theta11"].grows()
+        for delay in FINE_DELAYS:
+            late = np.exp(-1j * w * float(delay))
+            for name, ((read, answers), integral) in acting.items():
+                loop = sum(a * seen[o] for o, a in zip(read, answers, strict=True)) * late
+                margins = control.margins.margins_of(loop, w, plants["theta11"].integrates() + integral, grows)
+                found[name].append([float(times), float(delay), margins.stable])
+    return {"stable": found}
+
+
+def integrals(design):
+    """Order of a loop's integral."""
+    if isinstance(design, control.LqgDesign):
+        own = design.controller.poles()
+        if np.any(np.abs(own) > 1.0 + 1e-7):
+            raise SystemExit("a controller that is not stable by itself is not counted here")
+        return float(np.sum(np.abs(own - 1.0) < 1e-7))
+    return design.pid.lam
+
+
+def maker(w):
+    """What moves.Lqr answers to both angles: gains of them and of their filtered differences."""
+    gains = moves.Lqr().gain
+    z = np.exp(1j * w / RATE)
+    rate = 0.3 * RATE * (1.0 - 1.0 / z) / (1.0 - 0.7 / z)
+    return np.array([gains[0] + gains[2] * rate, gains[1] + gains[3] * rate])
+
+
+def still(seed=0):
+    """How still each design leaves the tip on other plants, moved on the arm as it is; moves to be seen."""
+    model, loops = contenders(seed)
+    pid, lqg, calm = (loops[n] for n in ("fractional PID, 40 rad/s", "LQG", "LQG, ten times the deviations"))
     path = control.smooth_move(ANGLE, SECONDS, RATE, before=BEFORE, after=AFTER)
     ends = round((BEFORE + SECONDS) * RATE)
-    shaper = control.input_shaper(fractional, "zvd", coupling="measured")
-    still = {
-        "fractional PID": (lambda: both(pid[1]), path, ends),
-        "fractional PID, ZVD": (lambda: both(pid[1]), shaper.filter(path, RATE), ends + round(shaper.delay * RATE)),
-        "LQG, inverse": (lambda: both(lqg[1]), control.inverse(lqg[0], path, of=TIP, samples=0).reference, ends),
+    shaper = control.input_shaper(model, "zvd", coupling="measured")
+    runs = {
+        "fractional PID": (lambda: both(control.Realised(pid.pid, RATE, limit=0.93)), path, ends),
+        "fractional PID, ZVD": (
+            lambda: both(control.Realised(pid.pid, RATE, limit=0.93)), shaper.filter(path, RATE),
+            ends + round(shaper.delay * RATE),
+        ),
+        "LQG, inverse": (
+            lambda: both(lqg.controlled(0.93)), control.inverse(lqg, path, of=TIP, samples=0).reference, ends,
+        ),
         "LQG, ten times the deviations, inverse": (
             lambda: both(calm.controlled(0.93)), control.inverse(calm, path, of=TIP, samples=0).reference, ends,
         ),
     }  # fmt: skip
-    gentle = control.smooth_move(ANGLE / 2, 0.8, RATE, before=0.1, after=2.6)
     arm = rig.ArmParameters.of("effective")
-    found = {"stable": {n: [] for n in loops}, "still": {n: [] for n in still}}
+    found = {n: [] for n in runs}
     for times in moves.STIFFNESS:
         other = replace(arm, stage1=replace(arm.stage1, a=arm.stage1.a * times))
         for delay in moves.DELAYS:
-            for name, made in loops.items():
-                tip = moves.tip_of(moves.Late(made(), delay), gentle, parameters=other, seed=5000)
-                # Of a second two and a half after the move: what is not at rest by then never will be.
-                left = None if tip is None else float(np.std(tip[-round(RATE) :]))
-                found["stable"][name].append([times, delay, left is not None and left < RESTLESS, left])
-            for name, (made, reference, until) in still.items():
+            for name, (made, reference, until) in runs.items():
                 after = np.concatenate([reference, np.full(round(0.4 * RATE), reference[-1])])
                 left = judged(moves.Late(made(), delay), after, until, parameters=other, seed=5000)
-                found["still"][name].append([times, delay, None if left is None else left[0]])
+                found[name].append([times, delay, None if left is None else left[0]])
         print(times, file=sys.stderr, flush=True)
     traces = {}
     for name in ("fractional PID", "fractional PID, ZVD", "LQG, inverse"):
-        made, reference, _ = still[name]
-        tip = moves.tip_of(made(), reference, seed=5000)
-        traces[name] = None if tip is None else tip[::4].round(6).tolist()
-    return {"plants": found, "traces": traces, "step": 4 / RATE, "path": path[::4].round(6).tolist()}
+        made, reference, _ = runs[name]
+        traces[name] = traced(made(), reference)
+    return {"still": found, "traces": traces, "step": 4 / RATE, "path": path[::4].round(6).tolist()}
 
 
-def quiet():
-    """The arm with gauges that have no noise and no steps: what is judged is then the tip itself."""
-    return replace(rig.ArmParameters.of("effective"), strain_noise=(0.0, 0.0), bits=0)
+def traced(controller, reference):
+    """The tip of a move, as far as it went before the rig stopped it."""
+    try:
+        run = rig.control(controller, np.column_stack([reference, 0 * reference]), offset=moves.OFFSET, seed=5000)
+    except ftlm.RigFault as fault:
+        run = fault.run
+    return (run["theta11"] + run["theta12"])[::4].round(6).tolist()
 
 
 def table():
@@ -197,13 +241,13 @@ def table():
     for name in ("lqg", "pid"):
         own = left("fractional", name, "inverse")
         for kind in structures():
-            plain, inverse, exact = (left(kind, name, w) for w in ("plain", "inverse", "exactly"))
+            plain, inverse = (left(kind, name, w) for w in ("plain", "inverse"))
             goal = left(kind, name, "inverse", 1)
             none = sum("none" in r[kind][name] for r in rows)
             refused = sum(r[kind][name]["refused"] is not None for r in rows)
             print(f"{name}, {kind}: plain {np.nanmedian(plain):.2f} ({np.isnan(plain).sum()} stopped), inverse "
-                  f"{np.nanmedian(inverse):.3f} (about the goal {np.nanmedian(goal):.3f}, without noise "
-                  f"{np.nanmedian(exact):.3f}, {np.isnan(inverse).sum()} stopped) mrad; plain over inverse "
+                  f"{np.nanmedian(inverse):.3f} (about the goal {np.nanmedian(goal):.3f}, "
+                  f"{np.isnan(inverse).sum()} stopped) mrad; plain over inverse "
                   f"{np.nanmedian(plain / inverse):.1f}, least {np.nanmin(plain / inverse):.1f}; over fractional "
                   f"{np.nanmedian(inverse / own):.2f}, {np.nanmin(inverse / own):.2f} to "
                   f"{np.nanmax(inverse / own):.2f}; refused by their intervals {refused - none}, "
@@ -213,7 +257,7 @@ def table():
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("what", choices=["seeds", "plants", "table"])
+    parser.add_argument("what", choices=["seeds", "stable", "still", "table"])
     parser.add_argument("seeds", nargs="*", type=int)
     given = parser.parse_args()
     if given.what == "seeds":
@@ -223,6 +267,6 @@ if __name__ == "__main__":
                 file.write(line + "\n")
             print(f"seed {one}", file=sys.stderr, flush=True)
     else:
-        told = {"seeds": table()} if given.what == "table" else plants()
+        told = {"seeds": table()} if given.what == "table" else {"stable": stable, "still": still}[given.what]()
         before = json.loads(OUT.read_text(encoding="utf-8")) if OUT.exists() else {}
         OUT.write_text(json.dumps(before | told) + "\n", encoding="utf-8")

@@ -128,22 +128,29 @@ def moves() -> dict[str, Figure]:
             t = np.arange(len(tip)) * measured["step"]
             plot.plot(t, np.degrees(tip), style, linewidth=1.2, label=name)
     plot.legend(fontsize="small", loc="lower right")
-    told = measured["plants"]
     stable = Figure(figsize=(9, 5.2), layout="constrained")
-    stable.suptitle("filled: the loop comes to rest after a gentle move", fontsize="small")
-    for at, (name, rows) in enumerate(told["stable"].items(), start=1):
+    stable.suptitle("dark: the loop is stable on the arm's linear law", fontsize="small")
+    for at, (name, rows) in enumerate(measured["stable"].items(), start=1):
         plot = stable.add_subplot(2, 3, at)
-        share = sum(row[2] for row in rows)
-        plot.set_title(f"{name}\n{share} of {len(rows)}", fontsize="small")
-        grid = _plants(plot, [[a, b, c] for a, b, c, _ in rows])
-        plot.imshow(grid, origin="lower", aspect="auto", cmap="Blues", vmin=0, vmax=1.6)
+        share = sum(row[2] for row in rows) / len(rows)
+        plot.set_title(f"{name}: {100 * share:.0f} %", fontsize="small")
+        grid, times, delays = _plants(rows)
+        span = (times[0], times[-1], 1e3 * delays[0], 1e3 * delays[-1])
+        plot.imshow(grid, origin="lower", aspect="auto", cmap="Blues", vmin=0, vmax=1.4, extent=span)
+        plot.plot(1.0, 0.0, "C1o", markersize=6, clip_on=False)
+        plot.set_xlabel("stiffness of link 1, times", fontsize=7)
+        plot.set_ylabel("delay of the angles [ms]", fontsize=7)
     still = Figure(figsize=(9, 5.2), layout="constrained")
     still.suptitle("tip in the second after 20 degrees, RMS [mrad]; x: the rig stopped the run", fontsize="small")
     worst, best = 5e-2, 3e-4
-    for at, (name, rows) in enumerate(told["still"].items(), start=1):
+    for at, (name, rows) in enumerate(measured["still"].items(), start=1):
         plot = still.add_subplot(2, 2, at)
         plot.set_title(name, fontsize="small")
-        grid = _plants(plot, rows)
+        grid, times, delays = _plants(rows)
+        plot.set_xticks(range(len(times)), [f"{a:g}" for a in times], fontsize=7)
+        plot.set_yticks(range(len(delays)), [f"{1e3 * b:.0f}" for b in delays], fontsize=7)
+        plot.set_xlabel("stiffness of link 1, times", fontsize=7)
+        plot.set_ylabel("delay of the angles [ms]", fontsize=7)
         colours = np.log(np.clip(grid, best, worst))
         plot.imshow(colours, origin="lower", aspect="auto", cmap="viridis_r", vmin=np.log(best), vmax=np.log(worst))
         for (i, j), value in np.ndenumerate(grid):
@@ -153,15 +160,12 @@ def moves() -> dict[str, Figure]:
     return {"control-move": move, "control-stable": stable, "control-still": still, "control-phase": phases()}
 
 
-def _plants(plot: Axes, rows: list[list[float]]) -> np.ndarray:
-    """What was found by delay and stiffness, with both named on the axes."""
+def _plants(rows: list[list[float]]) -> tuple[np.ndarray, list[float], list[float]]:
+    """What was found, by delay and stiffness."""
     times, delays = (sorted({row[k] for row in rows}) for k in (0, 1))
     found = {(a, b): c for a, b, c in rows}
-    plot.set_xticks(range(len(times)), [f"{a:g}" for a in times], fontsize=7)
-    plot.set_yticks(range(len(delays)), [f"{1e3 * b:.0f}" for b in delays], fontsize=7)
-    plot.set_xlabel("stiffness of link 1, times", fontsize=7)
-    plot.set_ylabel("delay of the angles [ms]", fontsize=7)
-    return np.array([[np.nan if found[a, b] is None else float(found[a, b]) for a in times] for b in delays])
+    grid = [[np.nan if found[a, b] is None else float(found[a, b]) for a in times] for b in delays]
+    return np.array(grid), times, delays
 
 
 def phases() -> Figure:
