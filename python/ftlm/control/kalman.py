@@ -207,7 +207,7 @@ def noises(model: Solved, measured: tuple[str, ...], given: Mapping[str, float] 
         if value is None:
             raise ModelError(
                 f"the noise of {name} is not known, since this model does not say what its fit left; give its standard "
-                f"deviation, as noise={{{name!r}: 0.001}} (--noise {name}=0.001)"
+                f"deviation in noise (--noise {name}=0.001)"
             )
         out.append(positive(f"noise of {name}", value))
     return tuple(out)
