@@ -123,6 +123,7 @@ def test_a_damaged_lqg_is_refused_by_what_is_wrong(tmp_path):
         ("noise", [], "its noise"),
         ("deviations", [1.0], "its errors"),
         ("b", [1.0], "Expected `array`"),
+        ("feedback", [[1e999] * len(whole["controller"]["a"])], "is no ftlm controller|not finite"),
     ):
         told = whole | {"controller": whole["controller"] | {key: value}}
         (tmp_path / "c.json").write_text(json.dumps(told), encoding="utf-8")

@@ -100,6 +100,8 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
         for name, (matrix, shape) in shapes.items():
             if matrix.shape != shape:
                 raise ModelError(f"{name} has shape {matrix.shape}, not {shape}")
+            if not np.isfinite(matrix).all():
+                raise ModelError(f"{name} is not finite")
         if not 0 < size <= MOST + 1:
             raise ModelError(f"{size} states are not 1 to {MOST + 1}")
         absent = [n for n in (*self.measured, self.tracked) if n not in self.outputs]
