@@ -238,21 +238,25 @@ def table():
         values = [r[kind][name].get(what) for r in rows]
         return np.array([np.nan if v is None else 1e3 * v[about] for v in values])
 
+    def shown(values):
+        there = values[np.isfinite(values)]
+        return f"{np.median(there):.3g} ({there.min():.3g} to {there.max():.3g})" if there.size else "none"
+
     for name in ("lqg", "pid"):
         own = left("fractional", name, "inverse")
         for kind in structures():
-            plain, inverse = (left(kind, name, w) for w in ("plain", "inverse"))
-            goal = left(kind, name, "inverse", 1)
+            plain, inverse, goal = (left(kind, name, *w) for w in (("plain",), ("inverse",), ("inverse", 1)))
             none = sum("none" in r[kind][name] for r in rows)
-            refused = sum(r[kind][name]["refused"] is not None for r in rows)
-            print(f"{name}, {kind}: plain {np.nanmedian(plain):.2f} ({np.isnan(plain).sum()} stopped), inverse "
-                  f"{np.nanmedian(inverse):.3f} (about the goal {np.nanmedian(goal):.3f}, "
-                  f"{np.isnan(inverse).sum()} stopped) mrad; plain over inverse "
-                  f"{np.nanmedian(plain / inverse):.1f}, least {np.nanmin(plain / inverse):.1f}; over fractional "
-                  f"{np.nanmedian(inverse / own):.2f}, {np.nanmin(inverse / own):.2f} to "
-                  f"{np.nanmax(inverse / own):.2f}; refused by their intervals {refused - none}, "
-                  f"no design {none}")  # fmt: skip
-    return rows
+            refused = sum(r[kind][name]["refused"] is not None for r in rows) - none
+            print(f"{name}, {kind}: no design {none}, refused by its intervals {refused}; mrad plain {shown(plain)}, "
+                  f"stopped {np.isnan(plain).sum() - none}; inverse {shown(inverse)}, stopped "
+                  f"{np.isnan(inverse).sum() - none}, about the goal {shown(goal)}; plain over inverse "
+                  f"{shown(plain / inverse)}; inverse over the fractional one {shown(inverse / own)}")  # fmt: skip
+    return [
+        {"seed": r["seed"]}
+        | {k: {n: r[k][n] | {"refused": r[k][n]["refused"] is not None} for n in ("lqg", "pid")} for k in structures()}
+        for r in rows
+    ]
 
 
 if __name__ == "__main__":
