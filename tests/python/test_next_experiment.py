@@ -562,5 +562,7 @@ def test_plant_a_is_told_three_times_better_than_by_the_papers_square() -> None:
     first = ftlm.identify(plants.noisy_run("A", 40, 0), plants.structure("A"), intervals="quadratic")
     made = ftlm.design_input(first)
     assert made.gain > 10
-    for name in plants.clean_run("A").outputs:
-        assert np.max(np.abs(made.run[name])) <= np.max(np.abs(plants.noisy_run("A", 40, 0)[name])) * (1 + 1e-9)
+    square = plants.noisy_run("A", 40, 0)
+    for name in square.outputs:
+        # As far as the square moved it from where it began, whose noise is no limit.
+        assert np.max(np.abs(made.run[name])) <= np.max(np.abs(square[name] - square[name][0])) * (1 + 1e-9)
