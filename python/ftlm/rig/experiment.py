@@ -175,8 +175,10 @@ class Experiment:
                 raise ModelError(f"{name} = {shown(flag)} is neither True nor False; use one of them")
         if self.progress is not None and not callable(self.progress):
             raise ModelError(f"progress is a {type(self.progress).__name__}; pass what is called with (done, all)")
-        if self.sensor_filter is not None:
-            check_choice("sensor_filter", self.sensor_filter, ("stock",))
+        if self.sensor_filter is not None and not (
+            isinstance(self.sensor_filter, str) and self.sensor_filter == "stock"
+        ):
+            raise ModelError(f"sensor_filter = {shown(self.sensor_filter)} is not known; use 'stock' or None")
         board, known = _board(
             self.rig, self.parameters, self.seed, self.offset, paced=self.paced, horizon=self.limit, card=self.card
         )
