@@ -434,6 +434,16 @@ def way_out(table):
     table.tried("signals in every line of the way out", tried)
 
 
+def loops(table, count):
+    """Controllers, shapers and a rig's loop with bad arguments."""
+    import strange
+
+    for name, wrong in strange.calls(random.Random(2), count):
+        if wrong is not None:
+            table.broken("calls of control and a rig's loop", f"{name}: {wrong}")
+    table.tried("calls of control and a rig's loop", count)
+
+
 class Table:
     """What was tried and what broke."""
 
@@ -458,7 +468,7 @@ class Table:
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--calls", type=int, default=1_300, help="calls of each entry of the extension")
-    parser.add_argument("--files", type=int, default=1_000, help="damaged files of each kind, a twentieth of parquet")
+    parser.add_argument("--files", type=int, default=1_000, help="damaged files of each kind, calls of control")
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--only-calls", action="store_true", help="nothing but calls of the extension")
     parser.add_argument("--only", default="", help="entries of the extension to call, with commas between")
@@ -486,6 +496,7 @@ def main():
         os.chdir(folder)
         if not given.only_calls:
             way_out(table)
+            loops(table, given.files)
             outputs(table, folder)
             files(table, folder, given.files)
             presses(table, folder)

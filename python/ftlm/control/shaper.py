@@ -226,7 +226,7 @@ def _mode_of(given: complex | np.number[Any]) -> Mode:
     try:
         pole = complex(given)
         size = abs(pole)
-    except OverflowError:
+    except (TypeError, ValueError, OverflowError):
         pole, size = complex("nan"), math.nan
     low, high = POLES
     if not (low <= abs(pole.imag) and size <= high):
