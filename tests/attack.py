@@ -20,7 +20,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 #: Longest call, and what Ctrl-C may take of its own processor time [s].
 HANG, STOP = 5.0, 0.5
-#: So many times longer a call may be silent if it has not had that much of a processor: others may have it.
+#: So many times longer a call may be silent if it has not had that much of a processor: what it waits for may be at work.
 PATIENCE = 30
 #: Calls of each entry that a child makes; half a second goes by before its first.
 BATCH = 200
@@ -81,21 +81,30 @@ def spent(child):
         return float("inf")
 
 
+def waited(child):
+    """Time that threads of a process were ready and others had the processors [s]; 0 where nothing tells it."""
+    try:
+        told = [task.read_text() for task in Path(f"/proc/{child.pid}/task").glob("*/schedstat")]
+        return 1e-9 * sum(int(text.split()[1]) for text in told)
+    except (OSError, IndexError, ValueError):
+        return 0.0
+
+
 def lines_of(command, folder, hang):
     """Lines that a child writes, then in words how it ended if that was no good end.
 
-    It is ended by silence of `hang` s of its own processor time, and by a longer one whatever it does.
+    It is ended by silence of `hang` s of its own processor time, and by a longer one in which it could have had one.
     """
     with (
         (folder / "errors").open("w") as errors,
         subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=errors) as child,
     ):
-        started, at, used, buffer = False, time.monotonic(), spent(child), b""
+        started, at, used, starved, buffer = False, time.monotonic(), spent(child), 0.0, b""
         os.set_blocking(child.stdout.fileno(), False)
         while True:
             got = child.stdout.read()
             if got:
-                started, at, used = True, time.monotonic(), spent(child)
+                started, at, used, starved = True, time.monotonic(), spent(child), waited(child)
                 *lines, buffer = (buffer + got).split(b"\n")
                 for line in lines:
                     yield line.decode()
@@ -103,7 +112,7 @@ def lines_of(command, folder, hang):
                 break
             # Python and NumPy are imported before the first line.
             elif (silent := time.monotonic() - at - (0 if started else 20)) > hang and (
-                silent > PATIENCE * hang or not spent(child) - used <= hang
+                silent - (waited(child) - starved) > PATIENCE * hang or not spent(child) - used <= hang
             ):
                 child.kill()
                 yield f"!took more than {hang:g} s"

@@ -3,6 +3,7 @@
 import random
 import runpy
 import sys
+import time
 import warnings
 from collections import Counter
 from pathlib import Path
@@ -127,6 +128,16 @@ def test_a_panic_is_seen(tmp_path):
     (told, *_) = table.breaks[ATTACK["CALLS"]]
     assert "panic_on_purpose: InternalError: internal fault: on purpose" in told
     assert table.calls["metrics"]["calls"] == 20
+
+
+def test_a_process_that_others_leave_no_processor_does_not_hang(tmp_path, monkeypatch):
+    began = time.monotonic()
+    given = ATTACK["lines_of"].__globals__
+    monkeypatch.setitem(given, "PATIENCE", 5)
+    command = [sys.executable, "-c", "import os, time\nos.write(1, b'1\\n')\ntime.sleep(1.5)\nos.write(1, b'2\\n')"]
+    assert list(ATTACK["lines_of"](command, tmp_path, 0.1)) == ["1", "!took more than 0.1 s"]
+    monkeypatch.setitem(given, "waited", lambda child: time.monotonic() - began)
+    assert list(ATTACK["lines_of"](command, tmp_path, 0.1)) == ["1", "2"]
 
 
 @pytest.mark.parametrize(
