@@ -20,7 +20,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 #: Longest call, and what Ctrl-C may take of its own processor time [s].
 HANG, STOP = 5.0, 0.5
-#: So many times longer a call may be silent if it has not had that much of a processor: what it waits for may be at work.
+#: So many times longer a call may be silent that has not had that much of a processor: it may wait for others' work.
 PATIENCE = 30
 #: Calls of each entry that a child makes; half a second goes by before its first.
 BATCH = 200

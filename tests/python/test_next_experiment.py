@@ -419,6 +419,7 @@ BAD = {
     "tiny slew": ({"slew": 1e-45}, None, "slew of u = 1e-45 a second takes"),
     "tiny noise": ({"noise": 1e-320}, None, "noise of y = .* is no size"),
     "criteria": ({"criterion": np.array(["D", "E"])}, None, "criterion = array"),
+    "progress": ({"progress": 5}, None, "progress is a int"),
     "no list": ({"names": 5}, None, "names is a int"),
     "no name": ({"names": [["alpha"]]}, None, r"names\[0\] = \['alpha'\] is no free number"),
     "long seed": ({"seed": -(10**5000)}, None, "seed = an integer of 16610 bits"),

@@ -112,6 +112,8 @@ def design_input(
         A model that is not stable, or integrates without a limit of that output; one with friction, saturations or dead
         zones; intervals too wide to design on; an argument that cannot be used, or a limit that cannot be kept.
     """
+    if progress is not None and not callable(progress):
+        raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
     wanted = _wanted(
         model, like, duration, step, peak, slew, limits, names, criterion, noise, period, seed,
     )  # fmt: skip
