@@ -49,7 +49,7 @@ class Runs(tuple[Run, ...]):
         """Check them."""
         try:
             every = [runs] if isinstance(runs, Run) else list(runs)
-        except (TypeError, MemoryError):
+        except TypeError:
             raise DataError(f"runs is {type(runs).__name__}; give a Run or a list of them") from None
         if not every:
             raise DataError("no run is given; give at least one")
