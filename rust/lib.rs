@@ -58,6 +58,7 @@ pub mod kernels;
 pub mod operational;
 pub mod series;
 
+mod abreast;
 pub mod dense;
 pub mod fft;
 pub mod lanes;

@@ -228,8 +228,7 @@ mod tests {
             let level = libm::pow(10.0, -f64::from(case % 8));
             let sum: Vec<f64> = (0..m).map(|t| columns[..terms].iter().map(|c| c[t]).sum()).collect();
             let target: Vec<f64> = sum.iter().zip(noise(state, m)).map(|(s, v)| s + level * v).collect();
-            let all: Vec<&[f64]> = columns.iter().chain([&target]).map(|c| &c[..]).collect();
-            let squares = Squares::new(dense::gram(&all), columns.len(), m, terms, 1);
+            let squares = Squares::new(dense::gram(&columns.concat(), &target), columns.len(), m, terms, 1);
             let but = case as usize % terms;
             let others: Vec<usize> = (0..terms - 1).collect();
             let changing: Vec<usize> = (terms - 1..columns.len()).collect();
