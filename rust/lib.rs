@@ -64,6 +64,7 @@ pub mod fft;
 pub mod lanes;
 mod shared;
 
+mod driven;
 pub mod equation;
 mod impulses;
 pub mod regressors;

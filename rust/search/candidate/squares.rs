@@ -13,8 +13,8 @@ pub(crate) struct Squares {
     norms: Vec<f64>,
     /// What rounding may add to a squared sum, per unit of the squared sum of norms.
     unit: f64,
-    /// The same where the least sum over all coefficients is asked for, and the determinant of the terms' correlation
-    /// matrix from which on it holds (docs/mathematics.md, one term that changes).
+    /// The same where the least sum over all coefficients is asked for, and the least eigenvalue of the terms' correlation
+    /// matrix from which on it holds (docs/mathematics.md, stretches of one term).
     slack: f64,
     flat: f64,
 }
@@ -33,7 +33,7 @@ impl Squares {
             unit: 4.0 * f64::EPSILON * samples as f64,
             slack,
             // Whose columns lie this far apart is not singular in the weighted equations either.
-            flat: 16.0 * (terms as f64 * slack).max(weights as f64 * PIVOT_FLOOR),
+            flat: (2.0 * terms as f64 * slack).max(16.0 * weights as f64 * PIVOT_FLOOR),
         }
     }
 
@@ -73,7 +73,7 @@ impl Squares {
         self.slack
     }
 
-    /// The least determinant of a correlation matrix of which anything is proved.
+    /// The least eigenvalue of a correlation matrix of which anything is proved.
     #[inline(always)]
     pub(super) fn flat(&self) -> f64 {
         self.flat

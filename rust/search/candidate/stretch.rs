@@ -16,14 +16,14 @@ pub(crate) struct Shared<'a> {
     /// Rows of L below its diagonal of ones, and D⁻¹.
     lower: [[f64; MOST]; MOST],
     inverse: [f64; MOST],
-    /// Products with the target behind L⁻¹, and these behind D⁻¹.
+    /// Products with the target behind L⁻¹, and the coefficients of these terms alone.
     values: [f64; MOST],
-    scaled: [f64; MOST],
+    alone: [f64; MOST],
     norms: [f64; MOST],
     /// What these terms leave of the target's squared norm.
     left: f64,
-    /// Determinant of their correlation matrix.
-    volume: f64,
+    /// Trace of the inverse of their correlation matrix, which no inverse of an eigenvalue exceeds.
+    trace: f64,
 }
 
 impl<'a> Shared<'a> {
@@ -40,17 +40,17 @@ impl<'a> Shared<'a> {
             lower: [zero; MOST],
             inverse: zero,
             values: zero,
-            scaled: zero,
+            alone: zero,
             norms: zero,
             left: squares.product(squares.target(), squares.target()),
-            volume: 1.0,
+            trace: 0.0,
         };
         for i in 0..count {
             shared.columns[i] = columns[i + usize::from(i >= but)];
             shared.extend(i);
         }
         // Also where it is not a number.
-        (shared.volume >= squares.flat()).then_some(shared)
+        (shared.trace * squares.flat() <= 1.0).then_some(shared)
     }
 
     /// Takes term `i` into the factor.
@@ -71,12 +71,23 @@ impl<'a> Shared<'a> {
             pivot -= row[j] * self.lower[i][j];
             value -= self.lower[i][j] * self.values[j];
         }
-        self.inverse[i] = 1.0 / pivot;
+        self.inverse[i] = if pivot > 0.0 { 1.0 / pivot } else { f64::INFINITY };
         self.values[i] = value;
-        self.scaled[i] = value * self.inverse[i];
         self.norms[i] = squares.norms()[column];
-        self.left -= value * self.scaled[i];
-        self.volume *= pivot / whole;
+        let last = value * self.inverse[i];
+        self.left -= value * last;
+        // What the others make of this column, from the last one back; so much less is left for them to do.
+        let mut sum = whole;
+        for j in (0..i).rev() {
+            row[j] = self.lower[i][j];
+            for l in j + 1..i {
+                row[j] -= self.lower[l][j] * row[l];
+            }
+            sum += row[j] * row[j] * self.norms[j] * self.norms[j];
+            self.alone[j] -= row[j] * last;
+        }
+        self.alone[i] = last;
+        self.trace += sum * self.inverse[i];
     }
 
     /// Appends the positions among `columns`, which ascend, of those that this bound does not exclude where they stand
@@ -155,35 +166,32 @@ impl<'a> Shared<'a> {
                 row[j][n] = scaled;
             }
         }
-        let (mut error, mut size) = ([0.0; L], [0.0; L]);
-        let mut last = [0.0; L];
+        let (mut error, mut size, mut sum) = ([0.0; L], [0.0; L], whole);
+        let (mut inverse, mut last) = ([0.0; L], [0.0; L]);
         for n in 0..L {
-            last[n] = value[n] / pivot[n];
+            inverse[n] = 1.0 / pivot[n];
+            last[n] = value[n] * inverse[n];
             error[n] = self.left - value[n] * last[n];
             size[n] = squares.norms()[squares.target()] + last[n].abs() * norms[n];
         }
-        // The other coefficients, from the last one back.
+        // What the others make of the changing column, from the last one back; so much less is left for them to do.
         for j in (0..count).rev() {
-            let mut c = [0.0; L];
-            for n in 0..L {
-                c[n] = self.scaled[j] - row[j][n] * last[n];
-            }
             for l in j + 1..count {
                 for n in 0..L {
-                    c[n] -= self.lower[l][j] * row[l][n];
+                    row[j][n] -= self.lower[l][j] * row[l][n];
                 }
             }
             for n in 0..L {
-                size[n] += c[n].abs() * self.norms[j];
+                let share = row[j][n] * self.norms[j];
+                sum[n] += share * share;
+                size[n] += (self.alone[j] - row[j][n] * last[n]).abs() * self.norms[j];
             }
-            // Its place in the row of L has been read for the last time.
-            row[j] = c;
         }
         let (slack, flat) = (squares.slack(), squares.flat());
         let mut excluded = [false; L];
         for n in 0..L {
             // Written so that what is not a number excludes nothing.
-            let known = pivot[n] * self.volume >= flat * whole[n];
+            let known = (pivot[n] > 0.0) & ((self.trace + sum[n] * inverse[n]) * flat <= 1.0);
             excluded[n] = known & (error[n] - slack * size[n] * size[n] > limit);
         }
         excluded
