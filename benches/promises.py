@@ -91,8 +91,9 @@ def searches(quick: bool) -> None:
     for name, promise in (("P2", 60), ("P2'", 120)):
         judge(
             name, f"{promise} million a second over candidates a second on all cores", promise * 1e6 / rate, 1,
-            f"{found.candidates} candidates by processor time {rate / 1e6:.1f} million/s on {threads} cores, by wall time "
-            f"{found.candidates / wall / 1e6:.1f}; NumPy's batched solve {1 / numpy_each / 1e6:.2f} million/s on one",
+            f"{found.candidates} candidates by processor time {rate / 1e6:.1f} million/s on {threads} cores, by wall "
+            f"time {found.candidates / wall / 1e6:.1f}; NumPy's batched solve {1 / numpy_each / 1e6:.2f} million/s on "
+            f"one",
         )  # fmt: skip
 
 
@@ -181,8 +182,8 @@ def set_up(quick: bool) -> None:
     judge(
         "P12", f"set-up of a search at {m} pulses on two threads over one, processor time of the busier thread",
         busiest / one, 0.55,
-        f"{busiest:.1f} of {one:.1f} s ({two:.1f} s by both threads); wall time {two_wall:.1f} of {one_wall:.1f} s, load "
-        f"{os.getloadavg()[0]:.1f}; at most {peak / 1e6:.0f} MB",
+        f"{busiest:.1f} of {one:.1f} s ({two:.1f} s by both threads); wall time {two_wall:.1f} of {one_wall:.1f} s, "
+        f"load {os.getloadavg()[0]:.1f}; at most {peak / 1e6:.0f} MB",
     )  # fmt: skip
 
 

@@ -329,7 +329,7 @@ fn early_stopping_and_threads_change_nothing() {
 
 #[test]
 fn stretches_of_one_term_rank_as_brute_force_does() {
-    let (mut bounded, mut candidates, mut singular) = (0, 0, 0);
+    let (mut bounded, mut candidates) = (0, 0);
     for seed in 300..312 {
         let mut problem = random_problem(seed);
         let mut random = Random::new(seed);
@@ -349,11 +349,10 @@ fn stretches_of_one_term_rank_as_brute_force_does() {
         assert_eq!(one.failures, brute.failures, "seed {seed}");
         assert_eq!(problem.run(|o| o.threads = 3), one, "seed {seed}");
         bounded += one.counts.bounded;
-        singular += one.counts.singular;
         candidates += one.counts.candidates;
     }
-    println!("of {candidates} candidates {bounded} excluded, {singular} singular");
-    assert!(bounded > candidates / 2 && singular > 0);
+    println!("of {candidates} candidates {bounded} excluded");
+    assert!(bounded > candidates / 2);
 }
 
 #[test]

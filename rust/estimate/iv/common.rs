@@ -114,9 +114,9 @@ impl Instruments {
 const SPANNED: f64 = 1e-13;
 
 /// Makes the instruments of all records orthonormal, a column over all records for each of k unknowns: the factor Q of a
-/// QR factorisation, by Gram and Schmidt's process done twice. They span what they did, so they give the same estimate;
-/// their products with the regressors are as well conditioned as these, where those of the instruments themselves are as
-/// badly as the square of that.
+/// QR factorisation, by Gram and Schmidt's process, done twice where it loses digits. They span what they did, so they
+/// give the same estimate; their products with the regressors are as well conditioned as these, where those of the
+/// instruments themselves are as badly as the square of that.
 ///
 /// O(records · k² m), where k counts the unknowns that a record has.
 ///
@@ -130,13 +130,14 @@ pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
     for record in &mut *records {
         for at in (0..record.places.len()).filter(|&at| held[record.places[at]] == 1) {
             let mut column = [std::mem::take(&mut record.columns[at])];
-            let whole = size(&column);
-            for _ in 0..2 {
+            let spanned = twice(&mut column, |column| {
                 for before in (0..at).filter(|&before| held[record.places[before]] == 1) {
                     remove(&mut column[0], &record.columns[before], None);
                 }
+            });
+            if !spanned {
+                return Err(singular(record.places[at]));
             }
-            unit(&mut column, whole).ok_or_else(|| singular(record.places[at]))?;
             [record.columns[at]] = column;
         }
     }
@@ -144,25 +145,26 @@ pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
     for (n, &place) in shared.iter().enumerate() {
         // An unknown that not all records have is nothing in the others.
         let mut pieces: Vec<Vec<f64>> = records.iter().map(|r| r.of(place).cloned().unwrap_or_default()).collect();
-        let whole = size(&pieces);
-        for _ in 0..2 {
+        let spanned = twice(&mut pieces, |pieces| {
             for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
                 for (column, _) in record.columns.iter().zip(&record.places).filter(|(_, p)| held[**p] == 1) {
                     remove(piece, column, None);
                 }
             }
             for &before in &shared[..n] {
-                let pairs = || records.iter().map(|r| r.of(before)).zip(&pieces);
+                let pairs = records.iter().map(|r| r.of(before)).zip(&*pieces);
                 let along =
-                    pairs().map(|(q, piece)| q.filter(|_| !piece.is_empty()).map_or(0.0, |q| dot(q, piece))).sum();
+                    pairs.map(|(q, piece)| q.filter(|_| !piece.is_empty()).map_or(0.0, |q| dot(q, piece))).sum();
                 for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
                     if let Some(q) = record.of(before) {
                         remove(piece, q, Some(along));
                     }
                 }
             }
+        });
+        if !spanned {
+            return Err(singular(place));
         }
-        unit(&mut pieces, whole).ok_or_else(|| singular(place))?;
         for (record, piece) in records.iter_mut().zip(pieces) {
             if let Some(at) = record.places.iter().position(|p| *p == place) {
                 record.columns[at] = piece;
@@ -178,12 +180,23 @@ fn remove(column: &mut [f64], direction: &[f64], along: Option<f64>) {
     column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
 }
 
-/// Scales what is left of a column of this size to unit size; none where it is rounding.
-fn unit(pieces: &mut [Vec<f64>], whole: f64) -> Option<()> {
-    let left = size(pieces);
-    let tells = left > SPANNED * whole && left.is_finite();
-    pieces.iter_mut().flatten().for_each(|v| *v /= left);
-    tells.then_some(())
+/// Takes out of a column what those before it span, once more where little was left, and scales what is left to unit size;
+/// false where that is rounding.
+fn twice(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
+    let whole = size(pieces);
+    let (mut before, mut left) = (whole, whole);
+    for _ in 0..2 {
+        clear(pieces);
+        left = size(pieces);
+        // What rounding left of the others weighs as much more as the column has shrunk.
+        if left > 0.5 * before {
+            break;
+        }
+        before = left;
+    }
+    let scale = 1.0 / left;
+    pieces.iter_mut().flatten().for_each(|v| *v *= scale);
+    left > SPANNED * whole && scale.is_finite() && left.is_finite()
 }
 
 fn size(pieces: &[Vec<f64>]) -> f64 {
