@@ -95,6 +95,7 @@ impl<'a> System<'a> {
     }
 
     /// The right-hand side with these initial terms, and those that are added to the outputs instead.
+    #[allow(clippy::type_complexity)]
     fn driven(&self, initial: &[Vec<(f64, f64)>]) -> (Vec<Vec<f64>>, Vec<Vec<(f64, f64)>>) {
         let (driving, beside) =
             if self.record.is_filtered() { (initial.to_vec(), Vec::new()) } else { parted(initial) };

@@ -55,6 +55,7 @@ impl<'a> Shared<'a> {
 
     /// Takes term `i` into the factor.
     #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // triangles, whose elements are told by their places
     fn extend(&mut self, i: usize) {
         let (squares, column) = (self.squares, self.columns[i]);
         let whole = squares.product(column, column);
@@ -142,6 +143,7 @@ impl<'a> Shared<'a> {
 
     /// Whether no coefficients at all bring the squared error of each of L candidates down to the limit.
     #[inline(always)]
+    #[allow(clippy::needless_range_loop)] // triangles of lanes, whose elements are told by their places
     fn excluded<const L: usize>(&self, count: usize, changing: &Columns<L>, limit: f64) -> [bool; L] {
         let squares = self.squares;
         let whole = changing.of(squares.diagonal());
