@@ -111,7 +111,9 @@ impl<'a> Hunt<'a> {
     /// The candidates of a round in chunks: those of a large slab together, others a few at a time.
     fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<Slab>)> {
         let mut chunks = Vec::new();
-        let chunk = if self.catalogue.problem.squares.is_some() { CHUNK_PLAIN } else { CHUNK };
+        // Beside boxes a chunk must not reach far into the next slab.
+        let plain = self.catalogue.problem.squares.is_some() && self.boxes.is_none();
+        let chunk = if plain { CHUNK_PLAIN } else { CHUNK };
         let mut at = start;
         while at < end {
             let boxed = self.boxes.filter(|_| limit < f64::INFINITY).and_then(|_| self.catalogue.lattice.slab(at));
