@@ -1,7 +1,10 @@
 //! Times that `promises.py` sets beside its rivals, one `name seconds` a line; with a kernel's name, runs that kernel a
-//! fixed number of times for callgrind; with `search`, pulses, step and threads, runs one search.
+//! fixed number of times for callgrind; with `search`, pulses, step and threads, runs one search; with `setup` and the
+//! same, sets one up.
 #![allow(missing_docs, clippy::cast_precision_loss)]
 
+use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::hint::black_box;
 use std::time::Instant;
 
@@ -14,7 +17,8 @@ use ftlm::regressors::Record;
 use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis};
 use ftlm::search::options::{Criterion, Estimator, Norm, Options};
-use ftlm::search::rounds::search;
+use ftlm::search::rounds::{search, Search};
+use ftlm::search::threads::pool;
 use ftlm::series::{self, Buffers, Division, Kernel};
 use ftlm::simulate;
 
@@ -195,6 +199,9 @@ fn problem(m: usize, step: f64) -> Option<(Record, Lattice)> {
     Some((record, Lattice::new(1, &alphas, &axes, |s| s == 2).ok()?))
 }
 
+/// Step of the lattice that is ranked by equation errors for callgrind: five million candidates.
+const RANKED: f64 = 0.025;
+
 fn options(threads: usize) -> Options {
     Options {
         criterion: Criterion::OutputError,
@@ -228,6 +235,41 @@ fn growth(m: usize, step: f64, threads: usize) {
     }
 }
 
+/// Sets up a search and stops before its first round: prints wall seconds, processor seconds of all threads and of the
+/// busiest one, and the most memory that the process had, in bytes.
+fn setup(m: usize, step: f64, threads: usize) {
+    let (Some((record, lattice)), Ok(pool)) = (problem(m, step), pool(threads)) else { return };
+    let (records, options) = ([record], options(threads));
+    let before = busy();
+    let start = Instant::now();
+    let ready = Search::new(&records, Cow::Borrowed(&lattice), &[None; 4], &options, &pool, &Control::default());
+    let wall = start.elapsed().as_secs_f64();
+    if black_box(ready).is_ok() {
+        let spent: Vec<f64> =
+            busy().into_iter().map(|(thread, now)| now - before.get(&thread).copied().unwrap_or(0.0)).collect();
+        let busiest = spent.iter().copied().fold(0.0, f64::max);
+        println!("{wall:e} {:e} {busiest:e} {:e}", spent.iter().sum::<f64>(), peak().unwrap_or(f64::NAN));
+    }
+}
+
+/// Processor seconds of every thread of this process.
+fn busy() -> BTreeMap<String, f64> {
+    let tasks = std::fs::read_dir("/proc/self/task").into_iter().flatten().flatten();
+    tasks
+        .filter_map(|task| {
+            let text = std::fs::read_to_string(task.path().join("schedstat")).ok()?;
+            Some((task.file_name().into_string().ok()?, 1e-9 * text.split(' ').next()?.parse::<f64>().ok()?))
+        })
+        .collect()
+}
+
+/// The most memory that this process has had, in bytes.
+fn peak() -> Option<f64> {
+    let text = std::fs::read_to_string("/proc/self/status").ok()?;
+    let line = text.lines().find(|line| line.starts_with("VmHWM"))?;
+    Some(1024.0 * line.split_whitespace().nth(1)?.parse::<f64>().ok()?)
+}
+
 /// One of the hottest kernels a fixed number of times, for callgrind; prints how many units of work it did.
 fn kernel(name: &str) {
     let m = 2048;
@@ -237,6 +279,12 @@ fn kernel(name: &str) {
             if name == "screen" {
                 let _ = black_box(search(&[record], &lattice, &[None; 4], &options(1), &Control::default()));
             }
+            println!("units {}", lattice.count());
+        }
+        "rank" => {
+            let Some((record, lattice)) = problem(m, RANKED) else { return };
+            let options = Options { criterion: Criterion::EquationError, norm: Norm::L2, ..options(1) };
+            let _ = black_box(search(&[record], &lattice, &[None; 4], &options, &Control::default()));
             println!("units {}", lattice.count());
         }
         "divide" => {
@@ -263,6 +311,11 @@ fn main() {
         ["search", m, step, threads] => {
             if let (Ok(m), Ok(step), Ok(threads)) = (m.parse(), step.parse(), threads.parse()) {
                 growth(m, step, threads);
+            }
+        }
+        ["setup", m, step, threads] => {
+            if let (Ok(m), Ok(step), Ok(threads)) = (m.parse(), step.parse(), threads.parse()) {
+                setup(m, step, threads);
             }
         }
         [name] => kernel(name),

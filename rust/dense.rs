@@ -3,6 +3,17 @@
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
 
+use crate::abreast;
+
+/// Rows over which one product of long columns is summed, at least, and into how many such parts their rows are cut at
+/// most; the parts do not depend on the threads, nor do their sums.
+const PIECE: usize = 1 << 14;
+const PIECES: usize = 16;
+/// Columns of a Gram matrix that are multiplied with one another at a time.
+const TILE: usize = 64;
+/// Rows of scattered columns that are laid out for a product at a time: what fits a cache.
+const LAID_OUT: usize = 1 << 10;
+
 /// Row-major product of an a×b and a b×c matrix, one thread. O(abc).
 #[must_use]
 pub fn multiply(left: &[f64], right: &[f64], a: usize, b: usize, c: usize) -> Vec<f64> {
@@ -18,21 +29,53 @@ pub fn multiply(left: &[f64], right: &[f64], a: usize, b: usize, c: usize) -> Ve
     out
 }
 
-/// Gram matrix of the given columns (all of one length), row-major k × k, exactly symmetric. O(k²m).
+/// Gram matrix of columns that lie one behind another, and of a target as the last one: row-major, exactly symmetric.
+/// O(k²m), on the threads of the pool at hand; the columns are read where they lie.
+///
+/// # Panics
+/// Where the columns are not as long as the target.
 #[must_use]
-pub fn gram(columns: &[&[f64]]) -> Vec<f64> {
-    let k = columns.len();
-    let m = columns.first().map_or(0, |c| c.len());
-    let x = Mat::from_fn(m, k, |i, j| columns[j][i]);
-    let mut g = Mat::<f64>::zeros(k, k);
-    matmul(g.as_mut(), Accum::Replace, x.transpose(), x.as_ref(), 1.0, Par::Seq);
-    let mut out = vec![0.0; k * k];
-    for i in 0..k {
-        for j in 0..k {
-            out[i * k + j] = g[(i.min(j), i.max(j))];
+pub fn gram(columns: &[f64], target: &[f64]) -> Vec<f64> {
+    let m = target.len();
+    let k = columns.len() / m.max(1);
+    let x = MatRef::from_column_major_slice(columns, m, k);
+    let y = MatRef::from_column_major_slice(target, m, 1);
+    let mut tiles: Vec<(usize, MatRef<'_, f64>)> =
+        (0..k).step_by(TILE).map(|first| (first, x.subcols(first, TILE.min(k - first)))).collect();
+    tiles.push((k, y));
+    let rows = pieces(m);
+    let pairs = (0..tiles.len()).flat_map(|b| (0..=b).map(move |a| (a, b)));
+    let tasks: Vec<_> = pairs.flat_map(|pair| rows.iter().map(move |&piece| (pair, piece))).collect();
+    let made = abreast::map(
+        tasks,
+        || (),
+        |(), ((a, b), (from, len))| {
+            let (left, right) = (tiles[a].1.subrows(from, len), tiles[b].1.subrows(from, len));
+            let mut product = Mat::<f64>::zeros(left.ncols(), right.ncols());
+            matmul(product.as_mut(), Accum::Replace, left.transpose(), right, 1.0, Par::Seq);
+            (tiles[a].0, tiles[b].0, product)
+        },
+    );
+    let mut out = vec![0.0; (k + 1) * (k + 1)];
+    for (left, right, product) in made {
+        for (j, column) in product.col_iter().enumerate() {
+            for (i, value) in column.iter().enumerate().filter(|(i, _)| left + i <= right + j) {
+                out[(left + i) * (k + 1) + right + j] += value;
+            }
+        }
+    }
+    for i in 0..=k {
+        for j in 0..i {
+            out[i * (k + 1) + j] = out[j * (k + 1) + i];
         }
     }
     out
+}
+
+/// Where so many rows are cut: first row and number of each part.
+fn pieces(m: usize) -> Vec<(usize, usize)> {
+    let len = m.div_ceil(PIECES).max(PIECE);
+    (0..m).step_by(len).map(|from| (from, len.min(m - from))).collect()
 }
 
 /// Upper-triangular factor R of the QR factorisation of the given columns, row-major k × k. O(k²m).
@@ -72,13 +115,29 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share
     }
 }
 
-/// Inner products of every left with every right column (all of one length), row-major left × right. O(left·right·m).
+/// Inner products of every left with every right column (all of one length), row-major left × right. O(left·right·m), on
+/// the threads of the pool at hand.
 #[must_use]
 pub fn inner_products(left: &[&[f64]], right: &[&[f64]]) -> Vec<f64> {
     let m = left.first().map_or(0, |c| c.len());
-    let x = Mat::from_fn(m, left.len(), |i, j| left[j][i]);
-    let y = Mat::from_fn(m, right.len(), |i, j| right[j][i]);
-    let mut product = Mat::<f64>::zeros(right.len(), left.len());
-    matmul(product.as_mut(), Accum::Replace, y.transpose(), x.as_ref(), 1.0, Par::Seq);
-    product.col_iter().flat_map(|column| column.iter().copied().collect::<Vec<_>>()).collect()
+    let made = abreast::map(
+        pieces(m),
+        || (),
+        |(), (from, len)| {
+            let mut product = Mat::<f64>::zeros(right.len(), left.len());
+            for first in (from..from + len).step_by(LAID_OUT) {
+                let rows = LAID_OUT.min(from + len - first);
+                let x = Mat::from_fn(rows, left.len(), |i, j| left[j][first + i]);
+                let y = Mat::from_fn(rows, right.len(), |i, j| right[j][first + i]);
+                matmul(product.as_mut(), Accum::Add, y.transpose(), x.as_ref(), 1.0, Par::Seq);
+            }
+            product
+        },
+    );
+    let mut out = vec![0.0; left.len() * right.len()];
+    for product in made {
+        let values = product.col_iter().flat_map(|column| column.iter());
+        out.iter_mut().zip(values).for_each(|(sum, value)| *sum += value);
+    }
+    out
 }

@@ -58,11 +58,13 @@ pub mod kernels;
 pub mod operational;
 pub mod series;
 
+mod abreast;
 pub mod dense;
 pub mod fft;
 pub mod lanes;
 mod shared;
 
+mod driven;
 pub mod equation;
 mod impulses;
 pub mod regressors;

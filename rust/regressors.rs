@@ -1,7 +1,8 @@
 //! Records and equations become one bank of distinct regressors I^η s, shared by all candidates of a search.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
+use crate::abreast;
 use crate::equation::{grains, tidy};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::excess::kernel;
@@ -249,15 +250,47 @@ impl Index {
 
 /// The columns of an [`Index`] on one record.
 pub struct Bank {
-    columns: Vec<Vec<f64>>,
-    /// Kernels of the output's own regressors, by position; empty for all others.
-    kernels: Vec<Vec<f64>>,
+    m: usize,
+    /// All of them, one behind another.
+    columns: Vec<f64>,
+    /// Kernels of the output's own regressors, one behind another, and by position which of them it is.
+    kernels: Vec<f64>,
+    own: Vec<Option<usize>>,
+}
+
+/// What one order makes: the columns of all signals, and the kernel where the output is among them.
+struct Made<'a> {
+    order: i64,
+    columns: Vec<(usize, &'a mut [f64])>,
+    kernel: Option<&'a mut [f64]>,
+}
+
+impl Made<'_> {
+    /// One kernel and its spectrum for all signals.
+    #[allow(clippy::cast_precision_loss)]
+    fn write(self, record: &Record, spectra: &BTreeMap<usize, Kernel>, buffers: &mut Buffers) {
+        let kernel = kernel(tidy(self.order as f64 / 1e9), record.m(), record.step());
+        if self.order == 0 {
+            self.columns.into_iter().for_each(|(signal, column)| column.copy_from_slice(record.signal(signal)));
+        } else {
+            let spectrum = Kernel::new(&kernel);
+            for (signal, column) in self.columns {
+                if let Some(signal) = spectra.get(&signal) {
+                    spectrum.times(signal, column, buffers);
+                }
+            }
+        }
+        if let Some(own) = self.kernel {
+            own.copy_from_slice(&kernel);
+        }
+    }
 }
 
 impl Bank {
     /// Computes every column; `output` is the signal whose kernels simulation needs.
     ///
-    /// One pair of transforms a column. O(columns · m log m), memory 8·m bytes a column (twice for the output's own).
+    /// One transform a column, one more for each order and signal. O(columns · m log m), memory 8·m bytes a column (twice
+    /// for the output's own); on the threads of the pool at hand.
     ///
     /// # Errors
     /// [`Error::BankTooLarge`] beyond [`BANK_LIMIT`], [`Error::Structure`] for a signal that the record does not hold.
@@ -301,32 +334,47 @@ impl Bank {
                 remedy: "give the record all signals of the equation".into(),
             });
         }
-        let mut buffers = Buffers::default();
-        let mut spectra: HashMap<usize, Kernel> = HashMap::new();
-        let mut columns = Vec::with_capacity(index.keys.len());
-        let mut kernels = Vec::with_capacity(index.keys.len());
-        for key in &index.keys {
+        let mut columns = vec![0.0; m * index.keys.len()];
+        let mut kernels = vec![0.0; m * Self::own(index, output)];
+        let mut own = Vec::with_capacity(index.keys.len());
+        let mut orders: BTreeMap<i64, Made<'_>> = BTreeMap::new();
+        let mut initial = Vec::new();
+        let mut rest = kernels.chunks_exact_mut(m).enumerate();
+        for (key, column) in index.keys.iter().zip(columns.chunks_exact_mut(m)) {
+            let mut kernel = None;
             match *key {
                 Key::Integral { signal, order } => {
-                    let kernel = kernel(tidy(order as f64 / 1e9), m, record.step());
-                    let column = if order == 0 {
-                        record.signal(signal).to_vec()
-                    } else {
-                        let mut column = vec![0.0; m];
-                        let spectrum = spectra.entry(signal).or_insert_with(|| Kernel::new(record.signal(signal)));
-                        spectrum.apply(&kernel, &mut column, &mut buffers);
-                        column
-                    };
-                    columns.push(column);
-                    kernels.push(if signal == output { kernel } else { Vec::new() });
+                    let made = orders.entry(order).or_insert_with(|| Made { order, columns: vec![], kernel: None });
+                    made.columns.push((signal, column));
+                    if signal == output {
+                        (kernel, made.kernel) = rest.next().unzip();
+                    }
                 }
-                Key::Initial { exponent } => {
-                    columns.push(record.initial_term(exponent as f64 / 1e9));
-                    kernels.push(Vec::new());
-                }
+                Key::Initial { exponent } => initial.push((exponent, column)),
             }
+            own.push(kernel);
         }
-        Ok(Self { columns, kernels })
+        let integrated: BTreeSet<usize> =
+            orders.values().filter(|made| made.order != 0).flat_map(|made| &made.columns).map(|(s, _)| *s).collect();
+        let signals = integrated.into_iter().collect();
+        let spectrum = |(): &mut (), signal: usize| (signal, Kernel::new(record.signal(signal)));
+        let spectra: BTreeMap<usize, Kernel> = abreast::map(signals, || (), spectrum).into_iter().collect();
+        abreast::map(orders.into_values().collect(), Buffers::default, |buffers, made| {
+            made.write(record, &spectra, buffers);
+        });
+        abreast::map(
+            initial,
+            || (),
+            |(), (exponent, column)| {
+                column.copy_from_slice(&record.initial_term(exponent as f64 / 1e9));
+            },
+        );
+        Ok(Self { m, columns, kernels, own })
+    }
+
+    /// All columns, one behind another.
+    pub(crate) fn columns(&self) -> &[f64] {
+        &self.columns
     }
 
     /// Column at a position: one value a pulse.
@@ -335,7 +383,7 @@ impl Bank {
     /// Where there is no such column.
     #[must_use]
     pub fn column(&self, position: usize) -> &[f64] {
-        &self.columns[position]
+        &self.columns[position * self.m..(position + 1) * self.m]
     }
 
     /// Kernel of an own-output column, one value a pulse; empty for any other column.
@@ -344,18 +392,18 @@ impl Bank {
     /// Where there is no such column.
     #[must_use]
     pub fn kernel(&self, position: usize) -> &[f64] {
-        &self.kernels[position]
+        self.own[position].map_or(&[], |place| &self.kernels[place * self.m..(place + 1) * self.m])
     }
 
     /// Number of columns.
     #[must_use]
     pub fn len(&self) -> usize {
-        self.columns.len()
+        self.own.len()
     }
 
     /// Whether there is no column.
     #[must_use]
     pub fn is_empty(&self) -> bool {
-        self.columns.is_empty()
+        self.own.is_empty()
     }
 }

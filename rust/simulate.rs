@@ -1,13 +1,14 @@
 //! Response of an equation and of a coupled model, the two errors of a model, and the explicit Euler baseline.
 
+use crate::driven::System;
 use crate::equation::{Equation, Initial, Structure, ORDER_GRAIN};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::estimate::least_squares;
 use crate::excess::kernel;
-use crate::impulses::{add_impulses, is_impulse, parted};
+use crate::impulses::is_impulse;
 use crate::regressors::Record;
 use crate::regularity::check_regular;
-use crate::series::{self, Buffers, Kernel};
+use crate::series;
 
 /// A response with the initial terms that were fitted to the measured outputs.
 #[derive(Debug, Clone, PartialEq)]
@@ -28,171 +29,6 @@ pub struct OutputFilter<'a> {
     /// One flag an equation.
     pub applies: &'a [bool],
 }
-
-/// The series system A y = b of some equations: their outputs are unknown, every other signal is read from the record.
-///
-/// Coefficients may be of any size here, as the steps of an estimator make them; what people give is checked before.
-pub(crate) struct System<'a> {
-    record: &'a Record,
-    matrix: Vec<Vec<Vec<f64>>>,
-    rhs: Vec<Vec<f64>>,
-}
-
-impl<'a> System<'a> {
-    /// The system of equations with distinct outputs.
-    ///
-    /// # Errors
-    /// Orders or signals that make no equation, as many coefficients as terms missing, two equations of one output.
-    pub(crate) fn new(equations: &[Equation], record: &'a Record) -> Result<Self> {
-        let m = record.m();
-        let n = equations.len();
-        let outputs: Vec<usize> = equations.iter().map(|e| e.structure.output).collect();
-        for (i, output) in outputs.iter().enumerate() {
-            if outputs[..i].contains(output) {
-                return Err(Error::Structure {
-                    what: format!("two equations have signal {output} as their output"),
-                    remedy: "give one equation an output".into(),
-                });
-            }
-        }
-        let mut matrix = vec![vec![vec![0.0; m]; n]; n];
-        let mut rhs = vec![vec![0.0; m]; n];
-        // Terms often share an order: each kernel is made once.
-        let mut kernels: Vec<(f64, Vec<f64>)> = Vec::new();
-        let step = record.step();
-        for (i, equation) in equations.iter().enumerate() {
-            let structure = &equation.structure;
-            structure.check(record.len(), |_| true)?;
-            check_length("coefficients", structure.terms.len(), equation.coefficients.len())?;
-            matrix[i][i][0] += 1.0;
-            for (k, (term, &c)) in structure.terms.iter().zip(&equation.coefficients).enumerate() {
-                let eta = structure.integration(k);
-                let unknown = outputs.iter().position(|&o| o == term.signal);
-                if unknown.is_none() {
-                    let signal = record.signal(term.signal);
-                    // What stands still drives nothing.
-                    if signal.iter().all(|v| *v == 0.0) {
-                        continue;
-                    }
-                    if eta == 0.0 {
-                        rhs[i].iter_mut().zip(signal).for_each(|(b, v)| *b += c * v);
-                        continue;
-                    }
-                }
-                let place = kernels.iter().position(|(known, _)| known.to_bits() == eta.to_bits());
-                let place = place.unwrap_or_else(|| {
-                    kernels.push((eta, kernel(eta, m, step)));
-                    kernels.len() - 1
-                });
-                let kernel = &kernels[place].1;
-                match unknown {
-                    Some(j) => matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v),
-                    None => {
-                        // Of a single sample, only that: nothing is to be transformed then.
-                        let signal = record.signal(term.signal);
-                        let last = signal.iter().rposition(|v| *v != 0.0).map_or(0, |k| k + 1);
-                        let integral = series::multiply(kernel, if last <= FEW { &signal[..last] } else { signal }, m);
-                        rhs[i].iter_mut().zip(integral).for_each(|(b, v)| *b += c * v);
-                    }
-                }
-            }
-        }
-        Ok(Self { record, matrix, rhs })
-    }
-
-    /// The matrix read at ρz, ρ = e^{−decay}, which makes every model stable for a large enough decay [1/pulse].
-    #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn damped(mut self, decay: f64) -> Self {
-        if decay > 0.0 {
-            for series in self.matrix.iter_mut().flatten() {
-                series.iter_mut().enumerate().for_each(|(k, a)| *a *= libm::exp(-decay * k as f64));
-            }
-        }
-        self
-    }
-
-    /// Free run with given initial terms: (exponent, coefficient) pairs per equation, empty at rest.
-    pub(crate) fn respond(&self, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
-        let (driving, beside) =
-            if self.record.is_filtered() { (initial.to_vec(), Vec::new()) } else { parted(initial) };
-        let mut rhs = self.rhs.clone();
-        for (b, terms) in rhs.iter_mut().zip(&driving) {
-            for &(exponent, coefficient) in terms {
-                b.iter_mut().zip(self.record.initial_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
-            }
-        }
-        let mut outputs = self.solve(&rhs)?;
-        add_impulses(&mut outputs, &beside, self.record.step());
-        Ok(outputs)
-    }
-
-    /// Whether an initial term is an impulse that only the filter of its output gets: of none that the record is behind.
-    fn is_beside(&self, exponent: f64) -> bool {
-        is_impulse(exponent) && !self.record.is_filtered()
-    }
-
-    /// Series of the inverse of the matrix, see [`series::Solver::inverse`].
-    pub(crate) fn inverse(&self) -> Result<Vec<Vec<Vec<f64>>>> {
-        series::Solver::new(&self.matrix)?.inverse()
-    }
-
-    /// What a unit of each initial term, an equation and an exponent, does to every output while nothing else drives.
-    pub(crate) fn units(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
-        self.units_by(&mut series::Solver::new(&self.matrix)?, units)
-    }
-
-    fn units_by(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
-        let (m, n) = (self.record.m(), self.matrix.len());
-        if units.is_empty() {
-            return Ok(Vec::new());
-        }
-        let alone = |i: usize, exponent: f64| {
-            let mut rows = vec![vec![0.0; m]; n];
-            rows[i] = self.record.initial_term(exponent);
-            rows
-        };
-        let inverse = solver.inverse()?;
-        if inverse.iter().flatten().any(|series| grows(series)) {
-            return units
-                .iter()
-                .map(|&(i, exponent)| {
-                    let term = alone(i, exponent);
-                    if self.is_beside(exponent) {
-                        Ok(term)
-                    } else {
-                        solver.solve(&term)
-                    }
-                })
-                .collect();
-        }
-        let kernels: Vec<Vec<Kernel>> =
-            inverse.iter().map(|row| row.iter().map(|s| Kernel::new(s)).collect()).collect();
-        let mut buffers = Buffers::default();
-        let mut through = |kernel: &Kernel, term: &[f64]| {
-            let mut out = vec![0.0; m];
-            kernel.apply(term, &mut out, &mut buffers);
-            out
-        };
-        Ok(units
-            .iter()
-            .map(|&(i, exponent)| {
-                if self.is_beside(exponent) {
-                    return alone(i, exponent);
-                }
-                let term = self.record.initial_term(exponent);
-                kernels.iter().map(|row| through(&row[i], &term)).collect()
-            })
-            .collect())
-    }
-
-    fn solve(&self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
-        let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
-        series::solve(&self.matrix, &borrowed)
-    }
-}
-
-/// Pulses of a signal that ends in zeros which a product takes one by one.
-const FEW: usize = 64;
 
 /// Free run: pulse means of the outputs of `equations`, driven by the record's other signals.
 ///
@@ -319,17 +155,6 @@ fn as_terms(equations: usize, units: &[(usize, f64)]) -> Result<Vec<Vec<(f64, f6
     }
     Ok(initial)
 }
-
-/// Whether the second half of a series exceeds its first by so much that a transform would swamp the latter.
-fn grows(series: &[f64]) -> bool {
-    let largest = |part: &[f64]| part.iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-    let (first, second) = series.split_at(series.len() / 2);
-    let (first, second) = (largest(first), largest(second));
-    !(second <= GROWTH * first && first.is_finite())
-}
-
-/// By this factor: half of the digits of a transform's smallest values are lost to 1e−12 of its largest.
-const GROWTH: f64 = 1e3;
 
 /// Free run whose initial terms are those that bring it closest to the measured outputs.
 ///

@@ -1,6 +1,6 @@
 //! Fixed-size solves and the recursions of the estimators; the only user of `nalgebra`.
 
-use nalgebra::{DMatrix, DVector};
+use nalgebra::{DMatrix, DVector, Dyn, FullPivLU};
 
 use crate::error::{check_length, Error, Result};
 use crate::lanes::Lanes;
@@ -38,6 +38,75 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
     }
 }
 
+/// A square matrix whose rows and columns may differ in scale by any factor, ready to be solved with.
+pub struct Scaled {
+    /// Largest element of each row, then of each column.
+    rows: Vec<f64>,
+    columns: Vec<f64>,
+    /// None of a matrix without rows.
+    factor: Option<FullPivLU<f64, Dyn, Dyn>>,
+}
+
+impl Scaled {
+    /// Of a row-major k × k matrix.
+    ///
+    /// # Errors
+    /// [`Error::Singular`] where rounding cannot tell its rows apart, [`Error::Length`].
+    ///
+    /// ```
+    /// let solved = ftlm::small::Scaled::new(&[2.0, 0.0, 0.0, 0.25], 2)?.solve(&[1.0, 1.0]);
+    /// assert_eq!(solved, [0.5, 4.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn new(matrix: &[f64], k: usize) -> Result<Self> {
+        check_length("matrix", k * k, matrix.len())?;
+        // Rows, then columns, to unit largest element: what is then nearly singular is so whatever the units.
+        let largest = |values: &mut dyn Iterator<Item = f64>| values.fold(0.0_f64, |a, v| a.max(v.abs()));
+        let mut a = DMatrix::from_row_slice(k, k, matrix);
+        let rows: Vec<f64> = (0..k).map(|i| largest(&mut a.row(i).iter().copied())).collect();
+        for (i, scale) in rows.iter().enumerate() {
+            a.row_mut(i).unscale_mut(*scale);
+        }
+        let columns: Vec<f64> = (0..k).map(|j| largest(&mut a.column(j).iter().copied())).collect();
+        for (j, scale) in columns.iter().enumerate() {
+            a.column_mut(j).unscale_mut(*scale);
+        }
+        let singular = |index| Error::Singular { index, count: k };
+        if let Some(bad) = rows.iter().chain(&columns).position(|s| !(*s > 0.0 && s.is_finite())) {
+            return Err(singular(bad % k.max(1)));
+        }
+        let factor = (k > 0).then(|| a.full_piv_lu());
+        let pivots = factor.iter().flat_map(|f| f.u().diagonal().iter().copied().collect::<Vec<f64>>());
+        if let Some(bad) = pivots.into_iter().position(|p| p.is_nan() || p.abs() <= PIVOT_FLOOR) {
+            return Err(singular(bad));
+        }
+        Ok(Self { rows, columns, factor })
+    }
+
+    /// The solution of a system with this right-hand side, one value a row.
+    #[must_use]
+    pub fn solve(&self, rhs: &[f64]) -> Vec<f64> {
+        let mut x = DVector::from_iterator(rhs.len(), rhs.iter().zip(&self.rows).map(|(v, scale)| v / scale));
+        if let Some(factor) = &self.factor {
+            factor.solve_mut(&mut x);
+        }
+        x.iter().zip(&self.columns).map(|(v, scale)| v / scale).collect()
+    }
+
+    /// The inverse, row-major.
+    #[must_use]
+    pub fn inverse(&self) -> Vec<f64> {
+        let k = self.rows.len();
+        let mut out = vec![0.0; k * k];
+        for j in 0..k {
+            let mut unit = vec![0.0; k];
+            unit[j] = 1.0;
+            self.solve(&unit).into_iter().enumerate().for_each(|(i, v)| out[i * k + j] = v);
+        }
+        out
+    }
+}
+
 /// Row-major inverse of a row-major k × k matrix whose rows and columns may differ in scale by any factor.
 ///
 /// # Errors
@@ -49,38 +118,7 @@ pub fn inverse(matrix: &[f64], n: usize) -> Result<Vec<f64>> {
 /// assert_eq!(ftlm::small::scaled_inverse(&[], 0), Ok(vec![]));
 /// ```
 pub fn scaled_inverse(matrix: &[f64], k: usize) -> Result<Vec<f64>> {
-    check_length("matrix", k * k, matrix.len())?;
-    if k == 0 {
-        return Ok(Vec::new());
-    }
-    // Rows, then columns, to unit largest element: what is then nearly singular is so whatever the units.
-    let largest = |values: &mut dyn Iterator<Item = f64>| values.fold(0.0_f64, |a, v| a.max(v.abs()));
-    let mut a = DMatrix::from_row_slice(k, k, matrix);
-    let rows: Vec<f64> = (0..k).map(|i| largest(&mut a.row(i).iter().copied())).collect();
-    for (i, scale) in rows.iter().enumerate() {
-        a.row_mut(i).unscale_mut(*scale);
-    }
-    let columns: Vec<f64> = (0..k).map(|j| largest(&mut a.column(j).iter().copied())).collect();
-    for (j, scale) in columns.iter().enumerate() {
-        a.column_mut(j).unscale_mut(*scale);
-    }
-    let singular = |index| Error::Singular { index, count: k };
-    if let Some(bad) = rows.iter().chain(&columns).position(|s| !(*s > 0.0 && s.is_finite())) {
-        return Err(singular(bad % k.max(1)));
-    }
-    let factor = a.full_piv_lu();
-    let pivots = factor.u().diagonal();
-    if let Some(bad) = pivots.iter().position(|p| p.is_nan() || p.abs() <= PIVOT_FLOOR) {
-        return Err(singular(bad));
-    }
-    let inverse = factor.try_inverse().ok_or_else(|| singular(0))?;
-    let mut out = vec![0.0; k * k];
-    for i in 0..k {
-        for j in 0..k {
-            out[i * k + j] = inverse[(i, j)] / (columns[i] * rows[j]);
-        }
-    }
-    Ok(out)
+    Ok(Scaled::new(matrix, k)?.inverse())
 }
 
 /// Position of element (i, j), j ≤ i, of a symmetric matrix kept by its lower rows.

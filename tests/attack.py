@@ -20,7 +20,7 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 #: Longest call, and what Ctrl-C may take of its own processor time [s].
 HANG, STOP = 5.0, 0.5
-#: So many times longer a call may be silent if it has not had that much of a processor: others may have it.
+#: So many times longer a call may be silent that has not had that much of a processor: it may wait for others' work.
 PATIENCE = 30
 #: Calls of each entry that a child makes; half a second goes by before its first.
 BATCH = 200
@@ -81,21 +81,30 @@ def spent(child):
         return float("inf")
 
 
+def waited(child):
+    """Time that threads of a process were ready and others had the processors [s]; 0 where nothing tells it."""
+    try:
+        told = [task.read_text() for task in Path(f"/proc/{child.pid}/task").glob("*/schedstat")]
+        return 1e-9 * sum(int(text.split()[1]) for text in told)
+    except (OSError, IndexError, ValueError):
+        return 0.0
+
+
 def lines_of(command, folder, hang):
     """Lines that a child writes, then in words how it ended if that was no good end.
 
-    It is ended by silence of `hang` s of its own processor time, and by a longer one whatever it does.
+    It is ended by silence of `hang` s of its own processor time, and by a longer one in which it could have had one.
     """
     with (
         (folder / "errors").open("w") as errors,
         subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=errors) as child,
     ):
-        started, at, used, buffer = False, time.monotonic(), spent(child), b""
+        started, at, used, starved, buffer = False, time.monotonic(), spent(child), 0.0, b""
         os.set_blocking(child.stdout.fileno(), False)
         while True:
             got = child.stdout.read()
             if got:
-                started, at, used = True, time.monotonic(), spent(child)
+                started, at, used, starved = True, time.monotonic(), spent(child), waited(child)
                 *lines, buffer = (buffer + got).split(b"\n")
                 for line in lines:
                     yield line.decode()
@@ -103,7 +112,7 @@ def lines_of(command, folder, hang):
                 break
             # Python and NumPy are imported before the first line.
             elif (silent := time.monotonic() - at - (0 if started else 20)) > hang and (
-                silent > PATIENCE * hang or not spent(child) - used <= hang
+                silent - (waited(child) - starved) > PATIENCE * hang or not spent(child) - used <= hang
             ):
                 child.kill()
                 yield f"!took more than {hang:g} s"
@@ -434,6 +443,16 @@ def way_out(table):
     table.tried("signals in every line of the way out", tried)
 
 
+def loops(table, count):
+    """Controllers, shapers and a rig's loop with bad arguments."""
+    import strange
+
+    for name, wrong in strange.calls(random.Random(2), count):
+        if wrong is not None:
+            table.broken("calls of control and a rig's loop", f"{name}: {wrong}")
+    table.tried("calls of control and a rig's loop", count)
+
+
 class Table:
     """What was tried and what broke."""
 
@@ -458,7 +477,7 @@ class Table:
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--calls", type=int, default=1_300, help="calls of each entry of the extension")
-    parser.add_argument("--files", type=int, default=1_000, help="damaged files of each kind, a twentieth of parquet")
+    parser.add_argument("--files", type=int, default=1_000, help="damaged files of each kind, calls of control")
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--only-calls", action="store_true", help="nothing but calls of the extension")
     parser.add_argument("--only", default="", help="entries of the extension to call, with commas between")
@@ -486,6 +505,7 @@ def main():
         os.chdir(folder)
         if not given.only_calls:
             way_out(table)
+            loops(table, given.files)
             outputs(table, folder)
             files(table, folder, given.files)
             presses(table, folder)

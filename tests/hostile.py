@@ -6,6 +6,7 @@ word, an array or a list was exchanged.
 """
 
 import ast
+import functools
 import itertools
 import math
 import random
@@ -429,17 +430,11 @@ class Sound:
 
     # ------------------------------------------------------------------------------------------------------------- rig
 
-    def made_by(self, name, make):
-        """Arguments with which ftlm makes an object of the extension."""
-        with mock.patch.object(_core, name) as seen:
-            make()
-        return seen.call_args.args
-
     def guard_new(self):
-        return self.made_by("Guard", lambda: rig.Limits().guard(0.002, self.one(None, (0.01, 0.7))))
+        return of_guard(self.one(None, (0.01, 0.7)))
 
     def virtual_arm_new(self):
-        return self.made_by("VirtualArm", lambda: rig.ArmParameters.of("linear").arm(0.002, 1.0))
+        return of_arm()
 
     def reading(self):
         return [self.number(-1, 1) for _ in range(4)], [self.random.randrange(-99, 99), 7], [1, 1, 1, 1]
@@ -503,6 +498,24 @@ class Sound:
         if new or name not in self.kept or self.random.random() < 0.1:
             self.kept[name] = getattr(_core, name)(*getattr(self, f"{snake(name)}_new")())
         return self.kept[name]
+
+
+def made_by(name, make):
+    """Arguments with which ftlm makes an object of the extension."""
+    with mock.patch.object(_core, name) as seen:
+        make()
+    return seen.call_args.args
+
+
+# They are always the same, and to make them takes longer than a call.
+@functools.cache
+def of_guard(deflection):
+    return made_by("Guard", lambda: rig.Limits().guard(0.002, deflection))
+
+
+@functools.cache
+def of_arm():
+    return made_by("VirtualArm", lambda: rig.ArmParameters.of("linear").arm(0.002, 1.0))
 
 
 #: Entries whose last arguments are given by name.

@@ -21,18 +21,33 @@ SYSTEM = {
 }  # fmt: skip
 
 
+#: The whole C library of a Linux of a musllinux policy.
+MUSL = {"libc.so"}
+
+
+def met(found):
+    """The policy that a wheel meets, and libraries that it needs from outside."""
+    outside = set(found["external_libs"])
+    if "musllinux" in found["wheel"] and outside <= MUSL:
+        # A machine without musl does not have its C library, so that only symbols tell.
+        return found["sym_tag"], set()
+    return found["overall_tag"], outside
+
+
 def faults(found):
     """What is wrong with a wheel, in words."""
-    name, tag = found["wheel"], found["overall_tag"]
+    name, (tag, outside) = found["wheel"], met(found)
     claimed = name.removesuffix(".whl").rsplit("-", 1)[1].split(".")
-    needed = set(found["versioned_symbols"]) | set(found["external_libs"])
+    needed = set(found["versioned_symbols"]) | outside
     return [
         words
         for words, wrong in {
-            f"it meets {tag}, which is no manylinux policy": not tag.startswith("manylinux_2_"),
+            f"it meets {tag}, which is no policy of manylinux or musllinux": not tag.startswith(
+                ("manylinux_2_", "musllinux_1_")
+            ),
             f"it claims {', '.join(claimed)} and meets {tag}": tag not in claimed,
             f"it needs {', '.join(sorted(needed - SYSTEM))}": needed - SYSTEM,
-            f"outside the system it needs {', '.join(found['external_libs'])}": found["external_libs"],
+            f"outside the system it needs {', '.join(sorted(outside))}": outside,
             "it needs a newer processor than its tag says": found["unsupported_isa"],
             "it holds no extension": found["pure"],
         }.items()
@@ -74,4 +89,5 @@ if __name__ == "__main__":
     wrong = faults(found)
     if wrong:
         sys.exit(f"{found['wheel']}: {'; '.join(wrong)}")
-    print(f"{found['wheel']}: {found['overall_tag']}, needs {', '.join(sorted(found['versioned_symbols']))}")
+    needed = found["versioned_symbols"] or found["external_libs"]
+    print(f"{found['wheel']}: {met(found)[0]}, needs {', '.join(sorted(needed))}")

@@ -50,8 +50,8 @@ impl<'a> Catalogue<'a> {
         budget.add(records, output, &index, options, Bound::POOL);
         budget.check(options.memory)?;
         let spare = budget.left(options.memory);
-        let problem = Problem::new(records, output, index, fixed, options)?;
-        let problem = pool.install(|| problem.with_bound(lattice.count()));
+        let problem =
+            pool.install(|| Ok(Problem::new(records, output, index, fixed, options)?.with_bound(lattice.count())))?;
         let tables = tables(&lattice, &problem)?;
         Ok(Self { problem, lattice, options: options.clone(), spare, tables })
     }

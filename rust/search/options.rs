@@ -144,6 +144,14 @@ impl Options {
         matches!(self.estimator, Estimator::InstrumentalVariables(_))
     }
 
+    /// How many times another a row may weigh in the equations that give the coefficients.
+    pub(crate) fn weights(&self) -> usize {
+        match self.estimator {
+            Estimator::MultiInnovation(innovation) => innovation.length,
+            Estimator::LeastSquares | Estimator::InstrumentalVariables(_) => 1,
+        }
+    }
+
     /// Whether a candidate's score follows from the Gram matrix alone: the squared equation error at rest.
     pub(crate) fn scored_by_products(&self) -> bool {
         self.early_stopping

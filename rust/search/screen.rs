@@ -4,6 +4,9 @@ use crate::lanes::{self, WIDTH};
 use crate::search::bound::adapted::Weighted;
 use crate::search::candidate::columns::{part_of, Columns};
 use crate::search::candidate::normal::Solve;
+use crate::search::candidate::problem::Problem;
+use crate::search::candidate::squares::Squares;
+use crate::search::candidate::stretch::Shared;
 use crate::search::catalogue::Catalogue;
 use crate::search::lattice::cursor::Cursor;
 use crate::search::lattice::slab::Slab;
@@ -51,9 +54,19 @@ impl lanes::Kernel for Screening<'_> {
         if !catalogue.options.initial.follows_orders() {
             let mut screen = Screen::<WIDTH>::new(width);
             catalogue.positions(&cursor, &mut screen.terms);
-            while index + WIDTH as u64 <= hi {
-                screen.some(catalogue, &mut cursor, index, limit, &mut found);
-                index += WIDTH as u64;
+            let sharing = Sharing::of(catalogue, limit);
+            while index < hi {
+                let shared = sharing
+                    .as_ref()
+                    .and_then(|sharing| screen.stretch(catalogue, sharing, &mut cursor, (index, hi), &mut found));
+                if let Some(candidates) = shared {
+                    index += candidates;
+                } else if index + WIDTH as u64 <= hi {
+                    screen.some(catalogue, &mut cursor, index, limit, &mut found);
+                    index += WIDTH as u64;
+                } else {
+                    break;
+                }
             }
         }
         let mut screen = Screen::<1>::new(width);
@@ -63,6 +76,21 @@ impl lanes::Kernel for Screening<'_> {
             index += 1;
         }
         found
+    }
+}
+
+/// What stretches of candidates are judged by first, where squared equation errors rank.
+struct Sharing<'a> {
+    squares: &'a Squares,
+    limit: f64,
+}
+
+impl<'a> Sharing<'a> {
+    /// None where nothing would be excluded, or where coefficients are known.
+    fn of(catalogue: &'a Catalogue<'_>, limit: f64) -> Option<Self> {
+        let Problem { squares, equations, .. } = &catalogue.problem;
+        let squares = squares.as_ref().filter(|_| limit < f64::INFINITY && equations.whole().is_some())?;
+        Some(Self { squares, limit })
     }
 }
 
@@ -80,6 +108,8 @@ pub(crate) struct Screen<const L: usize> {
     own: Vec<Weighted>,
     /// The test vector made for a candidate that excluded one last.
     last: usize,
+    /// What is left of a stretch.
+    left: Vec<usize>,
 }
 
 impl<const L: usize> Screen<L> {
@@ -94,7 +124,46 @@ impl<const L: usize> Screen<L> {
             weights: Vec::new(),
             own: Vec::new(),
             last: 0,
+            left: Vec::new(),
         }
+    }
+
+    /// Screens the next candidates as far as they differ in one term alone: how many; none where they are few, or where
+    /// nothing is proved of them together.
+    #[inline(always)]
+    fn stretch(
+        &mut self,
+        catalogue: &Catalogue<'_>,
+        &Sharing { squares, limit }: &Sharing<'_>,
+        cursor: &mut Cursor<'_>,
+        (index, hi): (u64, u64),
+        found: &mut (Vec<Open>, Vec<u64>),
+    ) -> Option<u64> {
+        let (term, digit, len) = cursor.run()?;
+        let len = usize::try_from(hi - index).map_or(len, |all| len.min(all));
+        if len < L {
+            return None;
+        }
+        let columns = &catalogue.of_term(cursor, term)[digit..digit + len];
+        let shared = Shared::new(squares, &self.terms, term)?;
+        let mut left = std::mem::take(&mut self.left);
+        left.clear();
+        shared.open::<L>(columns, limit, &mut left);
+        for part in left.chunks(L) {
+            for (positions, &column) in self.positions.iter_mut().zip(&self.terms) {
+                *positions = Columns::one(column);
+            }
+            let mut at = [part[0]; L];
+            at[..part.len()].copy_from_slice(part);
+            let indices = at.map(|n| index + n as u64);
+            self.positions[term] = Columns::new(at.map(|n| columns[n]));
+            self.positions[term].compare();
+            self.judge(catalogue, indices, part.len(), limit, found);
+        }
+        self.left = left;
+        cursor.skip(len - 1);
+        catalogue.next(cursor, &mut self.terms);
+        Some(len as u64)
     }
 
     /// Screens the next L candidates.

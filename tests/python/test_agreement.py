@@ -214,6 +214,20 @@ def test_words_where_nothing_can_be_compared():
         ftlm.agreement(still, SECOND, threads=1)
 
 
+def test_what_cannot_be_meant_is_refused_in_words(same):
+    run = same.results[0].task.runs[0]
+    structure = ftlm.equation("D^alpha y = a0 y + b0 u")
+    for runs, options, words in (
+        (run, {"parts": np.complex64(2)}, "parts = np.complex64"),
+        (run, {"method": np.array(["output-error", "x"])}, "method = array"),
+        (run, {"method": "x" * 10**6}, "method = 'x{59}… is not known"),
+        (run, {"loss": ["huber"]}, r"loss = \['huber'\] is not known"),
+        (run, {"intervals": {}}, r"intervals = \{\} is not known"),
+    ):
+        with pytest.raises(ftlm.FtlmError, match=words):
+            ftlm.agreement(runs, structure, **options)
+
+
 def test_the_command(tmp_path):
     run = changing([40.0, 48.0])
     table = np.column_stack([np.arange(run.length) * run.step, run["u"], run["y"]])

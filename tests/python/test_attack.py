@@ -3,18 +3,23 @@
 import random
 import runpy
 import sys
+import time
+import warnings
 from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import ftlm
 import house
 from ftlm import _core
 
 TESTS = Path(__file__).resolve().parents[1]
 ATTACK = runpy.run_path(str(TESTS / "attack.py"))
 HOSTILE = runpy.run_path(str(TESTS / "hostile.py"))
+sys.path.insert(0, str(TESTS))
+import strange  # noqa: E402
 
 
 def test_every_entry_of_the_bindings_is_attacked():
@@ -57,6 +62,21 @@ def test_a_fit_is_not_asked_for_more_time_than_an_attack_waits():
         assert max(v for v in asked if isinstance(v, int)) == HOSTILE["MOST_EVALUATIONS"]
         assert any(not isinstance(v, int) for v in asked)
         assert any(isinstance(v, int) and v < 0 for v in asked)
+
+
+def test_calls_of_controllers_and_loops_end_in_an_answer_or_in_words():
+    assert [told for _, told in strange.calls(random.Random(7), 60) if told is not None] == []
+    assert all(strange.outcome(function, given) is None for function, given in strange.recipes().values())
+
+
+def test_what_is_no_answer_of_a_controller_is_seen():
+    def call(**given):
+        raise given["error"]
+
+    for error in (TypeError("x"), ftlm.ModelError(""), ftlm.ModelError("x" * 9999), ftlm.InternalError("a fault")):
+        assert strange.outcome(call, {"error": error}).startswith(type(error).__name__)
+    warns = strange.outcome(lambda: warnings.warn("overflow", RuntimeWarning, stacklevel=1), {})
+    assert warns == "RuntimeWarning: overflow"
 
 
 def test_hostile_calls_end_in_an_answer_or_in_words(tmp_path):
@@ -108,6 +128,16 @@ def test_a_panic_is_seen(tmp_path):
     (told, *_) = table.breaks[ATTACK["CALLS"]]
     assert "panic_on_purpose: InternalError: internal fault: on purpose" in told
     assert table.calls["metrics"]["calls"] == 20
+
+
+def test_a_process_that_others_leave_no_processor_does_not_hang(tmp_path, monkeypatch):
+    began = time.monotonic()
+    given = ATTACK["lines_of"].__globals__
+    monkeypatch.setitem(given, "PATIENCE", 5)
+    command = [sys.executable, "-c", "import os, time\nos.write(1, b'1\\n')\ntime.sleep(1.5)\nos.write(1, b'2\\n')"]
+    assert list(ATTACK["lines_of"](command, tmp_path, 0.1)) == ["1", "!took more than 0.1 s"]
+    monkeypatch.setitem(given, "waited", lambda child: time.monotonic() - began)
+    assert list(ATTACK["lines_of"](command, tmp_path, 0.1)) == ["1", "2"]
 
 
 @pytest.mark.parametrize(

@@ -141,6 +141,14 @@ REFUSED = [
     (lambda: control.input_shaper(POLE, "zvv"), "kind = 'zvv' is not known"),
     (lambda: control.input_shaper(POLE, modes_shaped=0), "modes_shaped = 0"),
     (lambda: control.input_shaper(POLE, modes_shaped="1"), "modes_shaped = '1'"),
+    (lambda: control.input_shaper(POLE, {"zv": 1}), "kind = {'zv': 1} is not known"),
+    (lambda: control.input_shaper(POLE, np.array(["zv", "zvd"])), "kind = array.* is not known"),
+    (lambda: control.input_shaper(POLE, "x" * 10**6), "kind = 'x{59}… is not known"),
+    (lambda: control.input_shaper(POLE, modes_shaped=10**5000), "an integer of 16610 bits are to be shaped"),
+    (lambda: control.input_shaper(POLE, modes_shaped=np.complex64(1)), "modes_shaped = np.complex64"),
+    (lambda: control.input_shaper(complex(-1e308, 1e308)), "does not swing"),
+    (lambda: control.input_shaper(10**400), "pole = an integer of 1329 bits does not swing"),
+    (lambda: control.input_shaper(None), "model is NoneType, not a Model"),
     (lambda: control.input_shaper(2 + 17j), "not stable"),
     (lambda: control.input_shaper(17j), "not stable"),
     (lambda: control.input_shaper(-3.0), "does not swing"),
@@ -150,6 +158,8 @@ REFUSED = [
     (lambda: control.input_shaper(POLE).impulses(0), "rate = 0"),
     (lambda: control.input_shaper(POLE).impulses(10.0), "fewer than four samples in a period"),
     (lambda: control.input_shaper(POLE).impulses("fast"), "rate = 'fast' is not a number"),
+    (lambda: control.input_shaper(POLE).impulses(1e8), r"the shaper 1.79e\+07 samples long; use at most 2.34e\+07 Hz"),
+    (lambda: control.input_shaper(POLE).impulses(1e308), "rate = 1e.308 Hz is not a positive number of samples"),
 ]
 
 
@@ -158,6 +168,25 @@ def test_what_is_no_shaper_is_refused(case):
     act, words = REFUSED[case]
     with pytest.raises(ftlm.ModelError, match=words):
         act()
+
+
+@pytest.mark.parametrize("rate", [93.7, 500.0])
+def test_a_reference_is_convolved_with_the_impulses(rate):
+    shaper = control.input_shaper(ftlm.Model(ftlm.equation("D^2 y = -300 y - 4 D^0.9 y + 300 u")), "zvd")
+    given = np.cumsum(np.random.default_rng(0).standard_normal((200, 2)), axis=0)
+    taps = shaper.impulses(rate)
+    naive = [np.convolve(column - column[0], taps)[:200] + column[0] for column in given.T]
+    assert shaper.filter(given, rate) == pytest.approx(np.column_stack(naive), rel=1e-13)
+    half = control.input_shaper(shaper.modes[0].pole).impulses(rate)
+    assert taps == pytest.approx(np.convolve(half, half), abs=1e-15)
+
+
+def test_a_long_shaper_takes_no_longer_than_it_lasts():
+    """Two million samples, of which all but nine are zero; each with each would be for hours."""
+    taps = control.input_shaper(POLE, "zvd").impulses(6e6)
+    assert 2_000_000 < len(taps) < 2_200_000
+    assert np.count_nonzero(taps) <= 9
+    assert taps.sum() == pytest.approx(1.0, abs=1e-14)
 
 
 @pytest.mark.parametrize("given", ["text", None, [], [1j], np.zeros((2, 2, 2)), [[1, 2], [3]]])
@@ -250,6 +279,13 @@ def test_models_that_cannot_be_designed_on_are_refused():
         (HUB, {"samples": -1}, "samples = -1"),
         (HUB, {"seed": "x"}, "seed = 'x'"),
         (HUB, {"coupling": "loose"}, "coupling = 'loose'"),
+        (HUB, {"coupling": np.array([1.0, 2.0])}, "coupling = array"),
+        (HUB, {"rate": 1e308}, "rate = 1e.308 Hz"),
+        (HUB, {"rate": np.complex64(500.0)}, "rate = np.complex64.* is not a number"),
+        (HUB, {"crossover": 1e-300}, "crossover = 1e-300 rad/s is outside"),
+        (HUB, {"output": np.array(["theta", "theta"])}, "output = array"),
+        (HUB, {"input": 10**5000}, "input = an integer of 16610 bits is not one"),
+        (HUB, {"seed": -(10**5000)}, "seed = an integer of 16610 bits"),
         ("D^2.9 y = -63 D^2 y + 140 u", {"phase_margin": 80.0}, "no fractional PID with gains from 0"),
     ):
         with pytest.raises(ftlm.ModelError, match=words):
@@ -335,6 +371,10 @@ def test_a_reset_forgets():
         ({"band": 3.0}, "no pair of frequencies"),
         ({"order": 0}, "order = 0"),
         ({"order": 51}, "order = 51"),
+        ({"band": (5e-324, 50.0)}, "at most 1e.09 times the lower"),
+        ({"band": 10**5000}, "no pair of frequencies"),
+        ({"rate": 1e308}, "rate = 1e.308"),
+        ({"order": 10**5000}, "order = an integer of"),
     ],
 )
 def test_what_cannot_be_realised_is_refused(options, words):
@@ -342,6 +382,37 @@ def test_what_cannot_be_realised_is_refused(options, words):
         control.Realised(PID, **{"rate": 500.0, **options})
     with pytest.raises(ftlm.ModelError, match="Realised or Lqg controllers"):
         control.HubLoops(PID)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ({"kp": math.nan}, "kp = nan is not a finite number"),
+        ({"ki": "2"}, "ki = '2' is not a number"),
+        ({"kd": 1 + 1j}, "kd = .* is not a number"),
+        ({"kd": np.array([1.0, 2.0])}, "kd = .* is not a number"),
+        ({"lam": 0.0}, "lam = 0 is no order"),
+        ({"lam": -0.5}, "lam = -0.5 is no order"),
+        ({"mu": 1e308}, "mu = 1e.308 is no order"),
+        ({"mu": 10**400}, "mu = an integer of"),
+        # What runs is of orders up to 1: another would be another controller.
+        ({"lam": 1.2}, "lam = 1.2 cannot be realised"),
+        ({"mu": 1.7}, "mu = 1.7 cannot be realised"),
+        ({"kd": 1e308}, "is not finite in its band"),
+        ({"kp": 0.0, "ki": 0.0, "kd": 0.0}, "is not finite in its band"),
+    ],
+)
+def test_what_is_no_controller_is_refused(numbers, words):
+    with pytest.raises(ftlm.ModelError, match=words):
+        control.Realised(control.FractionalPid(**{**dataclasses.asdict(PID), **numbers}), 500.0)
+
+
+@pytest.mark.parametrize("given", [None, 3.0, "pid", {}])
+def test_what_is_no_model_and_no_controller_is_named(given):
+    with pytest.raises(ftlm.ModelError, match="not a Model"):
+        control.fractional_pid(given, crossover=40.0)
+    with pytest.raises(ftlm.ModelError, match="no FractionalPid"):
+        control.Realised(given, 500.0)
 
 
 def test_a_designed_loop_runs_on_the_virtual_arm_and_holds_what_it_is_told():

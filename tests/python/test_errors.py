@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import ftlm
 from ftlm import _core
-from ftlm.base.checks import real_number, whole_number
+from ftlm.base.checks import real_number, shown, whole_number, words_of
 
 N = 65
 U = np.where(np.arange(N) % 20 < 10, 1.0, -1.0)
@@ -391,7 +391,7 @@ def test_families():
     [
         (3, 3), (0, 0), (-2, -2), (3.0, 3), (np.int8(5), 5), (np.float64(7), 7), (10**40, 10**40), (3.5, None),
         (True, None), ("3", None), (b"3", None), (None, None), (math.nan, None), (math.inf, None), ([3], None),
-        (3 + 0j, None),
+        (3 + 0j, None), (np.complex64(3), None), (np.bool_(True), None), (np.array(3), 3),
     ],
 )  # fmt: skip
 def test_whole_numbers(value, whole):
@@ -406,16 +406,31 @@ def test_real_numbers(value):
 
 
 @pytest.mark.parametrize(
-    ("value", "shown"),
+    ("value", "words"),
     [
         ("1", "'1'"), (None, "None"), (True, "True"), (1j, "1j"), ([1], "[1]"), (10**400, "an integer of 1329 bits"),
-        pytest.param(10**5000, "an integer of 16610 bits", id="beyond decimals"), ("x" * 200, "'" + "x" * 59),
+        pytest.param(10**5000, "an integer of 16610 bits", id="beyond decimals"), ("x" * 200, "'" + "x" * 59 + "…"),
+        (np.complex64(1), "np.complex64(1+0j)"), (np.array(1 + 2j), "array(1.+2.j)"), (np.bool_(True), "np.True_"),
     ],
 )  # fmt: skip
-def test_what_is_no_real_number_is_refused(value, shown):
+def test_what_is_no_real_number_is_refused(value, words):
     with pytest.raises(ftlm.ModelError) as refused:
         real_number("the step", value)
-    assert str(refused.value) == f"the step = {shown} is not a number; give one"
+    assert str(refused.value) == f"the step = {words} is not a number; give one"
+
+
+def test_what_others_say_is_shown_whatever_it_is():
+    class MuteError(Exception):
+        def __repr__(self):
+            raise ValueError
+
+        __str__ = __repr__
+
+    seen = [shown(v) for v in (1.5, -(10**5000), MuteError(), "\ud800")]
+    assert seen == ["1.5", "an integer of 16610 bits", "a MuteError", r"'\ud800'"]
+    assert shown("x" * 100, 10) == "'xxxxxxxxx…"
+    said = [words_of(e, 10) for e in (ValueError("why"), MuteError(), ValueError("\ud800"), ValueError("x" * 10**6))]
+    assert said == ["why", "what it says cannot be read", r"\ud800", "x" * 10 + "…"]
 
 
 # ----------------------------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """Controllers in the loop: what a good one is handed, and that a bad one ends at 0 V with its cause and its run."""
 
 import os
+import re
 import signal
 import time
 
@@ -100,6 +101,27 @@ def fails(bad):
     raise ZeroDivisionError("in the controller")
 
 
+class MuteError(Exception):
+    def __str__(self):
+        raise ValueError("no words")
+
+
+class Liar(list):
+    """A list of two that goes on."""
+
+    def __iter__(self):
+        return iter([0.0] * 5)
+
+
+class Unreadable(float):
+    def __float__(self):
+        raise ValueError("not now")
+
+
+def raises(error):
+    raise error
+
+
 BAD = {
     "nan": (lambda bad: (np.nan, 0.0), "returned nan for motor 1, not a finite current"),
     "infinite": (lambda bad: (0.0, -np.inf), "returned -inf for motor 2"),
@@ -116,6 +138,12 @@ BAD = {
     "texts": (lambda bad: ("0.1", "0.1"), "returned a str for motor 1"),
     "complex": (lambda bad: (0.1j, 0.0), "returned a complex for motor 1"),
     "exception": (fails, r"failed \(ZeroDivisionError: in the controller\)"),
+    # What is told of an error must neither fail by itself nor leave a file that cannot be read.
+    "mute": (lambda bad: raises(MuteError()), r"failed \(MuteError: what it says cannot be read\)"),
+    "endless": (lambda bad: raises(ValueError("x" * 10**7)), r"failed \(ValueError: x{500}…\)"),
+    "half a pair": (lambda bad: raises(ValueError("\ud800")), r"failed \(ValueError: \\ud800\)"),
+    "a liar": (lambda bad: Liar((0.1, 0.1)), r"returned cannot be read \(ValueError: "),
+    "a float of its own": (lambda bad: (Unreadable(0.1), 0.0), r"returned cannot be read \(ValueError: not now\)"),
 }
 
 
@@ -124,15 +152,17 @@ def test_a_bad_answer_is_0_v_at_once_with_its_cause_and_its_run(bench, tmp_path,
     answer, words = BAD[what]
     bad = Bad(answer)
     path = tmp_path / "run.csv"
-    with pytest.raises(ftlm.RigFault, match=f"at 0.1 s the controller .*{words}") as fault:
+    with pytest.raises(ftlm.RigFault, match=f"at 0.1 s .*the controller .*{words}") as fault:
         run_with(bench, bad, out=path)
     bench.assert_safe(within=153)
     assert bad.asked == 51
     loaded = ftlm.load(path)
     assert loaded.length == fault.value.run.length == 51
     assert np.array_equal(loaded["I1"], [0.0] + [0.2] * 50)
-    assert words.replace("\\", "") in loaded.about["faults"][0]
-    assert isinstance(fault.value.__cause__, ZeroDivisionError if what == "exception" else type(None))
+    assert re.search(words, loaded.about["faults"][0])
+    caused = {"exception": ZeroDivisionError, "mute": MuteError}
+    raised = ValueError if words.startswith((r"failed \(V", "returned cannot")) else type(None)
+    assert isinstance(fault.value.__cause__, caused.get(what, raised))
 
 
 def test_a_fault_of_the_rig_stays_the_rigs(bench, tmp_path):
@@ -247,6 +277,18 @@ REFUSED = [
     ({"reference": np.zeros((200, 2)), "rate": 0}, ftlm.ModelError, "rate = 0"),
     ({"reference": np.zeros((200, 2)), "watchdog": 0.0}, ftlm.ModelError, "watchdog = 0"),
     ({"reference": np.zeros((200, 2)), "rig": "q9"}, ftlm.ModelError, "'q9' is not known"),
+    ({"reference": range(1 << 40)}, ftlm.DataError, "no array of numbers"),
+    ({"reference": np.zeros((200, 2)), "rig": 10**5000}, ftlm.ModelError, "rig is a int"),
+    ({"reference": np.zeros((200, 2)), "rate": 10**5000}, ftlm.ModelError, "rate = an integer of"),
+    ({"reference": np.zeros((200, 2)), "watchdog": "0.1"}, ftlm.ModelError, "watchdog = '0.1' is not a number"),
+    ({"reference": np.zeros((200, 2)), "paced": None}, ftlm.ModelError, "paced = None is neither True nor False"),
+    ({"reference": np.zeros((200, 2)), "arm": "no"}, ftlm.ModelError, "arm = 'no' is neither True nor False"),
+    ({"reference": np.zeros((200, 2)), "progress": 5}, ftlm.ModelError, "progress is a int"),
+    ({"reference": np.zeros((200, 2)), "offset": "ab"}, ftlm.ModelError, "offset = 'ab' is not a pair"),
+    ({"reference": np.zeros((200, 2)), "offset": 0.1}, ftlm.ModelError, "offset = 0.1 is not a pair"),
+    ({"reference": np.zeros((200, 2)), "parameters": np.zeros(2)}, ftlm.ModelError, "parameters is a ndarray"),
+    ({"reference": np.zeros((200, 2)), "sensor_filter": np.zeros(2)}, ftlm.ModelError, "sensor_filter = array"),
+    ({"reference": np.zeros((200, 2)), "name": 10**5000}, ftlm.DataError, "an integer of .* cannot name a run"),
     ({"reference": np.zeros((200, 2)), "name": ""}, ftlm.DataError, "cannot name a run"),
     ({"reference": np.zeros((200, 2)), "out": "run.xlsx"}, ftlm.DataError, "neither .csv nor .parquet"),
 ]
@@ -259,16 +301,43 @@ def test_what_no_loop_can_be_run_with_is_refused_before_anything_moves(case):
         rig.control(**{"controller": proportional, **options})
 
 
-def test_a_controller_that_cannot_be_told_of_is_refused():
-    class Odd:
-        def to_dict(self):
-            return {"x": np.nan}
+class Telling:
+    def __init__(self, told):
+        self.told = told
 
-        def __call__(self, time, angles, reference):
-            return 0.0, 0.0
+    def to_dict(self):
+        return self.told
 
-    with pytest.raises(ftlm.ModelError, match="no JSON"):
-        rig.control(Odd(), (0, 0), duration=0.1)
+    def __call__(self, time, angles, reference):
+        return 0.0, 0.0
+
+
+def nested(depth):
+    told = {}
+    for _ in range(depth):
+        told = {"x": told}
+    return told
+
+
+@pytest.mark.parametrize(
+    ("told", "words"),
+    [
+        ({"x": np.nan}, "no JSON"),
+        ({"x": 10**5000}, "no JSON"),
+        (nested(10**5), "no JSON"),
+        # What stands in a file must be read again: the line that holds it has its limit.
+        ({"x": "x" * 10**6}, "1000042 characters long, more than the 100000"),
+    ],
+)
+def test_a_controller_that_cannot_be_told_of_is_refused(told, words):
+    with pytest.raises(ftlm.ModelError, match=words):
+        rig.control(Telling(told), (0, 0), duration=0.1)
+
+
+def test_whatever_a_controller_says_is_read_again(tmp_path):
+    told = {"half a pair \ud800": "\udfff", "mark\n# ftlm-run 9 {}": "\x1b]0;x\x07\0</script>"}
+    rig.control(Telling(told), (0, 0), duration=0.02, out=tmp_path / "run.csv")
+    assert ftlm.load(tmp_path / "run.csv").about["control"]["controller"]["settings"] == told
 
 
 def test_the_board_needs_arm(monkeypatch):

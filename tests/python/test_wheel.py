@@ -9,6 +9,7 @@ import tomllib
 import zipfile
 from pathlib import Path
 
+import pytest
 import yaml
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -43,6 +44,36 @@ def test_the_check_of_a_wheel_ends_with_its_verdict(tmp_path):
                 wheel.writestr(f"a/{name}", "free")
         done = subprocess.run(call, capture_output=True, text=True, timeout=60, check=False)
         assert (done.returncode, done.stdout, done.stderr) == (code, "", told)
+
+
+SHOWN = {
+    "wheel": "ftlm-1-cp311-abi3-manylinux2014_x86_64.manylinux_2_17_x86_64.whl", "overall_tag": "manylinux_2_17_x86_64",
+    "sym_tag": "manylinux_2_17_x86_64", "versioned_symbols": {"libc.so.6": ["GLIBC_2.17"]}, "external_libs": {},
+    "unsupported_isa": False, "pure": False,
+}  # fmt: skip
+#: As auditwheel tells it on a machine whose C library is another one.
+SHOWN_MUSL = {
+    **SHOWN, "wheel": "ftlm-1-cp311-abi3-musllinux_1_2_x86_64.whl", "overall_tag": "linux_x86_64",
+    "sym_tag": "musllinux_1_2_x86_64", "versioned_symbols": {}, "external_libs": {"libc.so": None},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "shown", [SHOWN, SHOWN_MUSL, {**SHOWN_MUSL, "overall_tag": "musllinux_1_2_x86_64", "external_libs": {}}]
+)
+def test_a_wheel_that_meets_its_tag_is_good_and_any_other_is_not(shown):
+    def wrong(**changed):
+        return "; ".join(WHEEL["faults"]({**shown, **changed}))
+
+    assert wrong() == ""
+    lowest = "musllinux_1_2" if "musl" in shown["wheel"] else "manylinux_2_17"
+    other = shown["wheel"].replace(lowest, f"{lowest[:-1]}9").replace("manylinux2014", "linux")
+    assert "it claims" in wrong(wheel=other)
+    assert "no policy" in wrong(overall_tag="linux_x86_64", sym_tag="linux_x86_64")
+    assert "libssl.so.3" in wrong(external_libs={"libssl.so.3": None, "libc.so": None})
+    assert "libssl.so.3" in wrong(versioned_symbols={"libssl.so.3": []})
+    assert "newer processor" in wrong(unsupported_isa=True)
+    assert "no extension" in wrong(pure=True)
 
 
 def test_linked_is_what_normal_dependencies_reach():

@@ -7,6 +7,7 @@ use ftlm::estimate::least_squares::{self, Regression};
 use ftlm::estimate::multi_innovation::{closed_form, recursion, Innovation, Rows};
 use ftlm::lanes::{self, WIDTH};
 use ftlm::regressors::{Bank, Index, Key, Record, BANK_LIMIT};
+use ftlm::search::threads::pool;
 use ftlm::small::{self, packed};
 use ftlm::{haar, series, simulate};
 use proptest::prelude::*;
@@ -388,9 +389,27 @@ fn banks_hold_the_integrals() {
         assert_eq!(index.insert(Key::integral(2, 1.35)), 3);
         assert_eq!(index.get(Key::integral(0, 0.9)), Some(0));
         assert_eq!(index.get(Key::integral(1, 0.9)), None);
-        assert_eq!(index.keys().len(), 4);
+        // An order that several signals share, a derivative, an order 0 of the output itself.
+        let shared: Vec<usize> = (0..3).map(|signal| index.insert(Key::integral(signal, 0.55))).collect();
+        assert_eq!(shared, [4, 5, 6]);
+        let (steep, plain) = (index.insert(Key::integral(2, -0.3)), index.insert(Key::integral(0, 0.0)));
+        assert_eq!(index.keys().len(), 9);
         let bank = Bank::new(&index, &record, 0).unwrap();
-        assert_eq!((bank.len(), bank.is_empty()), (4, false));
+        assert_eq!((bank.len(), bank.is_empty()), (9, false));
+        for (signal, &place) in shared.iter().enumerate() {
+            assert!(relative_distance(bank.column(place), &record.integral(signal, 0.55)) < 1e-14);
+        }
+        assert!(relative_distance(bank.column(steep), &record.integral(2, -0.3)) < 1e-14);
+        assert_eq!(bank.column(plain), record.signal(0));
+        assert_eq!(bank.kernel(shared[0]), ftlm::kernels::block_pulse_kernel(0.55, 200, 0.02));
+        assert_eq!((bank.kernel(plain)[0], bank.kernel(plain)[1]), (1.0, 0.0));
+        assert!([5, 6, 7].iter().all(|&p| bank.kernel(p).is_empty()));
+        for threads in [1, 3] {
+            let same = pool(threads).unwrap().install(|| Bank::new(&index, &record, 0)).unwrap();
+            for p in 0..bank.len() {
+                assert_eq!((same.column(p), same.kernel(p)), (bank.column(p), bank.kernel(p)), "{threads} threads");
+            }
+        }
         assert!(relative_distance(bank.column(0), &record.integral(0, 0.9)) < 1e-14);
         assert_eq!(bank.column(1), record.signal(1));
         assert_eq!(bank.column(2), record.initial_term(0.9));

@@ -2,6 +2,7 @@
 
 use ftlm::error::Error;
 use ftlm::kernels::block_pulse_kernel;
+use ftlm::search::threads::pool;
 use ftlm::{dense, haar, operational, series};
 use proptest::prelude::*;
 
@@ -150,16 +151,22 @@ fn dense_products_match_sums() {
 #[test]
 fn gram_matrices_and_triangular_factors() {
     let mut random = Random::new(24);
-    for (k, m) in [(1, 5), (4, 100), (6, 6), (5, 3)] {
+    for (k, m) in [(1, 5), (4, 100), (6, 6), (5, 3), (131, 20), (3, 40_000)] {
         let columns: Vec<Vec<f64>> = (0..k).map(|_| random.signal(m)).collect();
         let borrowed: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
-        let gram = dense::gram(&borrowed);
+        let (target, others) = columns.split_last().unwrap();
+        let gram = dense::gram(&others.concat(), target);
+        let three = pool(3).unwrap();
+        assert_eq!(three.install(|| dense::gram(&others.concat(), target)), gram);
+        let products = dense::inner_products(&borrowed, &borrowed[..2.min(k)]);
+        assert_eq!(three.install(|| dense::inner_products(&borrowed, &borrowed[..2.min(k)])), products);
         let r = dense::triangular_factor(&columns);
         for i in 0..k {
             for j in 0..k {
                 let sum: f64 = columns[i].iter().zip(&columns[j]).map(|(x, y)| x * y).sum();
                 assert!((gram[i * k + j] - sum).abs() < 1e-13 * m as f64);
                 assert_eq!(gram[i * k + j].to_bits(), gram[j * k + i].to_bits());
+                assert!(j > 1 || (products[i * 2.min(k) + j] - sum).abs() < 1e-13 * m as f64);
                 // RᵀR is the Gram matrix whatever the signs in R.
                 let square: f64 = (0..k).map(|l| r[l * k + i] * r[l * k + j]).sum();
                 assert!((square - sum).abs() < 1e-13 * m as f64);

@@ -283,6 +283,43 @@ fn the_band_of_a_sine_is_its_frequency() {
     assert!((power_frequency(&sine, 0.01) / 12.0 - 1.0).abs() < 0.05);
 }
 
+/// Three terms of one input whose orders lie this far apart, and an own one: regressors and instruments that are nearly
+/// alike.
+fn alike(apart: f64) -> Equation {
+    equation(0, 1.5, &[(0, 0.0, -9.0), (1, 0.3, 2.0), (1, 0.3 + apart, -1.0), (1, 0.3 + 2.0 * apart, 0.5)])
+}
+
+#[test]
+fn nearly_equal_regressors_cost_their_condition_once() {
+    for (apart, allowed) in [(0.1, 1e-12), (1e-3, 1e-9), (1e-4, 1e-7)] {
+        let model = alike(apart);
+        // One record, and two: a column over all of them for each term.
+        for seeds in [&[61][..], &[61, 62]] {
+            let records: Vec<Record> = seeds.iter().map(|&seed| measured(&model, 400, &[], 0.0, seed).1).collect();
+            let settings = Settings { iterations: 1, tolerance: 0.0 };
+            let structures = std::slice::from_ref(&model.structure);
+            let found = fit(&records, structures, &[FREE.to_vec()], &Initial::Rest, settings).unwrap();
+            let by_factor = least_squares::fit(&records, &model.structure, &FREE, &Initial::Rest).unwrap();
+            let (ours, theirs) = (&found.estimates[0].coefficients, &by_factor.coefficients);
+            // Exact data: their instruments give the truth, as far as rounding lets a QR factorisation find it.
+            check(&format!("orders {apart} apart, factor"), relative_distance(theirs, &model.coefficients), allowed);
+            check(&format!("orders {apart} apart"), relative_distance(ours, &model.coefficients), allowed);
+        }
+    }
+}
+
+#[test]
+fn an_unknown_that_one_record_alone_has_leaves_the_others_theirs() {
+    let model = link();
+    let started = [(0.0, 0.4), (0.9, -0.2)];
+    let (one, _) = measured(&model, 300, &started, 0.0, 63);
+    let (two, _) = measured(&model, 260, &[], 0.0, 64);
+    let together = run(&[one.clone(), two.clone()], &model, &FREE, &Initial::Powers(vec![0.0, 0.9]));
+    check("two records, one of them in motion", relative_distance(&together, &model.coefficients), 1e-8);
+    let other = run(&[two, one], &model, &FREE, &Initial::Powers(vec![0.0, 0.9]));
+    check("the other way round", relative_distance(&other, &together), 1e-8);
+}
+
 #[test]
 fn instruments_that_say_nothing_are_refused() {
     let model = link();

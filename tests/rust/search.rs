@@ -328,6 +328,34 @@ fn early_stopping_and_threads_change_nothing() {
 }
 
 #[test]
+fn stretches_of_one_term_rank_as_brute_force_does() {
+    let (mut bounded, mut candidates) = (0, 0);
+    for seed in 300..312 {
+        let mut problem = random_problem(seed);
+        let mut random = Random::new(seed);
+        let grain = [0.05, 0.04, 1e-4][seed as usize % 3];
+        let own = [axis(0, &range(0.0, 25.0 * grain, grain), true), axis(0, &range(0.0, 20.0 * grain, grain), true)];
+        let others = [axis(1, &range(0.0, 40.0 * grain, grain), false), axis(2, &[-0.3, 0.0], false)];
+        // What changes last is the only term of its signal, or the second of two of one, where some pairs are left out.
+        let axes = if random.chance(0.5) { [&own[..], &others[..]] } else { [&others[1..], &own[..]] }.concat();
+        problem.lattice = Lattice::new(0, &[1.0, 1.4, 1.75], &axes, |s| s == 2).unwrap();
+        problem.fixed = vec![None; axes.len()];
+        let options = &mut problem.options;
+        (options.criterion, options.norm, options.initial) = (Criterion::EquationError, Norm::L2, Initial::Rest);
+        let brute = problem.run(|o| o.early_stopping = false);
+        let one = problem.run(|_| {});
+        assert_eq!(one.rows, brute.rows, "seed {seed}");
+        assert_eq!(one.counts.singular, brute.counts.singular, "seed {seed}");
+        assert_eq!(one.failures, brute.failures, "seed {seed}");
+        assert_eq!(problem.run(|o| o.threads = 3), one, "seed {seed}");
+        bounded += one.counts.bounded;
+        candidates += one.counts.candidates;
+    }
+    println!("of {candidates} candidates {bounded} excluded");
+    assert!(bounded > candidates / 2);
+}
+
+#[test]
 fn every_candidate_matches_its_naive_evaluation() {
     let (mut worst, mut worst_coefficient, mut compared) = (0.0_f64, 0.0_f64, 0);
     for seed in 200..230 {

@@ -10,11 +10,48 @@ from ftlm.base.errors import DataError, ModelError
 
 #: Environment variable that gives the threads of what does not say its own.
 THREADS = "FTLM_THREADS"
+#: Kinds of NumPy's numbers that a real number may be; `float` of others drops their imaginary part, or counts days.
+_REAL = frozenset("fiuO")
+
+
+def shown(value: object, most: int = 60) -> str:
+    """Return a value as an error message shows it, whatever it is: cut off, and long integers by their length."""
+    if type(value) is int and value.bit_length() > 3 * most:
+        # A long integer has no decimal form in Python.
+        return f"an integer of {value.bit_length()} bits"
+    try:
+        text = repr(value)
+    except Exception:
+        return f"a {type(value).__name__}"
+    return text if len(text) <= most else f"{text[:most]}…"
+
+
+def words_of(error: BaseException, most: int = 500) -> str:
+    """Return what an error of somebody else's says: cut off, in characters that a file can hold."""
+    try:
+        text = str(error)
+    except Exception:
+        return "what it says cannot be read"
+    return (text if len(text) <= most else f"{text[:most]}…").encode("utf-8", "backslashreplace").decode()
+
+
+def check_choice(name: str, value: object, known: Iterable[str]) -> None:
+    """Refuse anything but one of some words."""
+    words = list(known)
+    if not isinstance(value, str) or value not in words:
+        raise ModelError(f"{name} = {shown(value)} is not known; use {' or '.join(map(repr, words))}")
+
+
+def _is_number(value: object) -> bool:
+    """Whether a value may be a real number; a complex one is none, whatever its imaginary part."""
+    if isinstance(value, (str, bytes, bytearray, bool, complex)):
+        return False
+    return getattr(getattr(value, "dtype", None), "kind", "f") in _REAL
 
 
 def whole_number(value: object) -> int | None:
     """Return a value that is a whole number as an int, anything else as None; the message is the caller's."""
-    if isinstance(value, (str, bytes, bytearray, bool)):
+    if not _is_number(value):
         return None
     try:
         number = int(value)  # type: ignore[call-overload]
@@ -37,16 +74,14 @@ def real_number(name: str, value: object) -> float:
     Raises
     ------
     ModelError
-        Text, nothing, a truth value, or an integer beyond the range of floating point.
+        Text, nothing, a truth value, a complex number, or an integer beyond the range of floating point.
     """
     try:
-        if isinstance(value, (str, bytes, bytearray, bool)):
+        if not _is_number(value):
             raise TypeError
         return float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError):
-        # A long integer has no decimal form in Python.
-        shown = f"an integer of {value.bit_length()} bits" if type(value) is int else f"{value!r}"[:60]
-        raise ModelError(f"{name} = {shown} is not a number; give one") from None
+        raise ModelError(f"{name} = {shown(value)} is not a number; give one") from None
 
 
 def listed(names: Iterable[object], most: int = 40) -> str:

@@ -9,12 +9,15 @@ from typing import Any, Literal
 import numpy as np
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import real_number, whole_number
+from ftlm.base.checks import real_number, shown, whole_number
 from ftlm.base.errors import ModelError
+from ftlm.control.names import checked_rate
 from ftlm.solve.approximation import LARGEST_ORDER, oustaloup
 
 #: Poles reach this many times beyond the band on both sides.
 REACH = 30.0
+#: Widest band, high over low.
+WIDEST = 1e9
 #: Frequencies at which the error is measured.
 COMPARED = 200
 
@@ -28,7 +31,12 @@ class FractionalPid:
     kp, ki, kd
         Gains, of the controller's output over the error.
     lam, mu
-        Orders of the integral and of the derivative.
+        Orders of the integral and of the derivative, above 0 and at most 2.
+
+    Raises
+    ------
+    ModelError
+        A gain that is no finite number, an order out of range.
     """
 
     kp: float
@@ -36,6 +44,15 @@ class FractionalPid:
     kd: float
     lam: float
     mu: float
+
+    def __post_init__(self) -> None:
+        for name in ("kp", "ki", "kd", "lam", "mu"):
+            value = real_number(name, getattr(self, name))
+            if not math.isfinite(value):
+                raise ModelError(f"{name} = {value:g} is not a finite number; give one")
+            if name in ("lam", "mu") and not 0 < value <= 2:
+                raise ModelError(f"{name} = {value:g} is no order of a fractional PID; give one above 0, at most 2")
+            object.__setattr__(self, name, value)
 
     def response(self, w: Floats | Complex) -> Complex:
         """Exact response at frequencies above 0 [rad/s]."""
@@ -76,7 +93,7 @@ class Realised:
     Parameters
     ----------
     pid
-        The controller.
+        The controller, of orders up to 1.
     rate
         Samples per second.
     limit
@@ -89,37 +106,46 @@ class Realised:
     Raises
     ------
     ModelError
-        A rate, limit, band or order that is none.
+        A controller whose orders exceed 1 or whose gains leave floating point, a rate, limit, band or order that is
+        none.
     """
 
     def __init__(
         self, pid: FractionalPid, rate: float, *, limit: float = math.inf, band: tuple[float, float] | None = None,
         order: int = 6,
     ) -> None:  # fmt: skip
-        value = real_number("rate", rate)
-        if not (math.isfinite(value) and value > 0):
-            raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
+        if not isinstance(pid, FractionalPid):
+            raise ModelError(f"pid is a {type(pid).__name__}, no FractionalPid; tune one, or write its five numbers")
+        for name, given in (("lam", pid.lam), ("mu", pid.mu)):
+            if given > 1:
+                raise ModelError(f"{name} = {given:g} cannot be realised; give a controller whose orders are at most 1")
+        value = checked_rate(rate)
         most = real_number("limit", limit)
         if not most > 0:
-            raise ModelError(f"limit = {limit!r} is not a number above 0")
+            raise ModelError(f"limit = {shown(limit)} is not a number above 0")
         half = math.pi * value
         if band is None:
             band = (half / 1000.0, half / 8.0)
         try:
             low, high = (real_number("band", b) for b in band)
         except (TypeError, ValueError):
-            raise ModelError(f"band = {band!r} is no pair of frequencies; give (low, high) in rad/s") from None
-        if not (math.isfinite(low) and 0 < low < high <= half):
-            raise ModelError(f"band = ({low:g}, {high:g}) rad/s is no interval up to half the rate, {half:g} rad/s")
+            raise ModelError(f"band = {shown(band)} is no pair of frequencies; give (low, high) in rad/s") from None
+        if not (0 < low < high <= half and high <= WIDEST * low):
+            raise ModelError(
+                f"band = ({low:g}, {high:g}) rad/s is no interval up to half the rate, {half:g} rad/s, whose upper end "
+                f"is at most {WIDEST:g} times the lower"
+            )
         count = whole_number(order)
         if count is None or not 1 <= count <= LARGEST_ORDER:
-            raise ModelError(f"order = {order!r} is no whole number from 1 to {LARGEST_ORDER}")
+            raise ModelError(f"order = {shown(order)} is no whole number from 1 to {LARGEST_ORDER}")
         self.pid, self.rate, self.limit, self.band, self.order = pid, value, most, (low, high), count
         reach = (low / REACH, high * REACH)
         self._integral = _bank(pid.ki, *_integral(pid.lam, reach, count), 1.0 / value)
         self._derivative = _bank(pid.kd, *_power(pid.mu, reach, count), 1.0 / value)
         #: Largest errors over the band against the exact controller [dB], [degrees].
         self.gain_error, self.phase_error = self._errors()
+        if not math.isfinite(self.gain_error + self.phase_error):
+            raise ModelError(f"{pid} is not finite in its band; give gains within floating point, one not 0")
         self.reset()
 
     @property
@@ -177,8 +203,9 @@ class Realised:
 
     def _errors(self) -> tuple[float, float]:
         w = np.geomspace(*self.band, COMPARED)
-        quotient = self.response(w) / self.pid.response(w)
-        gain = float(np.max(np.abs(20.0 * np.log10(np.abs(quotient)))))
+        with np.errstate(all="ignore"):
+            quotient = self.response(w) / self.pid.response(w)
+            gain = float(np.max(np.abs(20.0 * np.log10(np.abs(quotient)))))
         return gain, float(np.degrees(np.max(np.abs(np.angle(quotient)))))
 
     def to_dict(self) -> dict[str, Any]:
@@ -222,4 +249,5 @@ def _bank(factor: float, poles: Floats, residues: Floats, direct: float, step: f
     mean = np.where(small, 1.0 - x / 2.0, -np.expm1(-safe) / safe)
     now = step * np.where(small, 0.5, (1.0 - mean) / safe)
     before = step * np.where(small, 0.5, (mean - keeps) / safe)
-    return _Bank(factor * direct, factor * residues, keeps, now, before)
+    with np.errstate(over="ignore"):
+        return _Bank(factor * direct, factor * residues, keeps, now, before)

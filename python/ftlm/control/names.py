@@ -8,8 +8,21 @@ from collections.abc import Sequence
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import nearest, real_number
+from ftlm.base.checks import nearest, real_number, shown
 from ftlm.base.errors import ModelError
+
+#: Rates of a loop [Hz]: beyond, floating point tells no margins.
+RATES = (1e-9, 1e9)
+
+
+def checked_rate(rate: object) -> float:
+    """Samples per second of a loop, as a number."""
+    value = real_number("rate", rate)
+    if not RATES[0] <= value <= RATES[1]:
+        raise ModelError(
+            f"rate = {shown(rate)} Hz is not a positive number of samples per second from {RATES[0]:g} to {RATES[1]:g}"
+        )
+    return value
 
 
 def names_of(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -> tuple[str, ...]:

@@ -9,12 +9,13 @@ from typing import Any, Literal
 import numpy as np
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import nearest, real_number, whole_number
+from ftlm.base.checks import nearest, real_number, shown, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.control.fractional import FractionalPid, Realised
 from ftlm.control.margins import Margins, Plant, grid, margins_of, margins_told
-from ftlm.data.solved import Solved
-from ftlm.solve.frequency import check_unlimited, model_numbers, response_inputs
+from ftlm.control.names import checked_rate
+from ftlm.data.solved import Solved, check_solved
+from ftlm.solve.frequency import check_unlimited, is_coupled, model_numbers, response_inputs
 from ftlm.solve.records import check_linear
 
 #: Orders that are tried: of the integral and of the derivative, first over all, then around the best.
@@ -30,6 +31,8 @@ SLOW = 0.1
 BROKEN = 0.05
 #: A sample keeps a design whose phase margin is at least this share of what was asked for.
 KEPT = 0.5
+#: The lowest crossover as a share of its rate: below, floating point tells no margins.
+SLOWEST = 1e-6
 #: Gains of the plant over which flatness is told.
 FLAT = (0.7, 1.4)
 
@@ -146,19 +149,19 @@ def fractional_pid(
     """
     plant = plant_of(model, output, input, rate, coupling, sensor=sensor)
     wc = real_number("crossover", crossover)
-    if not (math.isfinite(wc) and 0 < wc < math.pi * plant.rate / 4):
+    if not SLOWEST * plant.rate <= wc < math.pi * plant.rate / 4:
         raise ModelError(
-            f"crossover = {crossover!r} rad/s is outside (0, {math.pi * plant.rate / 4:.4g}), an eighth of the rate of "
-            f"{plant.rate:g} Hz"
+            f"crossover = {shown(crossover)} rad/s is outside [{SLOWEST * plant.rate:.4g}, "
+            f"{math.pi * plant.rate / 4:.4g}), from a millionth to an eighth of the rate of {plant.rate:g} Hz"
         )
     asked = real_number("phase_margin", phase_margin)
     if not 10 <= asked <= 80:
-        raise ModelError(f"phase_margin = {phase_margin!r} degrees is outside [10, 80]")
+        raise ModelError(f"phase_margin = {shown(phase_margin)} degrees is outside [10, 80]")
     count, start = whole_number(samples), whole_number(seed)
     if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {samples!r} is no whole number from 0 to 10000")
+        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
     if start is None or start < 0:
-        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
+        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
     plant.check_stable()
     drawn = plant.samples(count, start)
     target = np.exp(1j * (math.radians(asked) - math.pi)) / plant.response(np.array([wc]))[0]
@@ -206,30 +209,26 @@ def plant_of(
     model: Solved, output: str | None, driver: str | None, rate: float, coupling: str, *, sensor: bool
 ) -> Plant:
     """The input and output that are meant, or a refusal."""
+    check_solved(model)
     if not isinstance(sensor, bool):
-        raise ModelError(f"sensor = {sensor!r} is neither True nor False")
+        raise ModelError(f"sensor = {shown(sensor)} is neither True nor False")
     check_linear(model.equations, "a loop's margin")
     check_unlimited(model, "a loop's margin")
-    if coupling not in ("simulated", "measured"):
-        raise ModelError(f"coupling = {coupling!r} is not known; use 'simulated' or 'measured'")
-    inputs = response_inputs(model, coupled=coupling == "simulated")
+    inputs = response_inputs(model, coupled=is_coupled(coupling))
     names = []
     for what, name, known in (("output", output, model.outputs), ("input", driver, inputs)):
         if name is None and len(known) == 1:
             names.append(known[0])
         elif name is None:
             raise ModelError(f"the model has several {what}s: say which, {what}=…; it has {', '.join(known)}")
-        elif name not in known:
+        elif not isinstance(name, str) or name not in known:
+            near = nearest(name, known) if isinstance(name, str) else ""
             raise ModelError(
-                f"{what} = {name!r} is not one of the model's{nearest(name, known)}; it has "
-                f"{', '.join(known) or 'none'}"
+                f"{what} = {shown(name)} is not one of the model's{near}; it has {', '.join(known) or 'none'}"
             )
         else:
             names.append(name)
-    value = real_number("rate", rate)
-    if not (math.isfinite(value) and value > 0):
-        raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
-    return Plant(model, names[0], names[1], value, coupling, sensor)
+    return Plant(model, names[0], names[1], checked_rate(rate), coupling, sensor)
 
 
 def _best(target: complex, slope: float, wc: float, w: Floats, curves: Complex) -> FractionalPid | None:

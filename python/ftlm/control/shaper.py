@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import reduce
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import real_number, whole_number
+from ftlm.base.checks import check_choice, shown, whole_number
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.statistics import NORMAL_95
+from ftlm.control.names import checked_rate
 from ftlm.data.solved import Solved
 from ftlm.paint.text import with_error
 from ftlm.solve.modes import Mode, modes
@@ -22,6 +22,9 @@ from ftlm.solve.modes import Mode, modes
 KINDS = {"zv": 1, "zvd": 2}
 #: A shaper that may leave more than this share of the vibration within the intervals of its poles is no design.
 WIDEST = 0.2
+#: Most samples that a shaper may last, and poles that it may be made for [rad/s].
+LONGEST = 1 << 22
+POLES = (1e-12, 1e12)
 #: Values of frequency and damping each, of a grid over their intervals.
 GRID = 9
 
@@ -66,18 +69,26 @@ class Shaper:
         Raises
         ------
         ModelError
-            A rate that is none, or with fewer than four samples a period of a mode.
+            A rate that is none, with fewer than four samples a period of a mode, or so high that the shaper lasts for
+            millions of them.
         """
-        rate = _rate(rate)
-        parts = []
+        rate = checked_rate(rate)
+        if self.delay * rate > LONGEST:
+            raise ModelError(
+                f"rate = {rate:g} Hz makes the shaper {self.delay * rate:.3g} samples long; use at most "
+                f"{LONGEST / self.delay:.3g} Hz"
+            )
+        taps = np.ones(1)
         for mode in self.modes:
             if mode.pole.imag * 2.0 > math.pi * rate:
                 raise ModelError(
                     f"rate = {rate:g} Hz has fewer than four samples in a period of the mode at "
                     f"{mode.frequency:.4g} rad/s; use at least {2.0 * mode.pole.imag / math.pi:.3g} Hz"
                 )
-            parts += [_sampled(mode, 1.0 / rate)] * KINDS[self.kind]
-        return np.asarray(reduce(np.convolve, parts), dtype=np.float64)
+            part = _sampled(mode, 1.0 / rate)
+            for _ in range(KINDS[self.kind]):
+                taps = _through(np.append(taps, np.zeros(len(part) - 1)), part)
+        return taps
 
     def filter(self, reference: ArrayLike, rate: float) -> Floats:
         """A reference, or an input, of one row a sample at a rate [Hz] through the shaper; it is as long as before.
@@ -104,7 +115,7 @@ class Shaper:
             raise DataError(f"reference is not finite at row {bad[0]} ({bad.size} such rows in all)")
         taps = self.impulses(rate)
         rest = x[0]
-        shaped = np.column_stack([np.convolve(column, taps)[: len(x)] for column in (x - rest).T]) + rest
+        shaped = np.column_stack([_through(column, taps) for column in (x - rest).T]) + rest
         return np.asarray(shaped.reshape(given.shape), dtype=np.float64)
 
     def to_dict(self) -> dict[str, Any]:
@@ -153,13 +164,12 @@ def input_shaper(
     Singer and Seering (1990), doi:10.1115/1.2894142. A fractional model has a power of time beside its swings, which no
     shaper cancels; it is no vibration.
     """
-    if kind not in KINDS:
-        raise ModelError(f"kind = {kind!r} is not known; use {' or '.join(map(repr, KINDS))}")
+    check_choice("kind", kind, KINDS)
     count = whole_number(modes_shaped)
     if count is None or count < 1:
-        raise ModelError(f"modes_shaped = {modes_shaped!r} is no number of modes; give a whole number from 1")
-    if isinstance(model, (complex, float, int)):
-        every: tuple[Mode, ...] = (_mode_of(complex(model)),)
+        raise ModelError(f"modes_shaped = {shown(modes_shaped)} is no number of modes; give a whole number from 1")
+    if isinstance(model, (complex, float, int, np.number)):
+        every: tuple[Mode, ...] = (_mode_of(model),)
     else:
         every = modes(model, coupling=coupling)
     growing = [m for m in every if m.grows or m.damping <= 0.0]
@@ -171,7 +181,8 @@ def input_shaper(
     swings = sorted((m for m in every if m.swings), key=lambda m: m.damping)
     if len(swings) < count:
         raise ModelError(
-            f"the model has {len(swings)} modes that swing, and {count} are to be shaped; what relaxes needs no shaper"
+            f"the model has {len(swings)} modes that swing, and {shown(count)} are to be shaped; what relaxes "
+            "needs no shaper"
         )
     chosen = tuple(swings[:count])
     times, amplitudes = np.zeros(1), np.ones(1)
@@ -203,17 +214,23 @@ def left_over(times: Floats, amplitudes: Floats, frequency: ArrayLike, damping: 
     return np.asarray(np.abs(left), dtype=np.float64)
 
 
-def _rate(rate: object) -> float:
-    value = real_number("rate", rate)
-    if not (math.isfinite(value) and value > 0):
-        raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
-    return value
+def _through(x: Floats, taps: Floats) -> Floats:
+    """What comes out of a filter of a few impulses, as long as what goes in."""
+    out = np.zeros(len(x))
+    for at in np.flatnonzero(taps[: len(x)]):
+        out[at:] += taps[at] * x[: len(x) - at]
+    return out
 
 
-def _mode_of(pole: complex) -> Mode:
-    if not (math.isfinite(pole.real) and math.isfinite(pole.imag) and pole.imag != 0):
-        raise ModelError(f"pole = {pole} does not swing; give one such as -2 + 17j [rad/s]")
-    size = abs(pole)
+def _mode_of(given: complex | np.number[Any]) -> Mode:
+    try:
+        pole = complex(given)
+        size = abs(pole)
+    except (TypeError, ValueError, OverflowError):
+        pole, size = complex("nan"), math.nan
+    low, high = POLES
+    if not (low <= abs(pole.imag) and size <= high):
+        raise ModelError(f"pole = {shown(given)} does not swing; give one such as -2 + 17j [rad/s]")
     slow = abs(pole.real)
     return Mode(complex(pole.real, abs(pole.imag)), size, -pole.real / size, 1 / slow if slow else math.inf, True)
 

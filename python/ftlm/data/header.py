@@ -17,6 +17,8 @@ from ftlm.data.readings import unread
 CSV_MARK = "# ftlm-run "
 CSV_VERSION = 1
 BOM = b"\xef\xbb\xbf"
+#: Most bytes of the line; a reader that knew none would take a file without a line's end into memory.
+LONGEST_HEADER = 1 << 20
 #: What a file says of rows at times of their own, which it does not hold.
 LEFT_BEHIND = "written on its grid: the times at which outputs were read stayed behind"
 #: What must be told, as JSON gives it; the rows themselves say when they start.
@@ -55,7 +57,20 @@ class Header:
     def text(self) -> str:
         """Write it."""
         told = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _OPTIONAL or getattr(self, f.name)}
-        return f"{CSV_VERSION} {json.dumps(told, ensure_ascii=False, allow_nan=False)}"
+        words = json.dumps(told, ensure_ascii=False, allow_nan=False)
+        # Half of a pair, which no file can hold, is written as JSON escapes it.
+        return f"{CSV_VERSION} {words.encode('utf-8', 'backslashreplace').decode()}"
+
+    def line(self) -> str:
+        """Write it as the first line of a text file, or refuse what no reader would take for one."""
+        line = f"{CSV_MARK}{self.text()}\n"
+        size = len(line.encode())
+        if size > LONGEST_HEADER:
+            raise DataError(
+                f"run {self.name!r}: names, warnings and what it is about take {size} bytes, more than the "
+                f"{LONGEST_HEADER} of the first line of a csv file; write it as .parquet"
+            )
+        return line
 
     @classmethod
     def read(cls, path: Path, where: str, text: str) -> Header:

@@ -14,7 +14,7 @@ import numpy as np
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError
 from ftlm.base.output import RUN, check_new, write_atomically
-from ftlm.data.header import CSV_MARK, Header
+from ftlm.data.header import Header
 from ftlm.data.measured import Measured
 from ftlm.data.names import CSV_TIME
 from ftlm.data.samples import grid_of
@@ -25,7 +25,7 @@ def write_csv(run: Measured, path: str | os.PathLike[str], *, force: bool) -> No
     check_new(path, force=force, words=RUN)
     columns = _columns(run)
     rows = map(",".join, zip(*(map(repr, column.tolist()) for column in columns.values()), strict=True))
-    text = "\n".join([f"{CSV_MARK}{Header.of(run).text()}", ",".join(columns), *rows, ""])
+    text = Header.of(run).line() + "\n".join([",".join(columns), *rows, ""])
     write_atomically(path, text.encode(), force=force, words=RUN)
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import nearest, real_number, whole_number
+from ftlm.base.checks import nearest, real_number, shown, whole_number
 from ftlm.base.errors import DataError, FtlmError, ModelError
 from ftlm.base.progress import Course
 from ftlm.base.statistics import NORMAL_95
@@ -112,6 +112,8 @@ def design_input(
         A model that is not stable, or integrates without a limit of that output; one with friction, saturations or dead
         zones; intervals too wide to design on; an argument that cannot be used, or a limit that cannot be kept.
     """
+    if progress is not None and not callable(progress):
+        raise ModelError(f"progress is a {type(progress).__name__}; pass what is called with (done, all)")
     wanted = _wanted(
         model, like, duration, step, peak, slew, limits, names, criterion, noise, period, seed,
     )  # fmt: skip
@@ -235,12 +237,12 @@ def _wanted(
     _check_stable(laid, bounds)
     _check_known_enough(laid, time, length)
     at = _chosen(laid, names)
-    if criterion not in ("D", "E"):
-        raise ModelError(f"criterion = {criterion!r} is not known; use 'D' (all intervals) or 'E' (the widest)")
+    if not isinstance(criterion, str) or criterion not in ("D", "E"):
+        raise ModelError(f"criterion = {shown(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)")
     # An order is of size 1 by itself; what else is known, is known as a share of itself.
     units = [1.0 if laid.names[i] in laid.problem.orders else abs(laid.values[i]) or 1.0 for i in at]
     if whole_number(seed) is None or int(seed) < 0:
-        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
+        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
     every = round(_positive("period", length / PERIODS if period is None else period, "a time [s]") / time)
     if not 2 <= every <= 2 * rows:
         raise ModelError(f"period = {period:g} s is not between two steps and twice the run; give another one")
@@ -303,12 +305,14 @@ def _chosen(laid: Laid, names: Sequence[str] | None) -> tuple[int, ...]:
         names = [names]
     if names is None:
         names = laid.problem.orders or laid.names
+    if not isinstance(names, Iterable):
+        raise ModelError(f"names is a {type(names).__name__}; give a list of names of {', '.join(laid.names)}")
     given = list(names)
     for k, name in enumerate(given):
-        if name not in laid.names:
+        if not isinstance(name, str) or name not in laid.names:
+            near = nearest(name, laid.names) if isinstance(name, str) else ""
             raise ModelError(
-                f"names[{k}] = {name!r} is no free number of the model{nearest(name, laid.names)}; it has "
-                f"{', '.join(laid.names)}"
+                f"names[{k}] = {shown(name)} is no free number of the model{near}; it has {', '.join(laid.names)}"
             )
         if name in given[:k]:
             raise ModelError(f"names has {name!r} twice; give each once")

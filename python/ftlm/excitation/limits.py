@@ -9,8 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import nearest, real_number
+from ftlm.base.checks import nearest, real_number, shown
 from ftlm.base.errors import ModelError
+
+#: Sizes that a limit may have, or infinity: of others squares of their quotients are none.
+SIZES = (1e-50, 1e50)
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class Bounds:
 
     def ramp(self, step: float) -> int:
         """Samples over which a change from one peak to the other has to be spread."""
-        return max(1, *(math.ceil(2 * p / (self.slews[n] * step) - 1e-9) for n, p in self.peaks.items()))
+        return max(1, *(math.ceil(min(2 * p / self.slews[n] / step, 1e18) - 1e-9) for n, p in self.peaks.items()))
 
     def scale(self, commands: Floats, moved: Floats) -> float:
         """Factor, at most 1, by which commands within their peaks keep all outputs within theirs; rows by name."""
@@ -61,8 +64,9 @@ def by_name(what: str, given: object, names: Sequence[str], default: Mapping[str
     if isinstance(given, Mapping):
         for name in given:
             if name not in names:
+                near = nearest(name, names) if isinstance(name, str) else ""
                 raise ModelError(
-                    f"{what} names {name!r}{nearest(name, names)}, which is none of {', '.join(names) or 'nothing'}; "
+                    f"{what} names {shown(name)}{near}, which is none of {', '.join(names) or 'nothing'}; "
                     "name one of them"
                 )
     elif given is not None:
@@ -80,5 +84,9 @@ def by_name(what: str, given: object, names: Sequence[str], default: Mapping[str
         value = real_number(f"{what} of {name}", said)
         if not value > 0:
             raise ModelError(f"{what} of {name} = {value:g} is not above 0; give the largest size it may have")
+        if not SIZES[0] <= value <= SIZES[1] and not math.isinf(value):
+            raise ModelError(
+                f"{what} of {name} = {value:g} is no size from {SIZES[0]:g} to {SIZES[1]:g}; use other units"
+            )
         out[name] = value
     return out

@@ -14,7 +14,7 @@ from ftlm.base.checks import as_mapping, listed, names_to_columns, nearest
 from ftlm.base.errors import DataError
 from ftlm.base.log import LOG
 from ftlm.data.asked import Asked
-from ftlm.data.header import Header
+from ftlm.data.header import LONGEST_HEADER, Header
 from ftlm.data.names import CSV_TIME, is_run_name
 from ftlm.data.readings import Missing, checked_missing
 from ftlm.data.run import Run, built
@@ -23,7 +23,7 @@ from ftlm.files.apart import kind_of, read_apart
 from ftlm.files.cells import stated_unit
 from ftlm.files.columns import Column, FileTable, Pool, order_of_dates
 from ftlm.files.layout import OF_SHEETS, OF_TEXT, Layout
-from ftlm.files.text import LONGEST_HEADER, read_text
+from ftlm.files.text import read_text
 
 PathLike: TypeAlias = str | os.PathLike[str]
 _SIZE_LIMIT = 1 << 30

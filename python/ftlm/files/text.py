@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from ftlm.base.checks import bad_rows
 from ftlm.base.errors import DataError
-from ftlm.data.header import header_of_line
+from ftlm.data.header import LONGEST_HEADER, header_of_line
 from ftlm.files.cells import DECIMAL_COMMA, is_number, number, split, stated_unit
 from ftlm.files.columns import Column, FileTable
 from ftlm.files.layout import Assumption, Layout
@@ -25,7 +25,6 @@ from ftlm.files.moments import Moments, is_moment
 from ftlm.files.sniff import SEPARATOR_WORDS, Found, find_table
 
 _BLOCK = 8 << 20
-LONGEST_HEADER = 1 << 20
 #: What is looked at before the rest is read in one go: so many characters, and at least so many lines.
 _SAMPLE, _SAMPLE_LINES = 1 << 16, 8
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)

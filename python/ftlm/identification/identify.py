@@ -11,6 +11,7 @@ from typing import Any, Literal
 import msgspec
 from msgspec import UNSET
 
+from ftlm.base.checks import check_choice
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.log import LOG
 from ftlm.base.statistics import ROUNDING
@@ -147,8 +148,7 @@ def identify(
         Regressors that cannot be told apart at the given orders, or an executor that has lost its workers.
     """
     several = as_runs(runs)
-    if method not in METHODS:
-        raise ModelError(f"method = {method!r} is not known; use {' or '.join(map(repr, METHODS))}")
+    check_choice("method", method, METHODS)
     if not isinstance(structure, Structure):
         raise ModelError(f"structure is {type(structure).__name__}; use ftlm.equation(…) or ftlm.flexible_link(…)")
     if offset is not None:
@@ -164,10 +164,10 @@ def identify(
         "prior_covariance": prior_covariance, "rows": rows, "keep": keep,
     }  # fmt: skip
     words = {n: value for n, value in words.items() if value is not None}
-    if loss is not None and loss not in LOSSES:
-        raise ModelError(f"loss = {loss!r} is not known; use {' or '.join(map(repr, LOSSES))}")
-    if intervals is not None and intervals not in INTERVALS:
-        raise ModelError(f"intervals = {intervals!r} is not known; use {' or '.join(map(repr, INTERVALS))}")
+    if loss is not None:
+        check_choice("loss", loss, LOSSES)
+    if intervals is not None:
+        check_choice("intervals", intervals, INTERVALS)
     if intervals == "profile" and reference is not None:
         raise ModelError(
             "intervals='profile' needs a cost that has its minimum at the estimate, and reference= has none; use "

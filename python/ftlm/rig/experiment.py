@@ -14,6 +14,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from ftlm.base.arrays import Floats
+from ftlm.base.checks import check_choice, shown
 from ftlm.base.errors import DataError, FtlmError, ModelError, RigFault
 from ftlm.base.output import RUN, check_free
 from ftlm.data.asked import Asked
@@ -168,8 +169,16 @@ class Experiment:
 
     def recorded(self, source_on: Callable[[Board], Source], told: dict[str, Any]) -> Run:
         """Drive the rig as a source on its board asks, and record it."""
-        if self.sensor_filter not in (None, "stock"):
-            raise ModelError(f"sensor_filter = {self.sensor_filter!r} is not known; use 'stock' or None")
+        # What moves an arm is no matter of what Python takes for true.
+        for name, flag in (("paced", self.paced), ("arm", self.arm), ("force", self.force)):
+            if not isinstance(flag, bool):
+                raise ModelError(f"{name} = {shown(flag)} is neither True nor False; use one of them")
+        if self.progress is not None and not callable(self.progress):
+            raise ModelError(f"progress is a {type(self.progress).__name__}; pass what is called with (done, all)")
+        if self.sensor_filter is not None and not (
+            isinstance(self.sensor_filter, str) and self.sensor_filter == "stock"
+        ):
+            raise ModelError(f"sensor_filter = {shown(self.sensor_filter)} is not known; use 'stock' or None")
         board, known = _board(
             self.rig, self.parameters, self.seed, self.offset, paced=self.paced, horizon=self.limit, card=self.card
         )
@@ -180,7 +189,7 @@ class Experiment:
                 "with arm=True (--arm)"
             )
         if not is_run_name(self.name):
-            raise DataError(f"name={self.name!r} cannot name a run")
+            raise DataError(f"name={shown(self.name)} cannot name a run")
         target = None if self.out is None else Path(self.out)
         if target is not None:
             _check_target(target, force=self.force)
@@ -333,19 +342,25 @@ def _board(
     offset: tuple[float, float] | None, *, paced: bool, horizon: float, card: str,
 ) -> tuple[Board, dict[str, Any]]:  # fmt: skip
     """The board that is asked for, and what a run tells of it."""
-    if offset is not None and rig != "virtual":
+    virtual = isinstance(rig, str) and rig == "virtual"
+    if offset is not None and not virtual:
         raise ModelError("offset is of the virtual arm; a board has its own, leave it out")
-    if rig == "virtual":
+    if virtual:
         arm = ArmParameters.of(parameters)
         if offset is not None:
-            if len(offset) != 2 or not all(math.isfinite(v) for v in offset):
-                raise ModelError(f"offset = {offset!r} is not a pair of currents [A], of motor 1 and motor 2")
-            arm = replace(arm, current_offset=(float(offset[0]), float(offset[1])))
+            try:
+                first, second = (float(v) for v in offset)
+            except (TypeError, ValueError, OverflowError):
+                first = second = math.nan
+            if isinstance(offset, str) or not (math.isfinite(first) and math.isfinite(second)):
+                raise ModelError(f"offset = {shown(offset)} is not a pair of currents [A], of motor 1 and motor 2")
+            arm = replace(arm, current_offset=(first, second))
         return VirtualBoard(arm, seed=seed, paced=paced, horizon=horizon), {"parameters": arm.to_dict()}
-    if rig == "q8":
-        return QuanserBoard(card=card), {"card": card}
     if isinstance(rig, str):
-        raise ModelError(f"rig = {rig!r} is not known; use 'virtual' or 'q8'")
+        check_choice("rig", rig, ("virtual", "q8"))
+        return QuanserBoard(card=card), {"card": card}
+    if not hasattr(rig, "hardware"):
+        raise ModelError(f"rig is a {type(rig).__name__}; use 'virtual', 'q8' or a board of your own")
     own = getattr(rig, "parameters", None)
     return rig, {"parameters": own.to_dict()} if isinstance(own, ArmParameters) else {}
 
@@ -369,21 +384,24 @@ def check_times(duration: float, limit: float, rate: float, seed: int) -> None:
     """Refuse times, a rate or a seed that no run can have."""
 
     def number(value: object) -> bool:
-        return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        try:
+            return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        except OverflowError:
+            return False
 
     if not number(limit) or not 0 < limit <= LONGEST:
-        raise ModelError(f"limit = {limit!r} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
+        raise ModelError(f"limit = {shown(limit)} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
     if not number(duration) or duration <= 0:
-        raise ModelError(f"duration = {duration!r} s is not a time above 0; give the length of the run")
+        raise ModelError(f"duration = {shown(duration)} s is not a time above 0; give the length of the run")
     if duration > limit:
         way_out = "raise limit= (--limit)" if duration <= LONGEST else f"no run is longer than {LONGEST:g} s"
         raise ModelError(f"duration = {duration:g} s is over the limit of {limit:g} s; {way_out}")
     if not number(rate) or rate <= 0:
-        raise ModelError(f"rate = {rate!r} Hz is not a positive number of samples per second")
+        raise ModelError(f"rate = {shown(rate)} Hz is not a positive number of samples per second")
     if duration * rate < 2:
         raise ModelError(f"duration = {duration:g} s holds fewer than three samples at {rate:g} Hz; make it longer")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
+        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
 
 
 def _column_of(name: str) -> int:

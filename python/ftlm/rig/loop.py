@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Floats
+from ftlm.base.checks import words_of
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.run import Run
 from ftlm.fit.streaming import Streaming
@@ -25,6 +26,8 @@ from ftlm.rig.rig import LONGEST, Board, Rig
 Controller: TypeAlias = Callable[[float, Floats, Floats], Sequence[float] | Floats]
 #: Names of the reference in a run, of hub 1 and hub 2.
 REFERENCES = ("reference1", "reference2")
+#: Most characters, as JSON, of what a controller says of itself.
+SAID = 100_000
 #: Hub angle at which a limit switch opens, where the board does not say its own [rad].
 TRAVEL = (math.pi / 2, math.pi / 2)
 
@@ -154,14 +157,19 @@ class Loop:
         try:
             answer = self.controller(t, rows[-1, 2:6].copy(), self.reference[self._at].copy())
         except Exception as error:
-            self._rig.fail(f"at {t:.6g} s the controller failed ({type(error).__name__}: {error})", error)
+            self._rig.fail(f"at {t:.6g} s the controller failed ({type(error).__name__}: {words_of(error)})", error)
         except BaseException:
             with contextlib.suppress(Exception):
                 self._rig.board.write((0.0, 0.0))
             raise
         self._took = self.clock() - self._since
         self._since = None
-        currents, wrong = _currents(answer, self._rig.limits.current)
+        try:
+            currents, wrong = _currents(answer, self._rig.limits.current)
+        except Exception as error:
+            # Lists and numbers of its own may do anything when they are read.
+            words = f"at {t:.6g} s what the controller returned cannot be read ({type(error).__name__}: "
+            self._rig.fail(f"{words}{words_of(error)})", error)
         if wrong:
             self._rig.fail(f"at {t:.6g} s the controller {wrong}")
         return currents
@@ -213,7 +221,7 @@ def _numbers(reference: ArrayLike) -> Floats:
     try:
         raw = np.asarray(reference)
         good = raw.dtype.kind in "fiu" and raw.ndim in (1, 2) and raw.shape[-1] == 2
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, MemoryError):
         good = False
     if not good:
         raise DataError(
@@ -257,7 +265,14 @@ def _told(controller: Controller) -> dict[str, Any]:
     if callable(describe):
         told |= {"settings": describe()}
     try:
-        json.dumps(told, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ModelError(f"what to_dict() of the controller returns is no JSON ({error}); correct it") from None
+        size = len(json.dumps(told, allow_nan=False))
+    except (TypeError, ValueError, RecursionError) as error:
+        raise ModelError(
+            f"what to_dict() of the controller returns is no JSON ({words_of(error, 200)}); correct it"
+        ) from None
+    if size > SAID:
+        raise ModelError(
+            f"what to_dict() of the controller returns is {size} characters long, more than the {SAID} that a run says "
+            "of its controller; leave out what no reader needs"
+        )
     return told

@@ -12,7 +12,7 @@ from typing import Any
 
 from ftlm import _core
 from ftlm.arm.link import Form, flexible_link
-from ftlm.base.checks import listed, nearest
+from ftlm.base.checks import listed, nearest, shown
 from ftlm.base.errors import DataError, ModelError
 from ftlm.model.model import Model
 from ftlm.rig.rig import COMMAND_SCALE, CURRENT_LIMIT, ENCODER_SCALE, SENSE_SCALE, STRAIN_SCALE
@@ -141,10 +141,12 @@ class ArmParameters:
             return given
         if isinstance(given, str) and given in SETS:
             return SETS[given]
+        if not isinstance(given, (str, os.PathLike)):
+            raise ModelError(f"parameters is a {type(given).__name__}; use {listed(SETS)}, or a TOML file's path")
         if not os.fspath(given).endswith(".toml"):
             raise ModelError(
-                f"parameters = {os.fspath(given)!r} is not known{nearest(given, SETS)}; use {listed(SETS)}, or a file "
-                "whose name ends with .toml"
+                f"parameters = {shown(os.fspath(given))} is not known{nearest(given, SETS)}; use {listed(SETS)}, or a "
+                "file whose name ends with .toml"
             )
         return cls._from_toml(Path(given))
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError, RigFault
-from ftlm.data.header import CSV_MARK, Header
+from ftlm.data.header import Header
 from ftlm.data.names import CSV_TIME
 from ftlm.data.run import Run
 from ftlm.rig.excitation import INPUTS
@@ -60,7 +60,7 @@ class Partial:
             ("the recording did not end: the program died, or the disk was full",),
             about | {"faults": ["the recording did not end"]},
         )  # fmt: skip
-        lines = f"{CSV_MARK}{header.text()}\n{','.join([CSV_TIME, *self._columns])}\n"
+        lines = f"{header.line()}{','.join([CSV_TIME, *self._columns])}\n"
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         try:
             # Whoever overwrites a link means the link, not what it leads to.

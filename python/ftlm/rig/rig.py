@@ -11,6 +11,7 @@ from typing import Any, Literal, NoReturn, Protocol
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
+from ftlm.base.checks import real_number, words_of
 from ftlm.base.errors import FtlmError, ModelError, RigFault
 from ftlm.rig.signals import Signals
 
@@ -226,6 +227,7 @@ class Rig:
         limits: Limits | None = None, sensor_filter: tuple[float, float] | None = None,
     ) -> None:  # fmt: skip
         low, high = WATCHDOG_RANGE
+        watchdog = real_number("watchdog", watchdog)
         if not low <= watchdog <= high:
             raise ModelError(
                 f"watchdog = {watchdog!r} s is outside [{low:g}, {high:g}] s; 0 would leave the motors running when "
@@ -303,7 +305,7 @@ class Rig:
                 self.board.write((0.0, 0.0))
             if not isinstance(error, FtlmError):
                 raise
-            self.guard.fail(str(error))
+            self.guard.fail(words_of(error))
         self._check()
 
     def fail(self, why: str, cause: BaseException | None = None) -> NoReturn:

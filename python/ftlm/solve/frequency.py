@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ftlm.base.arrays import Complex, Floats
+from ftlm.base.checks import check_choice
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.equations import Equation, Term
 from ftlm.data.limits import WORDS
@@ -168,8 +169,7 @@ def _written(polynomial: Polynomial) -> tuple[tuple[float, float], ...]:
 
 def is_coupled(coupling: str) -> bool:
     """Whether all equations act together; refuses what is no coupling."""
-    if coupling not in ("simulated", "measured"):
-        raise ModelError(f"coupling = {coupling!r} is not known; use 'simulated' or 'measured'")
+    check_choice("coupling", coupling, ("simulated", "measured"))
     return coupling == "simulated"
 
 

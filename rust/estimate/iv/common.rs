@@ -98,6 +98,111 @@ pub(super) fn dot(a: &[f64], b: &[f64]) -> f64 {
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + tail
 }
 
+/// The instruments of one record: columns, and the unknown that each belongs to.
+pub(super) struct Instruments {
+    pub(super) columns: Vec<Vec<f64>>,
+    pub(super) places: Vec<usize>,
+}
+
+impl Instruments {
+    fn of(&self, place: usize) -> Option<&Vec<f64>> {
+        self.places.iter().position(|p| *p == place).map(|at| &self.columns[at])
+    }
+}
+
+/// Less of an instrument than this outside the span of those before it is rounding.
+const SPANNED: f64 = 1e-13;
+
+/// Makes the instruments of all records orthonormal, a column over all records for each of k unknowns: the factor Q of a
+/// QR factorisation, by Gram and Schmidt's process, done twice where it loses digits. They span what they did, so they
+/// give the same estimate; their products with the regressors are as well conditioned as these, where those of the
+/// instruments themselves are as badly as the square of that.
+///
+/// O(records · k² m), where k counts the unknowns that a record has.
+///
+/// # Errors
+/// [`Error::Singular`] where one depends on those before it.
+pub(super) fn orthonormal(records: &mut [Instruments], k: usize) -> Result<()> {
+    let mut held = vec![0; k];
+    records.iter().flat_map(|r| &r.places).for_each(|&place| held[place] += 1);
+    let singular = |place| Error::Singular { index: place, count: k };
+    // Unknowns of one record alone come first: those of different records are orthogonal as they are.
+    for record in &mut *records {
+        for at in (0..record.places.len()).filter(|&at| held[record.places[at]] == 1) {
+            let mut column = [std::mem::take(&mut record.columns[at])];
+            let spanned = twice(&mut column, |column| {
+                for before in (0..at).filter(|&before| held[record.places[before]] == 1) {
+                    remove(&mut column[0], &record.columns[before], None);
+                }
+            });
+            if !spanned {
+                return Err(singular(record.places[at]));
+            }
+            [record.columns[at]] = column;
+        }
+    }
+    let shared: Vec<usize> = (0..k).filter(|&place| held[place] > 1).collect();
+    for (n, &place) in shared.iter().enumerate() {
+        // An unknown that not all records have is nothing in the others.
+        let mut pieces: Vec<Vec<f64>> = records.iter().map(|r| r.of(place).cloned().unwrap_or_default()).collect();
+        let spanned = twice(&mut pieces, |pieces| {
+            for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
+                for (column, _) in record.columns.iter().zip(&record.places).filter(|(_, p)| held[**p] == 1) {
+                    remove(piece, column, None);
+                }
+            }
+            for &before in &shared[..n] {
+                let pairs = records.iter().map(|r| r.of(before)).zip(&*pieces);
+                let along =
+                    pairs.map(|(q, piece)| q.filter(|_| !piece.is_empty()).map_or(0.0, |q| dot(q, piece))).sum();
+                for (piece, record) in pieces.iter_mut().zip(&*records).filter(|(piece, _)| !piece.is_empty()) {
+                    if let Some(q) = record.of(before) {
+                        remove(piece, q, Some(along));
+                    }
+                }
+            }
+        });
+        if !spanned {
+            return Err(singular(place));
+        }
+        for (record, piece) in records.iter_mut().zip(pieces) {
+            if let Some(at) = record.places.iter().position(|p| *p == place) {
+                record.columns[at] = piece;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Takes so much of a direction out of a column, all of it where not told.
+fn remove(column: &mut [f64], direction: &[f64], along: Option<f64>) {
+    let along = along.unwrap_or_else(|| dot(direction, column));
+    column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
+}
+
+/// Takes out of a column what those before it span, once more where little was left, and scales what is left to unit size;
+/// false where that is rounding.
+fn twice(pieces: &mut [Vec<f64>], clear: impl Fn(&mut [Vec<f64>])) -> bool {
+    let whole = size(pieces);
+    let (mut before, mut left) = (whole, whole);
+    for _ in 0..2 {
+        clear(pieces);
+        left = size(pieces);
+        // What rounding left of the others weighs as much more as the column has shrunk.
+        if left > 0.5 * before {
+            break;
+        }
+        before = left;
+    }
+    let scale = 1.0 / left;
+    pieces.iter_mut().flatten().for_each(|v| *v *= scale);
+    left > SPANNED * whole && scale.is_finite() && left.is_finite()
+}
+
+fn size(pieces: &[Vec<f64>]) -> f64 {
+    pieces.iter().map(|p| dot(p, p)).sum::<f64>().sqrt()
+}
+
 /// Adds the long-run covariance of the sums of scores to a k × k matrix, with Bartlett weights
 /// (doi:10.2307/1913610): what the filter leaves behind is not white where other measured outputs enter the equation.
 #[allow(clippy::cast_precision_loss, clippy::cast_possible_truncation, clippy::cast_sign_loss)]

@@ -7,12 +7,12 @@ use super::common::{dot, equations, initial_terms, unmoved, Dropped, Settings, S
 use super::filter::{damped_inverse, low_pass, power_frequency, unit};
 use super::joint;
 use super::single::{divisor, step, Scratch, Shelf, Source};
+use crate::driven::System;
 use crate::equation::{Initial, Structure};
 use crate::error::{check_length, Error, Result};
 use crate::estimate::least_squares;
 use crate::regressors::Record;
 use crate::series::Kernel;
-use crate::simulate::System;
 
 /// Low-passes behind which a start is made, in units of the output's own band; none: the plain record.
 const PREFILTERS: [Option<f64>; 4] = [None, Some(1.0), Some(2.0), Some(4.0)];
@@ -93,7 +93,7 @@ pub fn fit(
     }
     let clean: Vec<Record> = records.iter().map(Record::cleaned).collect();
     let exponents: Vec<Vec<f64>> = structures.iter().map(|s| s.initial_exponents(initial)).collect();
-    let problem = Problem { records, clean: &clean, structures, fixed, exponents: &exponents };
+    let problem = Problem::new(records, &clean, structures, (fixed, initial), &exponents)?;
     let mut best: Option<Ended> = None;
     let mut failure = None;
     // Ends of all equations together, by cost; from one start the equations one by one may come out unstable, from
@@ -101,14 +101,14 @@ pub fn fit(
     let mut together: Option<joint::Ended> = None;
     for multiple in PREFILTERS {
         // A start that cannot be made, or whose instruments fail, leaves the others.
-        match problem.start(initial, multiple).and_then(|(solutions, dropped)| {
-            let ended = problem.iterate(solutions.clone(), &dropped, settings)?;
-            Ok((solutions, dropped, ended))
+        match problem.start(multiple).and_then(|solutions| {
+            let ended = problem.iterate(solutions.clone(), settings)?;
+            Ok((solutions, ended))
         }) {
-            Ok((start, dropped, ended)) => {
+            Ok((start, ended)) => {
                 if structures.len() > 1 {
                     for from in [&ended.solutions, &start] {
-                        let Some(found) = problem.together(from, &dropped, settings)? else { continue };
+                        let Some(found) = problem.together(from, settings)? else { continue };
                         if together.as_ref().is_none_or(|t| found.cost < t.cost) {
                             together = Some(found);
                         }
@@ -157,6 +157,11 @@ struct Problem<'a> {
     structures: &'a [Structure],
     fixed: &'a [Vec<Option<f64>>],
     exponents: &'a [Vec<f64>],
+    /// Initial terms left out, per equation.
+    dropped: Vec<Dropped>,
+    /// Per equation and record: what no step changes, and what the clean signals make of its terms.
+    shelves: Vec<Vec<Shelf<'a>>>,
+    substitutes: Vec<Vec<Vec<Option<Kernel>>>>,
 }
 
 /// Where one start ended.
@@ -169,43 +174,49 @@ struct Ended {
     damped: bool,
 }
 
-impl Problem<'_> {
+impl<'a> Problem<'a> {
+    fn new(
+        records: &'a [Record],
+        clean: &'a [Record],
+        structures: &'a [Structure],
+        (fixed, initial): (&'a [Vec<Option<f64>>], &Initial),
+        exponents: &'a [Vec<f64>],
+    ) -> Result<Self> {
+        let plain = |(structure, fixed): (&Structure, &Vec<Option<f64>>)| {
+            Ok(least_squares::fit(records, structure, fixed, initial)?.dropped)
+        };
+        let dropped = structures.iter().zip(fixed).map(plain).collect::<Result<Vec<Dropped>>>()?;
+        let of_equation = |(structure, exponents): (&Structure, &Vec<f64>)| -> Vec<Shelf<'a>> {
+            records.iter().map(|record| Shelf::new(record, structure, exponents)).collect()
+        };
+        let shelves: Vec<Vec<Shelf<'a>>> = structures.iter().zip(exponents).map(of_equation).collect();
+        let substituted = |shelves: &Vec<Shelf<'a>>| -> Vec<Vec<Option<Kernel>>> {
+            shelves.iter().zip(clean).map(|(shelf, clean)| shelf.clean(clean, |_| true)).collect()
+        };
+        let substitutes = shelves.iter().map(substituted).collect();
+        Ok(Self { records, clean, structures, fixed, exponents, dropped, shelves, substitutes })
+    }
+
     /// Two-stage least squares: one step with the clean signals as instruments, behind a low-pass at a multiple of each
     /// output's own band if one is given.
-    fn start(&self, initial: &Initial, multiple: Option<f64>) -> Result<(Vec<Solution>, Vec<Dropped>)> {
+    fn start(&self, multiple: Option<f64>) -> Result<Vec<Solution>> {
         let mut scratch = Scratch::default();
         let mut solutions = Vec::with_capacity(self.structures.len());
-        let mut dropped = Vec::with_capacity(self.structures.len());
         for (i, (structure, fixed)) in self.structures.iter().zip(self.fixed).enumerate() {
-            let plain = least_squares::fit(self.records, structure, fixed, initial)?;
-            let shelves = self.shelves(i, self.clean);
-            let sources: Vec<Source<'_>> = shelves.iter().map(Shelf::source).collect();
-            let filters = self
-                .records
-                .iter()
-                .map(|r| {
-                    let band = power_frequency(r.signal(structure.output), r.step());
-                    let filter = multiple.map_or_else(|| Ok(unit(r.m())), |multiple| low_pass(multiple * band, r));
-                    Ok(Kernel::new(&filter?))
-                })
-                .collect::<Result<Vec<_>>>()?;
+            let pairs = self.shelves[i].iter().zip(&self.substitutes[i]);
+            let sources: Vec<Source<'_>> = pairs.map(|(shelf, clean)| shelf.source(|k| clean[k].as_ref())).collect();
+            let low_passed = |r: &Record, multiple: f64| {
+                low_pass(multiple * power_frequency(r.signal(structure.output), r.step()), r)
+            };
+            let filter = |r: &Record| multiple.map_or_else(|| Ok(unit(r.m())), |multiple| low_passed(r, multiple));
+            let filters = self.records.iter().map(|r| Ok(Kernel::new(&filter(r)?))).collect::<Result<Vec<Kernel>>>()?;
             let own: Vec<Vec<f64>> = self.clean.iter().map(|r| r.signal(structure.output).to_vec()).collect();
-            let (start, _) = step(&sources, &filters, &own, fixed, &plain.dropped, false, &mut scratch)?;
-            solutions.push(start);
-            dropped.push(plain.dropped);
+            solutions.push(step(&sources, &filters, &own, fixed, &self.dropped[i], false, &mut scratch)?.0);
         }
-        Ok((solutions, dropped))
+        Ok(solutions)
     }
 
-    fn shelves(&self, i: usize, substitutes: &[Record]) -> Vec<Shelf<'_>> {
-        self.records
-            .iter()
-            .zip(substitutes)
-            .map(|(record, substitute)| Shelf::new(record, substitute, &self.structures[i], &self.exponents[i]))
-            .collect()
-    }
-
-    fn iterate(&self, mut solutions: Vec<Solution>, dropped: &[Dropped], settings: Settings) -> Result<Ended> {
+    fn iterate(&self, mut solutions: Vec<Solution>, settings: Settings) -> Result<Ended> {
         let mut scratch = Scratch::default();
         let mut best = (f64::INFINITY, solutions.clone());
         let (mut iterations, mut converged, mut shortened) = (0, false, 0);
@@ -231,7 +242,7 @@ impl Problem<'_> {
                 solutions.clone_from(&best.1);
                 continue;
             }
-            let (next, covariances) = self.step(&solutions, &responses, dropped, last, &mut scratch)?;
+            let (next, covariances) = self.step(&solutions, &responses, last, &mut scratch)?;
             if last {
                 return Ok(Ended { error, solutions, covariances, iterations, converged, damped });
             }
@@ -246,14 +257,14 @@ impl Problem<'_> {
     }
 
     /// All equations together from a start ([`joint`]); None where that cannot be done.
-    fn together(&self, start: &[Solution], dropped: &[Dropped], settings: Settings) -> Result<Option<joint::Ended>> {
+    fn together(&self, start: &[Solution], settings: Settings) -> Result<Option<joint::Ended>> {
         let problem = joint::Problem {
             records: self.records,
             clean: self.clean,
             structures: self.structures,
             fixed: self.fixed,
             exponents: self.exponents,
-            dropped,
+            dropped: &self.dropped,
         };
         match problem.refine(start, settings) {
             Err(Error::Singular { .. }) => Ok(None),
@@ -266,7 +277,6 @@ impl Problem<'_> {
         &self,
         solutions: &[Solution],
         responses: &[Vec<Vec<f64>>],
-        dropped: &[Dropped],
         with_covariance: bool,
         scratch: &mut Scratch,
     ) -> Result<(Vec<Solution>, Vec<Vec<f64>>)> {
@@ -284,14 +294,23 @@ impl Problem<'_> {
             .collect::<Result<Vec<_>>>()?;
         let mut out = (Vec::new(), Vec::new());
         for (i, fixed) in self.fixed.iter().enumerate() {
-            let shelves = self.shelves(i, &simulated);
-            let sources: Vec<Source<'_>> = shelves.iter().map(Shelf::source).collect();
+            let driven = |signal: usize| self.structures.iter().any(|e| e.output == signal);
+            let pairs = self.shelves[i].iter().zip(&simulated);
+            let made: Vec<Vec<Option<Kernel>>> = pairs.map(|(shelf, record)| shelf.clean(record, driven)).collect();
+            let terms = &self.structures[i].terms;
+            let sources: Vec<Source<'_>> = (0..made.len())
+                .map(|r| {
+                    let of = |k: usize| if driven(terms[k].signal) { &made[r][k] } else { &self.substitutes[i][r][k] };
+                    self.shelves[i][r].source(|k| of(k).as_ref())
+                })
+                .collect();
             let filters = sources
                 .iter()
                 .map(|s| Ok(Kernel::new(&damped_inverse(&divisor(s, &solutions[i]))?.0)))
                 .collect::<Result<Vec<_>>>()?;
             let own: Vec<Vec<f64>> = responses.iter().map(|outputs| outputs[i].clone()).collect();
-            let (solution, covariance) = step(&sources, &filters, &own, fixed, &dropped[i], with_covariance, scratch)?;
+            let (solution, covariance) =
+                step(&sources, &filters, &own, fixed, &self.dropped[i], with_covariance, scratch)?;
             out.0.push(solution);
             out.1.push(covariance);
         }
@@ -313,7 +332,6 @@ fn output_error(records: &[Record], structures: &[Structure], responses: &[Vec<V
 }
 
 /// Free runs of all equations together on every record, damped where they grow.
-#[allow(clippy::cast_precision_loss)]
 fn coupled(
     clean: &[Record],
     structures: &[Structure],
@@ -325,21 +343,15 @@ fn coupled(
     let mut out = Vec::with_capacity(clean.len());
     for (r, record) in clean.iter().enumerate() {
         let initial = initial_terms(r, structures, exponents, solutions);
-        let m = record.m() as f64;
-        let mut gamma = 0.0;
-        let outputs = loop {
-            let outputs = System::new(&equations, record)?.damped(gamma / m).respond(&initial)?;
-            // A run that grows with its input is no instability; one that passes all measured sizes is.
-            let grown = outputs.iter().zip(structures).any(|(response, s)| {
+        // A run that grows with its input is no instability; one that passes all measured sizes is.
+        let bounded = |outputs: &[Vec<f64>]| {
+            outputs.iter().zip(structures).all(|(response, s)| {
                 let measured = record.signal(s.output).iter().fold(0.0_f64, |a, v| a.max(v.abs()));
-                response.iter().any(|v| !v.is_finite() || v.abs() > 10.0 * measured.max(f64::MIN_POSITIVE))
-            });
-            if !grown || gamma > 64.0 * m {
-                break outputs;
-            }
-            damped = true;
-            gamma = if gamma == 0.0 { 4.0 } else { 2.0 * gamma };
+                response.iter().all(|v| v.abs() <= 10.0 * measured.max(f64::MIN_POSITIVE))
+            })
         };
+        let (outputs, grown) = System::new(&equations, record)?.bounded(&initial, bounded)?;
+        damped |= grown;
         out.push(outputs);
     }
     Ok((out, damped))

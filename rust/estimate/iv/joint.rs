@@ -7,14 +7,16 @@
 //! term what a change of its coefficient does to the free run, so where the steps stand still the weighted output error
 //! does, too.
 
-use super::common::{dot, equations, initial_terms, long_run, unmoved, Dropped, Settings, Solution};
+use super::common::{
+    dot, equations, initial_terms, long_run, orthonormal, unmoved, Dropped, Instruments, Settings, Solution,
+};
 use super::filter::grows;
+use crate::driven::System;
 use crate::equation::Structure;
 use crate::error::Result;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
-use crate::simulate::System;
-use crate::small;
+use crate::small::Scaled;
 
 /// A step that raises the cost is halved, at most so many times in a row.
 const SHORTENED: usize = 8;
@@ -168,8 +170,8 @@ impl Problem<'_> {
     ) -> Result<Option<Stepped>> {
         let (n, k) = (self.structures.len(), unknowns.len());
         let equations = equations(self.structures, solutions);
-        let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
         let mut parts = Vec::with_capacity(self.records.len());
+        let mut instruments = Vec::with_capacity(self.records.len());
         for (r, record) in self.records.iter().enumerate() {
             let m = record.m();
             let inverse = System::new(&equations, record)?.inverse()?;
@@ -223,16 +225,21 @@ impl Problem<'_> {
                     Unknown::Initial(equation, run, _) => equation == i && run == r,
                 }));
             }
-            for (instrument, &a) in psi.iter().zip(&places) {
-                rhs[a] += dot(instrument, &target);
-                for (regressor, &b) in phi.iter().zip(&places) {
+            parts.push((phi, target));
+            instruments.push(Instruments { columns: psi, places });
+        }
+        orthonormal(&mut instruments, k)?;
+        let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
+        for ((phi, target), Instruments { columns, places }) in parts.iter().zip(&instruments) {
+            for (instrument, &a) in columns.iter().zip(places) {
+                rhs[a] += dot(instrument, target);
+                for (regressor, &b) in phi.iter().zip(places) {
                     cross[a * k + b] += dot(instrument, regressor);
                 }
             }
-            parts.push((phi, psi, places, target));
         }
-        let inverse = small::scaled_inverse(&cross, k)?;
-        let x: Vec<f64> = (0..k).map(|a| dot(&inverse[a * k..(a + 1) * k], &rhs)).collect();
+        let solved = Scaled::new(&cross, k)?;
+        let x = solved.solve(&rhs);
         let mut next: Vec<Solution> = solutions.to_vec();
         for (&unknown, &value) in unknowns.iter().zip(&x) {
             match unknown {
@@ -244,8 +251,9 @@ impl Problem<'_> {
         }
         let mut covariances = Vec::new();
         if with_covariance {
-            let mut meat = vec![0.0; k * k];
-            for ((phi, psi, places, target), record) in parts.iter().zip(self.records) {
+            let (mut meat, inverse) = (vec![0.0; k * k], solved.inverse());
+            for (((phi, target), made), record) in parts.iter().zip(&instruments).zip(self.records) {
+                let Instruments { columns: psi, places } = made;
                 let mut rest = target.clone();
                 for (column, &place) in phi.iter().zip(places) {
                     rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);

@@ -3,14 +3,14 @@
 //! The equation is filtered by 1/D̂, which leaves about the white noise of the output, and correlated with instruments
 //! that hold no noise: the inputs and the simulated output. Both follow from the last estimate, so the step is repeated.
 
-use super::common::{dot, long_run, unmoved, Settings, Solution};
+use super::common::{dot, long_run, orthonormal, unmoved, Instruments, Settings, Solution};
 use super::filter::damped_inverse;
 use crate::equation::Structure;
 use crate::error::Result;
 use crate::excess;
 use crate::regressors::Record;
-use crate::series::{Buffers, Kernel, SumOfProducts};
-use crate::small;
+use crate::series::{multiply, Buffers, Kernel, SumOfProducts};
+use crate::small::Scaled;
 
 /// What a step reads of one record for one equation: spectra good for products of two series of m terms.
 pub struct Source<'a> {
@@ -28,47 +28,71 @@ pub struct Source<'a> {
     pub output: &'a [f64],
 }
 
-/// Spectra that the sources of one record own.
+/// Spectra that the sources of one record share, whatever solution they are for.
 pub(super) struct Shelf<'a> {
-    kernels: Vec<Option<(Vec<f64>, Kernel)>>,
-    measured: Vec<Kernel>,
-    clean: Vec<Kernel>,
+    record: &'a Record,
+    output: usize,
+    terms: Vec<Shelved>,
     initial: Vec<Kernel>,
     target: Kernel,
-    output: &'a [f64],
+}
+
+/// One term: its signal and order, its kernel, that one's spectrum and that of I^η s as measured.
+struct Shelved {
+    signal: usize,
+    eta: f64,
+    kernel: Vec<f64>,
+    spectrum: Kernel,
+    measured: Kernel,
+}
+
+impl Shelved {
+    /// Spectrum of I^η of another signal.
+    fn of(&self, signal: &[f64]) -> Kernel {
+        if self.eta == 0.0 {
+            Kernel::new(signal)
+        } else {
+            Kernel::new(&multiply(&self.kernel, signal, signal.len()))
+        }
+    }
 }
 
 impl<'a> Shelf<'a> {
-    pub(super) fn new(record: &'a Record, clean: &Record, structure: &Structure, exponents: &[f64]) -> Self {
-        let orders = (0..structure.terms.len()).map(|k| (structure.terms[k].signal, structure.integration(k)));
-        let own = |s: usize| s == structure.output;
+    pub(super) fn new(record: &'a Record, structure: &Structure, exponents: &[f64]) -> Self {
+        let term = |k: usize| {
+            let (signal, eta) = (structure.terms[k].signal, structure.integration(k));
+            let kernel = excess::kernel(eta, record.m(), record.step());
+            let spectrum = Kernel::new(&kernel);
+            let measured = Kernel::new(&record.integral(signal, eta));
+            Shelved { signal, eta, kernel, spectrum, measured }
+        };
         Self {
-            kernels: orders
-                .clone()
-                .map(|(s, eta)| {
-                    own(s).then(|| {
-                        let kernel = excess::kernel(eta, record.m(), record.step());
-                        let spectrum = Kernel::new(&kernel);
-                        (kernel, spectrum)
-                    })
-                })
-                .collect(),
-            measured: orders.clone().map(|(s, eta)| Kernel::new(&record.integral(s, eta))).collect(),
-            clean: orders.map(|(s, eta)| Kernel::new(&clean.integral(s, eta))).collect(),
+            record,
+            output: structure.output,
+            terms: (0..structure.terms.len()).map(term).collect(),
             initial: exponents.iter().map(|&e| Kernel::new(&record.initial_term(e))).collect(),
             target: Kernel::new(record.signal(structure.output)),
-            output: record.signal(structure.output),
         }
     }
 
-    pub(super) fn source(&self) -> Source<'_> {
+    /// What substitutes make of the terms of other signals than the output, where `wanted` and where they are no other
+    /// than what was measured.
+    pub(super) fn clean(&self, substitute: &Record, wanted: impl Fn(usize) -> bool) -> Vec<Option<Kernel>> {
+        let other = |s: usize| s != self.output && wanted(s) && substitute.signal(s) != self.record.signal(s);
+        self.terms.iter().map(|t| other(t.signal).then(|| t.of(substitute.signal(t.signal)))).collect()
+    }
+
+    /// With what a substitute makes of each term, as measured where that is none.
+    pub(super) fn source<'b>(&'b self, clean: impl Fn(usize) -> Option<&'b Kernel>) -> Source<'b> {
+        let own = |t: &Shelved| t.signal == self.output;
+        let terms = || self.terms.iter();
         Source {
-            own: self.kernels.iter().map(|k| k.as_ref().map(|(kernel, spectrum)| (&kernel[..], spectrum))).collect(),
-            measured: self.measured.iter().collect(),
-            clean: self.clean.iter().collect(),
+            own: terms().map(|t| own(t).then_some((&t.kernel[..], &t.spectrum))).collect(),
+            measured: terms().map(|t| &t.measured).collect(),
+            clean: terms().enumerate().map(|(k, t)| clean(k).unwrap_or(&t.measured)).collect(),
             initial: self.initial.iter().collect(),
             target: &self.target,
-            output: self.output,
+            output: self.record.signal(self.output),
         }
     }
 }
@@ -115,8 +139,7 @@ pub fn step(
         .filter(|place| !dropped.contains(place))
         .collect();
     let k = free.len() + kept.len();
-    let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
-    let mut filtered = Vec::with_capacity(sources.len());
+    let (mut filtered, mut instruments) = (Vec::with_capacity(sources.len()), Vec::with_capacity(sources.len()));
     for (r, source) in sources.iter().enumerate() {
         let m = source.output.len();
         let filter = &filters[r];
@@ -145,18 +168,21 @@ pub fn step(
             phi.push(column);
             places.push(free.len() + place);
         }
-        for (instrument, &a) in psi.iter().zip(&places) {
-            rhs[a] += dot(instrument, &target);
-            for (regressor, &b) in phi.iter().zip(&places) {
+        filtered.push(Filtered { phi, target });
+        instruments.push(Instruments { columns: psi, places });
+    }
+    orthonormal(&mut instruments, k)?;
+    let (mut cross, mut rhs) = (vec![0.0; k * k], vec![0.0; k]);
+    for (Filtered { phi, target }, Instruments { columns, places }) in filtered.iter().zip(&instruments) {
+        for (instrument, &a) in columns.iter().zip(places) {
+            rhs[a] += dot(instrument, target);
+            for (regressor, &b) in phi.iter().zip(places) {
                 cross[a * k + b] += dot(instrument, regressor);
             }
         }
-        if with_covariance {
-            filtered.push(Filtered { phi, psi, places, target });
-        }
     }
-    let inverse = small::scaled_inverse(&cross, k)?;
-    let x: Vec<f64> = (0..k).map(|a| dot(&inverse[a * k..(a + 1) * k], &rhs)).collect();
+    let solved = Scaled::new(&cross, k)?;
+    let x = solved.solve(&rhs);
     let mut solution: Solution = fixed.iter().map(|f| f.unwrap_or(0.0)).collect();
     for (&j, &value) in free.iter().zip(&x) {
         solution[j] = value;
@@ -168,10 +194,10 @@ pub fn step(
     let mut covariance = Vec::new();
     if with_covariance {
         let mut meat = vec![0.0; k * k];
-        for part in &filtered {
-            long_run(&part.scores(&x), &part.places, &mut meat, k);
+        for (part, instruments) in filtered.iter().zip(&instruments) {
+            long_run(&part.scores(instruments, &x), &instruments.places, &mut meat, k);
         }
-        let n = free.len();
+        let (n, inverse) = (free.len(), solved.inverse());
         covariance = vec![0.0; n * n];
         for a in 0..n {
             for b in 0..n {
@@ -188,22 +214,20 @@ pub fn step(
     Ok((solution, covariance))
 }
 
-/// Regressors, instruments and target of one record behind the filter, and the unknown of each column.
+/// Regressors and target of one record behind the filter.
 struct Filtered {
     phi: Vec<Vec<f64>>,
-    psi: Vec<Vec<f64>>,
-    places: Vec<usize>,
     target: Vec<f64>,
 }
 
 impl Filtered {
     /// ψ e at a solution, a row each instrument.
-    fn scores(&self, x: &[f64]) -> Vec<Vec<f64>> {
+    fn scores(&self, instruments: &Instruments, x: &[f64]) -> Vec<Vec<f64>> {
         let mut rest = self.target.clone();
-        for (column, &place) in self.phi.iter().zip(&self.places) {
+        for (column, &place) in self.phi.iter().zip(&instruments.places) {
             rest.iter_mut().zip(column).for_each(|(e, v)| *e -= x[place] * v);
         }
-        self.psi.iter().map(|p| p.iter().zip(&rest).map(|(p, e)| p * e).collect()).collect()
+        instruments.columns.iter().map(|p| p.iter().zip(&rest).map(|(p, e)| p * e).collect()).collect()
     }
 }
 

@@ -1,5 +1,6 @@
 //! The test vectors on one record: what each says of a candidate's error there.
 
+use crate::abreast;
 use crate::dense;
 use crate::lanes::WIDTH;
 use crate::regressors::Bank;
@@ -67,8 +68,11 @@ impl Probes {
         let own: Vec<usize> = (0..bank.len()).filter(|&p| output_error && !bank.kernel(p).is_empty()).collect();
         let mut rows = vec![NONE; bank.len()];
         own.iter().enumerate().for_each(|(row, &p)| rows[p] = row);
-        let rounding =
-            (0..bank.len()).map(|p| unit * (sum(bank.column(p)) + sum(bank.kernel(p)) * size_of_target)).collect();
+        let rounding = abreast::map(
+            (0..bank.len()).collect(),
+            || (),
+            |(), p| unit * (sum(bank.column(p)) + sum(bank.kernel(p)) * size_of_target),
+        );
         let effects = effects(bank, &own, &vectors, &sizes, norm, unit);
         let size = (0..groups).map(|g| std::array::from_fn(|n| sizes[g * WIDTH + n])).collect();
         Self {

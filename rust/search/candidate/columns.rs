@@ -22,6 +22,12 @@ impl<const L: usize> Columns<L> {
         Self { at: [at; L], same: true, run: false }
     }
 
+    /// Columns that ascend.
+    #[inline(always)]
+    pub(super) fn ascending(at: [usize; L]) -> Self {
+        Self { at, same: L == 1, run: at[L - 1] - at[0] == L - 1 }
+    }
+
     #[inline(always)]
     pub(crate) fn compare(&mut self) {
         let first = self.at[0];

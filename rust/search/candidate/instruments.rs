@@ -1,6 +1,7 @@
 //! The coefficient step of an order search by refined instrumental variables: spectra of every regressor, made once for
 //! all candidates.
 
+use crate::abreast;
 use crate::error::{Error, Result};
 use crate::estimate::iv::{low_pass, power_frequency, refine, Scratch, Settings, Source};
 use crate::regressors::{Bank, Index, Record};
@@ -31,12 +32,17 @@ impl Refiner {
         let shelves = records
             .iter()
             .zip(banks)
-            .map(|(record, bank)| Shelf {
-                columns: (0..bank.len()).map(|p| Kernel::new(bank.column(p))).collect(),
-                kernels: (0..bank.len())
-                    .map(|p| Some(bank.kernel(p)).filter(|k| !k.is_empty()).map(Kernel::new))
-                    .collect(),
-                target: Kernel::new(record.signal(output)),
+            .map(|(record, bank)| {
+                let all = || (0..bank.len()).collect();
+                Shelf {
+                    columns: abreast::map(all(), || (), |(), p| Kernel::new(bank.column(p))),
+                    kernels: abreast::map(
+                        all(),
+                        || (),
+                        |(), p| Some(bank.kernel(p)).filter(|k| !k.is_empty()).map(Kernel::new),
+                    ),
+                    target: Kernel::new(record.signal(output)),
+                }
             })
             .collect();
         Self { shelves, settings }

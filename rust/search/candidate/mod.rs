@@ -7,3 +7,4 @@ pub(crate) mod needed;
 pub(crate) mod normal;
 pub(crate) mod problem;
 pub(crate) mod squares;
+pub(crate) mod stretch;

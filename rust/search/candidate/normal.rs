@@ -184,9 +184,7 @@ impl NormalEquations {
 
 /// Gram matrix of a bank's columns and the target, (columns + 1)² row-major.
 pub(super) fn plain_gram(bank: &Bank, target: &[f64]) -> Vec<f64> {
-    let mut columns: Vec<&[f64]> = (0..bank.len()).map(|i| bank.column(i)).collect();
-    columns.push(target);
-    dense::gram(&columns)
+    dense::gram(bank.columns(), target)
 }
 
 /// Gives a Gram matrix multi-innovation weights: p on all rows but the last p − 1.

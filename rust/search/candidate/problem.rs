@@ -203,7 +203,9 @@ impl Problem {
             banks,
             targets,
             equations: NormalEquations::new(Normal::new(&sum, width, prior), parts, fixed),
-            squares: options.scored_by_products().then(|| Squares::new(unweighted, width, samples)),
+            squares: options
+                .scored_by_products()
+                .then(|| Squares::new(unweighted, width, samples, fixed.len(), options.weights())),
             bound: None,
             adapted: None,
             refiner,

@@ -151,6 +151,17 @@ impl<'a> Cursor<'a> {
         (whole && (digit..digit + len).all(|i| self.completions[g].has(i))).then(|| (group.terms[group.last()], digit))
     }
 
+    /// The term, and its position in its axis, that alone changes over this and the next candidates, by one position each,
+    /// and how many candidates these are; none where no order varies.
+    #[inline]
+    pub(crate) fn run(&self) -> Option<(usize, usize, usize)> {
+        let slices = &self.lattice.blocks[self.block].slices;
+        let g = (0..slices.len()).rev().find(|&g| slices[g].count > 1)?;
+        let group = &self.lattice.groups[g];
+        let digit = self.digits[g][group.last()];
+        Some((group.terms[group.last()], digit, self.completions[g].run(digit)))
+    }
+
     /// Goes over this many candidates of a stretch.
     #[inline]
     pub(crate) fn skip(&mut self, count: usize) {

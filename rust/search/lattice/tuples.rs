@@ -57,6 +57,20 @@ impl Bits {
         }
     }
 
+    /// How many members follow one another from here on, it included.
+    pub(super) fn run(&self, from: usize) -> usize {
+        let mut at = from;
+        while let Some(&word) = self.0.get(at / 64) {
+            let left = 64 - at % 64;
+            let here = (!word >> (at % 64)).trailing_zeros() as usize;
+            if here < left {
+                return at + here - from;
+            }
+            at += left;
+        }
+        at - from
+    }
+
     /// The member with `rank` members before it.
     pub(super) fn select(&self, mut rank: u64) -> Option<usize> {
         for (word, &bits) in self.0.iter().enumerate() {

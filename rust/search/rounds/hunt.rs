@@ -17,8 +17,9 @@ use crate::search::threads::PerThread;
 
 /// Pulses of all candidates followed between two checkpoints: a tenth of a second or so of one core.
 const PIECE: usize = 1 << 21;
-/// Candidates that a thread screens at a time.
+/// Candidates that a thread screens at a time: those that the Gram matrix alone ranks cost a nanosecond or so.
 const CHUNK: u64 = 512;
+const CHUNK_PLAIN: u64 = 1 << 13;
 /// First and largest number of candidates followed between two looks at the kept scores.
 const FOLLOWED: (u64, u64) = (256, 16_384);
 /// First and largest number of refined candidates followed between two looks at the kept scores: each takes about a
@@ -110,6 +111,9 @@ impl<'a> Hunt<'a> {
     /// The candidates of a round in chunks: those of a large slab together, others a few at a time.
     fn chunks(&self, start: u64, end: u64, limit: f64) -> Vec<(u64, u64, Option<Slab>)> {
         let mut chunks = Vec::new();
+        // Beside boxes a chunk must not reach far into the next slab.
+        let plain = self.catalogue.problem.squares.is_some() && self.boxes.is_none();
+        let chunk = if plain { CHUNK_PLAIN } else { CHUNK };
         let mut at = start;
         while at < end {
             let boxed = self.boxes.filter(|_| limit < f64::INFINITY).and_then(|_| self.catalogue.lattice.slab(at));
@@ -121,7 +125,7 @@ impl<'a> Hunt<'a> {
                     continue;
                 }
             }
-            let to = end.min(at + CHUNK);
+            let to = end.min(at + chunk);
             chunks.push((at, to, None));
             at = to;
         }

@@ -160,8 +160,10 @@ impl<'a> Stage<'a> {
         budget.check(options.memory)?;
         let mut tables = Vec::with_capacity(equations.len());
         for (e, (index, candidates, used)) in indices.into_iter().enumerate() {
-            let problem = Problem::new(records, equations[e].output, index, &fixed[e], options)?;
-            let problem = pool.install(|| problem.with_bound(used.len() as u64));
+            let problem = pool.install(|| {
+                let problem = Problem::new(records, equations[e].output, index, &fixed[e], options)?;
+                Ok(problem.with_bound(used.len() as u64))
+            })?;
             tables.push(Table { problem, candidates, used, scale: scales[e] });
         }
         let stage = Self { lattice, options: options.clone(), tables, samples };
