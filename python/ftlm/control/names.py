@@ -44,7 +44,7 @@ def positive(name: str, value: object) -> float:
     """A finite number above 0."""
     number = real_number(name, value)
     if not (math.isfinite(number) and number > 0):
-        raise ModelError(f"{name} = {value!r} is not a finite number above 0")
+        raise ModelError(f"{name} = {shown(value)} is not a finite number above 0")
     return number
 
 

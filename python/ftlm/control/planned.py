@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import real_number, whole_number
+from ftlm.base.checks import real_number, shown, whole_number
 from ftlm.base.errors import DataError, ModelError
 from ftlm.control.margins import Plant
 from ftlm.control.names import positive, sums
@@ -110,13 +110,15 @@ def smooth_move(
     """
     reach = real_number("size", size)
     if not math.isfinite(reach):
-        raise ModelError(f"size = {size!r} is not a finite number")
+        raise ModelError(f"size = {shown(size)} is not a finite number")
     times = positive("duration", duration), positive("rate", rate)
     rests = [real_number(n, v) for n, v in (("before", before), ("after", after))]
     if not all(0 <= r < math.inf for r in rests):
         raise ModelError(f"before = {before!r} and after = {after!r} are not seconds from 0")
     if times[0] * times[1] < 10:
-        raise ModelError(f"duration = {duration!r} s has fewer than ten samples at {times[1]:g} Hz; give it more time")
+        raise ModelError(
+            f"duration = {shown(duration)} s has fewer than ten samples at {times[1]:g} Hz; give it more time"
+        )
     rows = (sum(rests) + times[0]) * times[1] + 1
     if rows > MOST:
         raise ModelError(f"a move of {rows:.4g} samples is longer than {MOST}; give it less time")
@@ -164,12 +166,12 @@ def inverse(
     rows = _path(path)
     count, start = whole_number(samples), whole_number(seed)
     if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {samples!r} is no whole number from 0 to 10000")
+        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
     if start is None or start < 0:
-        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
+        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
     most = real_number("limit", limit)
     if not most > 0:
-        raise ModelError(f"limit = {limit!r} is not a number above 0")
+        raise ModelError(f"limit = {shown(limit)} is not a number above 0")
     names = tuple(p.output for p in design.plants)
     row = sums("of", names[0] if of is None and len(names) == 1 else of, names)
     size = 1 << math.ceil(math.log2(LONGER * len(rows)))
@@ -230,8 +232,8 @@ def inverse(
             f"the path itself as the reference leaves {plain:.2g}; {known_least(design.plants[0].model)}; identify "
             "from a longer or richer run (ftlm design-input lays it out)"
         )
-    shown = {n: back(needed * line) for n, line in zip(names, outputs, strict=True)}
-    return PlannedMove(reference, rows, asked, shown, worst, plain)
+    ways = {n: back(needed * line) for n, line in zip(names, outputs, strict=True)}
+    return PlannedMove(reference, rows, asked, ways, worst, plain)
 
 
 def _path(path: ArrayLike) -> Floats:

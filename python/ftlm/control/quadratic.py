@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import real_number, whole_number
+from ftlm.base.checks import real_number, shown, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.control.kalman import UNKNOWN, Observer, filtered, noises, plants_of
 from ftlm.control.margins import Margins, Plant, margins_of, margins_told
@@ -49,7 +49,7 @@ class Lqg:
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
         most = real_number("limit", limit)
         if not most > 0:
-            raise ModelError(f"limit = {limit!r} is not a number above 0")
+            raise ModelError(f"limit = {shown(limit)} is not a number above 0")
         self.observer, self.tracked, self.limit = observer, tracked, most
         realisation = observer.realisation
         self.rate = realisation.rate
@@ -251,9 +251,9 @@ def lqg(
     """
     count, start = whole_number(samples), whole_number(seed)
     if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {samples!r} is no whole number from 0 to 10000")
+        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
     if start is None or start < 0:
-        raise ModelError(f"seed = {seed!r} is not a whole number from 0")
+        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
     dear = positive("effort", effort)
     walks = 0.2 * dear if drift is None else positive("drift", drift)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)

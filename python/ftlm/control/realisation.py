@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import real_number, whole_number
+from ftlm.base.checks import real_number, shown, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.control.margins import Plant
 from ftlm.solve.modes import modes
@@ -110,7 +110,7 @@ def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: i
     else:
         count = whole_number(poles)
         if count is None or not FEWEST <= count <= MOST:
-            raise ModelError(f"poles = {poles!r} is no whole number from {FEWEST} to {MOST}")
+            raise ModelError(f"poles = {shown(poles)} is no whole number from {FEWEST} to {MOST}")
         counts = [count]
     library = python_control()
     w = np.geomspace(low, high, FITTED)
