@@ -17,6 +17,7 @@ from ftlm.app.recipe import LOSSES, METHODS, OFFSETS
 from ftlm.data.units import TIME_UNITS, UNITS
 from ftlm.files.layout import DATES, DECIMALS, SEPARATORS
 from ftlm.paint.lines import chart_css
+from ftlm.paint.page import chart_script, look
 from ftlm.paint.text import number
 
 #: Ways of Python to say something, and those of the page.
@@ -62,14 +63,14 @@ def _rendered(template: str, **told: Any) -> str:
 
 @cache
 def script() -> str:
-    """The page's script."""
-    return _read("app.js")
+    """The page's script, behind that of its charts."""
+    return f"{chart_script()}\n{_read('app.js')}"
 
 
 @cache
 def style() -> str:
-    """The page's style, with the colours of charts."""
-    return f"{_read('app.css')}\n{chart_css()}"
+    """The look of the reports, and what the page has beyond it."""
+    return f"{look()}\n{chart_css()}\n{_read('app.css')}"
 
 
 def page_words(text: str) -> str:
