@@ -21,6 +21,7 @@ import ftlm
 from ftlm.app import desk as desks
 from ftlm.app import serve, view
 from ftlm.app.child import Task, TaskError
+from ftlm.app.connection import PATIENCE, patient
 from ftlm.app.desk import Desk, safe_name
 from ftlm.app.fields import asked_of
 from ftlm.app.recipe import NAMED, Reading, Recipe, checked_structures, cut_at
@@ -741,6 +742,157 @@ def test_progress_is_told_in_shares_and_words():
     desks._note(model, {"done": 10, "total": 20})
     assert model.share is None
     assert model.left == "10 of 20 candidates known so far are fitted"
+
+
+# -------------------------------------------------------------------------------------- clients that keep it waiting
+
+
+class Wire:
+    """The other end of a connection, with a clock of its own: what was written, whether it was cut."""
+
+    def __init__(self):
+        self.now, self.due, self.unread, self.cut, self.closing = 0.0, [], 0, False, False
+        self.written = b""
+
+    def time(self):
+        return self.now
+
+    def call_later(self, seconds, call):
+        handle = asyncio.TimerHandle(self.now + seconds, call, (), self)
+        self.due.append(handle)
+        return handle
+
+    def _timer_handle_cancelled(self, handle):
+        self.due = [h for h in self.due if h is not handle]
+
+    def call_exception_handler(self, context):
+        raise context["exception"]
+
+    def get_debug(self):
+        return False
+
+    def create_task(self, coroutine, **_):
+        coroutine.close()
+        return type("Done", (), {"add_done_callback": lambda self, call: None})()
+
+    def get_write_buffer_size(self):
+        return self.unread
+
+    def abort(self):
+        self.cut = True
+
+    def is_closing(self):
+        return self.closing
+
+    def close(self):
+        self.closing = True
+
+    def write(self, data):
+        self.written += data
+
+    def get_extra_info(self, _):
+        return None
+
+    def pause_reading(self):
+        pass
+
+    resume_reading = pause_reading
+
+    def pass_time(self, seconds):
+        end = self.now + seconds
+        while self.due and (first := min(self.due, key=lambda h: h.when())).when() <= end and not self.cut:
+            self.now = first.when()
+            self.due.remove(first)
+            first._run()
+        self.now = end
+
+
+async def nobody(scope, receive, send):
+    """An application that is never asked."""
+
+
+def answered(connection):
+    """A connection whose request has been answered."""
+    h11 = pytest.importorskip("h11")
+    connection.conn.send(h11.Response(status_code=200, headers=[("content-length", "0")]))
+    connection.conn.send(h11.EndOfMessage())
+    connection.on_response_complete()
+
+
+@pytest.fixture
+def wired():
+    uvicorn = pytest.importorskip("uvicorn")
+    from uvicorn.server import ServerState
+
+    def make():
+        config = uvicorn.Config(nobody, lifespan="off", ws="none", timeout_keep_alive=15, log_config=None)
+        wire = Wire()
+        connection = patient()(config, ServerState(), {}, wire)
+        connection.connection_made(wire)
+        return wire, connection, PATIENCE
+
+    return make
+
+
+HEAD = b"POST /x/files HTTP/1.1\r\nHost: x\r\nContent-Length: 1000\r\n\r\n"
+
+
+@pytest.mark.parametrize("begun", [b"", b"G", HEAD[:-2]])
+def test_who_opens_a_connection_and_says_nothing_loses_it(wired, begun):
+    wire, connection, patience = wired()
+    assert connection in connection.connections
+    if begun:
+        connection.data_received(begun)
+    wire.pass_time(0.9 * patience)
+    assert not wire.cut
+    wire.pass_time(0.7 * patience)
+    assert wire.cut
+    connection.connection_lost(None)
+    assert connection not in connection.connections
+
+
+def test_a_head_that_drips_is_no_sign_of_life(wired):
+    wire, connection, patience = wired()
+    for k in range(30):
+        if not wire.cut:
+            connection.data_received(HEAD[k : k + 1])
+            wire.pass_time(patience / 10)
+    assert wire.cut
+    assert wire.now <= 3.1 * patience
+
+
+def test_a_body_may_take_its_time_as_long_as_it_comes(wired):
+    wire, connection, patience = wired()
+    connection.data_received(HEAD)
+    for _ in range(9):
+        connection.data_received(b"x" * 100)
+        wire.pass_time(0.9 * patience)
+    assert not wire.cut
+    wire.pass_time(patience)
+    assert wire.cut
+
+
+def test_work_on_a_request_may_take_as_long_as_it_takes(wired):
+    wire, connection, patience = wired()
+    connection.data_received(HEAD + b"x" * 1000)
+    wire.pass_time(50 * patience)
+    assert not wire.cut
+    answered(connection)
+    connection.data_received(b"GE")
+    wire.pass_time(1.6 * patience)
+    assert wire.cut
+
+
+def test_who_does_not_read_an_answer_loses_it(wired):
+    wire, connection, patience = wired()
+    connection.data_received(HEAD + b"x" * 1000)
+    answered(connection)
+    for unread in (9000, 5000, 100):
+        wire.unread = unread
+        wire.pass_time(0.9 * patience)
+    assert not wire.cut
+    wire.pass_time(2 * patience)
+    assert wire.cut
 
 
 # ----------------------------------------------------------------------------------------------------- the command
