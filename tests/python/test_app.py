@@ -231,12 +231,16 @@ def test_no_file_of_the_machine_is_read_through_a_path(used, path):
 def test_ways_that_a_path_does_not_have_are_refused(used):
     (key,), (model,) = used.desk.files, used.desk.models
     paths = ["", "app.js", "app.css", "state", "files", "models", "check", "comparison", f"files/{key}",
-             f"models/{model}", f"models/{model}/stop", f"models/{model}/report", "files/0", "models/0"]  # fmt: skip
+             f"models/{model}", f"models/{model}/stop", f"models/{model}/resume", f"models/{model}/report", "files/0",
+             "models/0"]  # fmt: skip
     for path in paths:
         for method in ("PUT", "PATCH", "OPTIONS", "TRACE", "CONNECT", "PROPFIND", "X" * 50):
             status, _, _ = used.own(method, path)
             assert status in (404, 405), (method, path)
     assert used.own("GET", "files")[0] == used.own("DELETE", "models")[0] == 405
+    assert used.own("GET", f"models/{model}/resume")[0] == 405
+    # What is made stays made.
+    assert used.own("POST", f"models/{model}/resume", {})[0] == 200
     assert list(used.desk.files) == [key]
     assert used.desk.models[model].state == "made"
 
@@ -657,6 +661,82 @@ def test_models_wait_for_each_other_and_stop_in_any_state(page, monkeypatch):
         monkeypatch.setattr(desks, "MOST_MODELS", len(desk.models))
         with pytest.raises(DataError, match="are kept"):
             desk.start(LONG)
+
+    page.loop(course())
+
+
+class Quiet:
+    """Told how far it is."""
+
+    def phase(self, words):
+        pass
+
+    def __call__(self, done, total):
+        pass
+
+
+def test_a_choice_that_was_stopped_goes_on_where_it_was(tmp_path, content, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("lag.csv").write_bytes(content)
+    options = json.loads(json.dumps(ftlm.open_file("lag.csv").to_dict()["options"]))
+    words = tuple(f"D y = a0 y + b0 u{more}" for more in ("", " + c", " + b1 D^0.5 u"))
+    recipe = Recipe(Reading("lag.csv", options), share=0.25, structure=words, way="offered")
+    plain, store = recipe.made(Quiet()), Path("choice.ftlm")
+    recipe.made(Quiet(), str(store))
+    whole = store.read_bytes()
+    # As a kill in the middle leaves it.
+    store.write_bytes(whole[: len(whole) // 2])
+    went_on = recipe.made(Quiet(), str(store))
+    assert store.stat().st_size == len(whole)
+    assert store.read_bytes()[: len(whole) // 4] == whole[: len(whole) // 4]
+    assert went_on.choice.reason == plain.choice.reason
+    assert went_on.result.coefficients == plain.result.coefficients
+    # Nothing is left to be fitted, so nothing is kept once more.
+    again = store.read_bytes()
+    recipe.made(Quiet(), str(store))
+    assert store.read_bytes() == again
+
+
+def test_what_was_stopped_goes_on_with_the_same_store_as_long_as_its_file_is_there(page, monkeypatch):
+    asked = []
+
+    async def noted(self, seconds=None):
+        asked.append(self._asked["store"])
+        await asleep(self)
+
+    monkeypatch.setattr(Task, "answer", noted)
+    choice = Recipe(Reading("a.csv"), structure=("D y = a y + b u",), way="inside")
+
+    async def course():
+        desk = page.desk
+        await put_beside(desk, "a.csv", 1)
+        model, fit = desk.start(choice), desk.start(LONG)
+        for one in (model, fit):
+            await asyncio.sleep(0.03)
+            desk.stop(one.key)
+        await asyncio.sleep(0.03)
+        (desk.folder / f"{model.key}.ftlm").write_bytes(b"x")
+        assert "Go on" in view.model(model)
+        assert "Start again" in view.model(fit)
+        for one in (model, fit):
+            before = one.version
+            assert desk.resume(one.key) is one
+            assert (one.state, one.version) == ("waiting", before + 1)
+            await asyncio.sleep(0.03)
+            assert one.state == "running"
+            # Who asks twice has it once.
+            assert desk.resume(one.key).version == before + 2
+            desk.stop(one.key)
+            await asyncio.sleep(0.03)
+        assert asked == [f"{model.key}.ftlm", None, f"{model.key}.ftlm", None]
+        # Another file of that name is another file.
+        desk.remove_file("a.csv")
+        desk.files["other"] = desks.File("other", "a.csv", 1)
+        with pytest.raises(DataError, match="no longer on the page"):
+            desk.resume(model.key)
+        assert model.state == "stopped"
+        desk.remove_model(model.key)
+        assert not (desk.folder / f"{model.key}.ftlm").exists()
 
     page.loop(course())
 

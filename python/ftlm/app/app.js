@@ -122,8 +122,10 @@ document.addEventListener("click", async (event) => {
   if (!button) return;
   const card = button.closest(".card"), key = card.dataset.key;
   try {
-    if (button.dataset.do === "stop") put(models, await send(`models/${key}/stop`, {}));
-    else {
+    if (button.dataset.do === "stop" || button.dataset.do === "resume") {
+      put(models, await send(`models/${key}/${button.dataset.do}`, {})).querySelector("button")?.focus();
+      soon();
+    } else {
       await request(`${button.dataset.do === "remove-file" ? "files" : "models"}/${key}`, { method: "DELETE" });
       card.remove();
       say("Removed.");
