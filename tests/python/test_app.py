@@ -34,6 +34,14 @@ HOSTILE = "<script>hacked=1</script><img src=x onerror=hacked=1>\"' & {{70707*7}
 RAW = "application/octet-stream"
 
 
+@pytest.fixture(scope="module", autouse=True)
+def patience():
+    """A busy machine may take long to open a file; the answers here are those of one that is open."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(desks, "PATIENCE", 250.0)
+        yield
+
+
 @pytest.fixture(scope="module")
 def loop():
     with asyncio.Runner() as runner:
@@ -106,7 +114,7 @@ def content():
 
 
 @pytest.fixture(scope="module")
-def used(tmp_path_factory, loop, content):
+def used(tmp_path_factory, loop, content, patience):
     """A page with a file and the model of it."""
     made = Page(tmp_path_factory.mktemp("used") / "desk", loop)
     status, _, _ = made.upload("lag.csv", content)
