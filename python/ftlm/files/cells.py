@@ -40,13 +40,18 @@ def grouping(cell: str, *, comma: bool) -> str | None:
     return None
 
 
+def may_group(cell: str, mark: str, *, comma: bool) -> bool:
+    """Whether a cell is a number whose thousands this mark may group, decimals behind it or not."""
+    return _grouped(mark, comma).fullmatch(cell) is not None
+
+
 def number(cell: str, *, comma: bool = False, mark: str | None = None) -> float:
     """Return the number in a cell; `ValueError` where there is none.
 
     Python's numbers may have underscores between their digits, those of files have not; where commas are decimal,
     points may group digits, so that a number with one is none unless `mark` says that they do.
     """
-    if mark is not None and _grouped(mark, comma).fullmatch(cell):
+    if mark is not None and may_group(cell, mark, comma=comma):
         cell = re.sub(THOUSANDS[mark], "", cell)
     if "_" in cell or (comma and "." in cell):
         raise ValueError(cell)

@@ -18,7 +18,17 @@ import numpy.typing as npt
 from ftlm.base.checks import bad_rows
 from ftlm.base.errors import DataError
 from ftlm.data.header import LONGEST_HEADER, header_of_line
-from ftlm.files.cells import DECIMAL_COMMA, behind_a_stroke, grouping, is_gap, is_number, number, split, stated_unit
+from ftlm.files.cells import (
+    DECIMAL_COMMA,
+    behind_a_stroke,
+    grouping,
+    is_gap,
+    is_number,
+    may_group,
+    number,
+    split,
+    stated_unit,
+)
 from ftlm.files.columns import Column, FileTable
 from ftlm.files.layout import Assumption, Layout
 from ftlm.files.moments import Moments, is_moment
@@ -63,7 +73,9 @@ class _Trouble:
             way_out = f"say layout=dict(thousands={mark!r}), or write all numbers without"
         elif self.comma and "." in text and is_number(text):
             what = f"{shown} has a point where decimals follow a comma"
-            way_out = "write all numbers alike, or say layout=dict(thousands='point') where points group thousands"
+            way_out = "write all numbers alike"
+            if may_group(text, "point", comma=True):
+                way_out += ", or say layout=dict(thousands='point') where points group thousands"
         elif DECIMAL_COMMA.fullmatch(text):
             what = f"{shown} has a decimal comma"
             way_out = "write all numbers alike, or say layout=dict(decimal='comma') where all of them have commas"
