@@ -19,6 +19,7 @@ from ftlm.data.units import header_time
 from ftlm.files.columns import Column, FileTable, Pool, order_of_dates
 from ftlm.files.layout import Assumption, Layout
 from ftlm.files.load import Options, PathLike, Wanted, header_of, load, run_from, tables_of, wanted_of
+from ftlm.files.response import is_response
 from ftlm.files.roles import guessed_roles, known_unit, signal_names
 
 _SHOWN = 40
@@ -253,6 +254,15 @@ class _Opening:
         try:
             clock, assumed = self.pool.time(wanted.time, used)
         except DataError as error:
+            if is_response(self.pool):
+                return (
+                    None,
+                    (),
+                    (
+                        "these are columns of a frequency response or an impedance spectrum, and none is a time; "
+                        "ftlm.load_frequency and ftlm identify-frequency read it as such"
+                    ),
+                )
             return None, (), str(error)
         if assumed is not None:
             return clock, (assumed,), ""

@@ -128,6 +128,15 @@ def load_frequency(
     return FrequencyData(omega, response, deviation, output, input, unit, label, tuple(notes))
 
 
+def is_response(pool: Pool) -> bool:
+    """Whether names of columns tell the parts of a frequency response."""
+    try:
+        _known(pool)
+    except DataError:
+        return False
+    return True
+
+
 def _known(pool: Pool) -> dict[str, _Found]:
     """Columns by what they are called; two of one part are refused."""
     found: dict[str, _Found] = {}
