@@ -4,7 +4,7 @@
 2 % of the deviation, validated on another input without noise. The records are Grünwald-Letnikov runs at a fortieth of
 the step: neither rival's own scheme. SciPy starts at coefficients of one with their signs and whole orders, and at five
 more places of which the best counts; its intervals are of its Jacobian. FOMCON under Octave is not measured: Octave is
-packaged, FOMCON is in no registry of packages; its manual describes this scheme.
+packaged, FOMCON is in no registry of packages.
 """
 
 from __future__ import annotations

@@ -186,7 +186,7 @@ def _check_parts(found: Mapping[str, _Found], pool: Pool) -> None:
 
 def _parted(column: Column) -> tuple[str, str]:
     """A column's name without its unit, and the unit as written: ``freq/Hz``, ``f_Hz``, ``f (Hz)``."""
-    bare, unit = stated_unit(column.name)
+    bare, unit = stated_unit(column.written)
     if unit:
         return bare, unit
     bare, unit = column.name.strip(), column.stated
