@@ -664,7 +664,7 @@ def test_units_behind_a_stroke_are_units(tmp_path):
 def test_units_behind_a_stroke_are_those_of_a_spectrum_too(tmp_path):
     rows = "".join(f"{k + 1},{k + 2},{k + 3}\n" for k in range(9))
     data = ftlm.load_frequency(write(tmp_path, "freq/Hz,Re(Z)/mOhm,-Im(Z)/mOhm\n" + rows))
-    assert data.omega[0] == pytest.approx(2 * np.pi)
+    assert data.frequency[0] == pytest.approx(2 * np.pi)
     assert data.response[0] == pytest.approx(0.002 - 0.003j)
 
 
