@@ -14,8 +14,8 @@ STOREYS = (
 LEVEL = {folder: level for level, folders in enumerate(STOREYS) for folder in folders}
 #: What a function may import for itself: what need not be installed, is slow to start, or is there on one system only.
 LATE = {
-    "control", "fcntl", "h5py", "jinja2", "matplotlib", "msvcrt", "numpy", "pandas", "polars", "pyarrow", "pygad",
-    "python_calamine", "quanser", "resource", "rich", "scipy", "typer", "uvicorn", "xarray",
+    "control", "fcntl", "h11", "h5py", "jinja2", "matplotlib", "msvcrt", "numpy", "pandas", "polars", "pyarrow",
+    "pygad", "python_calamine", "quanser", "resource", "rich", "scipy", "typer", "uvicorn", "xarray",
 }  # fmt: skip
 LONGEST = 600
 FACE = 12

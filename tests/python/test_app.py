@@ -21,6 +21,7 @@ import ftlm
 from ftlm.app import desk as desks
 from ftlm.app import serve, view
 from ftlm.app.child import Task, TaskError
+from ftlm.app.connection import PATIENCE, patient
 from ftlm.app.desk import Desk, safe_name
 from ftlm.app.fields import asked_of
 from ftlm.app.recipe import NAMED, Reading, Recipe, checked_structures, cut_at
@@ -31,6 +32,14 @@ from ftlm.errors import DataError, FtlmError, ModelError
 TOKEN, HOST = "0123456789abcdef", "127.0.0.1:8347"
 HOSTILE = "<script>hacked=1</script><img src=x onerror=hacked=1>\"' & {{70707*7}}"
 RAW = "application/octet-stream"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def patience():
+    """A busy machine may take long to open a file; the answers here are those of one that is open."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(desks, "PATIENCE", 250.0)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +114,7 @@ def content():
 
 
 @pytest.fixture(scope="module")
-def used(tmp_path_factory, loop, content):
+def used(tmp_path_factory, loop, content, patience):
     """A page with a file and the model of it."""
     made = Page(tmp_path_factory.mktemp("used") / "desk", loop)
     status, _, _ = made.upload("lag.csv", content)
@@ -230,12 +239,16 @@ def test_no_file_of_the_machine_is_read_through_a_path(used, path):
 def test_ways_that_a_path_does_not_have_are_refused(used):
     (key,), (model,) = used.desk.files, used.desk.models
     paths = ["", "app.js", "app.css", "state", "files", "models", "check", "comparison", f"files/{key}",
-             f"models/{model}", f"models/{model}/stop", f"models/{model}/report", "files/0", "models/0"]  # fmt: skip
+             f"models/{model}", f"models/{model}/stop", f"models/{model}/resume", f"models/{model}/report", "files/0",
+             "models/0"]  # fmt: skip
     for path in paths:
         for method in ("PUT", "PATCH", "OPTIONS", "TRACE", "CONNECT", "PROPFIND", "X" * 50):
             status, _, _ = used.own(method, path)
             assert status in (404, 405), (method, path)
     assert used.own("GET", "files")[0] == used.own("DELETE", "models")[0] == 405
+    assert used.own("GET", f"models/{model}/resume")[0] == 405
+    # What is made stays made.
+    assert used.own("POST", f"models/{model}/resume", {})[0] == 200
     assert list(used.desk.files) == [key]
     assert used.desk.models[model].state == "made"
 
@@ -660,6 +673,82 @@ def test_models_wait_for_each_other_and_stop_in_any_state(page, monkeypatch):
     page.loop(course())
 
 
+class Quiet:
+    """Told how far it is."""
+
+    def phase(self, words):
+        pass
+
+    def __call__(self, done, total):
+        pass
+
+
+def test_a_choice_that_was_stopped_goes_on_where_it_was(tmp_path, content, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("lag.csv").write_bytes(content)
+    options = json.loads(json.dumps(ftlm.open_file("lag.csv").to_dict()["options"]))
+    words = tuple(f"D y = a0 y + b0 u{more}" for more in ("", " + c", " + b1 D^0.5 u"))
+    recipe = Recipe(Reading("lag.csv", options), share=0.25, structure=words, way="offered")
+    plain, store = recipe.made(Quiet()), Path("choice.ftlm")
+    recipe.made(Quiet(), str(store))
+    whole = store.read_bytes()
+    # As a kill in the middle leaves it.
+    store.write_bytes(whole[: len(whole) // 2])
+    went_on = recipe.made(Quiet(), str(store))
+    assert store.stat().st_size == len(whole)
+    assert store.read_bytes()[: len(whole) // 4] == whole[: len(whole) // 4]
+    assert went_on.choice.reason == plain.choice.reason
+    assert went_on.result.coefficients == plain.result.coefficients
+    # Nothing is left to be fitted, so nothing is kept once more.
+    again = store.read_bytes()
+    recipe.made(Quiet(), str(store))
+    assert store.read_bytes() == again
+
+
+def test_what_was_stopped_goes_on_with_the_same_store_as_long_as_its_file_is_there(page, monkeypatch):
+    asked = []
+
+    async def noted(self, seconds=None):
+        asked.append(self._asked["store"])
+        await asleep(self)
+
+    monkeypatch.setattr(Task, "answer", noted)
+    choice = Recipe(Reading("a.csv"), structure=("D y = a y + b u",), way="inside")
+
+    async def course():
+        desk = page.desk
+        await put_beside(desk, "a.csv", 1)
+        model, fit = desk.start(choice), desk.start(LONG)
+        for one in (model, fit):
+            await asyncio.sleep(0.03)
+            desk.stop(one.key)
+        await asyncio.sleep(0.03)
+        (desk.folder / f"{model.key}.ftlm").write_bytes(b"x")
+        assert "Go on" in view.model(model)
+        assert "Start again" in view.model(fit)
+        for one in (model, fit):
+            before = one.version
+            assert desk.resume(one.key) is one
+            assert (one.state, one.version) == ("waiting", before + 1)
+            await asyncio.sleep(0.03)
+            assert one.state == "running"
+            # Who asks twice has it once.
+            assert desk.resume(one.key).version == before + 2
+            desk.stop(one.key)
+            await asyncio.sleep(0.03)
+        assert asked == [f"{model.key}.ftlm", None, f"{model.key}.ftlm", None]
+        # Another file of that name is another file.
+        desk.remove_file("a.csv")
+        desk.files["other"] = desks.File("other", "a.csv", 1)
+        with pytest.raises(DataError, match="no longer on the page"):
+            desk.resume(model.key)
+        assert model.state == "stopped"
+        desk.remove_model(model.key)
+        assert not (desk.folder / f"{model.key}.ftlm").exists()
+
+    page.loop(course())
+
+
 def test_a_file_that_takes_long_is_on_the_page_and_can_be_removed(page, monkeypatch):
     monkeypatch.setattr(Task, "answer", asleep)
     monkeypatch.setattr(desks, "PATIENCE", 0.01)
@@ -741,6 +830,157 @@ def test_progress_is_told_in_shares_and_words():
     desks._note(model, {"done": 10, "total": 20})
     assert model.share is None
     assert model.left == "10 of 20 candidates known so far are fitted"
+
+
+# -------------------------------------------------------------------------------------- clients that keep it waiting
+
+
+class Wire:
+    """The other end of a connection, with a clock of its own: what was written, whether it was cut."""
+
+    def __init__(self):
+        self.now, self.due, self.unread, self.cut, self.closing = 0.0, [], 0, False, False
+        self.written = b""
+
+    def time(self):
+        return self.now
+
+    def call_later(self, seconds, call):
+        handle = asyncio.TimerHandle(self.now + seconds, call, (), self)
+        self.due.append(handle)
+        return handle
+
+    def _timer_handle_cancelled(self, handle):
+        self.due = [h for h in self.due if h is not handle]
+
+    def call_exception_handler(self, context):
+        raise context["exception"]
+
+    def get_debug(self):
+        return False
+
+    def create_task(self, coroutine, **_):
+        coroutine.close()
+        return type("Done", (), {"add_done_callback": lambda self, call: None})()
+
+    def get_write_buffer_size(self):
+        return self.unread
+
+    def abort(self):
+        self.cut = True
+
+    def is_closing(self):
+        return self.closing
+
+    def close(self):
+        self.closing = True
+
+    def write(self, data):
+        self.written += data
+
+    def get_extra_info(self, _):
+        return None
+
+    def pause_reading(self):
+        pass
+
+    resume_reading = pause_reading
+
+    def pass_time(self, seconds):
+        end = self.now + seconds
+        while self.due and (first := min(self.due, key=lambda h: h.when())).when() <= end and not self.cut:
+            self.now = first.when()
+            self.due.remove(first)
+            first._run()
+        self.now = end
+
+
+async def nobody(scope, receive, send):
+    """An application that is never asked."""
+
+
+def answered(connection):
+    """A connection whose request has been answered."""
+    h11 = pytest.importorskip("h11")
+    connection.conn.send(h11.Response(status_code=200, headers=[("content-length", "0")]))
+    connection.conn.send(h11.EndOfMessage())
+    connection.on_response_complete()
+
+
+@pytest.fixture
+def wired():
+    uvicorn = pytest.importorskip("uvicorn")
+    from uvicorn.server import ServerState
+
+    def make():
+        config = uvicorn.Config(nobody, lifespan="off", ws="none", timeout_keep_alive=15, log_config=None)
+        wire = Wire()
+        connection = patient()(config, ServerState(), {}, wire)
+        connection.connection_made(wire)
+        return wire, connection, PATIENCE
+
+    return make
+
+
+HEAD = b"POST /x/files HTTP/1.1\r\nHost: x\r\nContent-Length: 1000\r\n\r\n"
+
+
+@pytest.mark.parametrize("begun", [b"", b"G", HEAD[:-2]])
+def test_who_opens_a_connection_and_says_nothing_loses_it(wired, begun):
+    wire, connection, patience = wired()
+    assert connection in connection.connections
+    if begun:
+        connection.data_received(begun)
+    wire.pass_time(0.9 * patience)
+    assert not wire.cut
+    wire.pass_time(0.7 * patience)
+    assert wire.cut
+    connection.connection_lost(None)
+    assert connection not in connection.connections
+
+
+def test_a_head_that_drips_is_no_sign_of_life(wired):
+    wire, connection, patience = wired()
+    for k in range(30):
+        if not wire.cut:
+            connection.data_received(HEAD[k : k + 1])
+            wire.pass_time(patience / 10)
+    assert wire.cut
+    assert wire.now <= 3.1 * patience
+
+
+def test_a_body_may_take_its_time_as_long_as_it_comes(wired):
+    wire, connection, patience = wired()
+    connection.data_received(HEAD)
+    for _ in range(9):
+        connection.data_received(b"x" * 100)
+        wire.pass_time(0.9 * patience)
+    assert not wire.cut
+    wire.pass_time(patience)
+    assert wire.cut
+
+
+def test_work_on_a_request_may_take_as_long_as_it_takes(wired):
+    wire, connection, patience = wired()
+    connection.data_received(HEAD + b"x" * 1000)
+    wire.pass_time(50 * patience)
+    assert not wire.cut
+    answered(connection)
+    connection.data_received(b"GE")
+    wire.pass_time(1.6 * patience)
+    assert wire.cut
+
+
+def test_who_does_not_read_an_answer_loses_it(wired):
+    wire, connection, patience = wired()
+    connection.data_received(HEAD + b"x" * 1000)
+    answered(connection)
+    for unread in (9000, 5000, 100):
+        wire.unread = unread
+        wire.pass_time(0.9 * patience)
+    assert not wire.cut
+    wire.pass_time(2 * patience)
+    assert wire.cut
 
 
 # ----------------------------------------------------------------------------------------------------- the command

@@ -1,6 +1,7 @@
 """Reports in a real browser: no request, no error, zoom, hostile names inert, accessible, whole without scripts."""
 
 import os
+import re
 import shutil
 from dataclasses import replace
 
@@ -22,8 +23,8 @@ WIDTHS = (360, 800, 1280)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory, small_model, small_run, with_noise, reproduction):
-    """Reports of an output-error fit, of a searched model and of a saved model, names hostile; the paper's page."""
+def folder(tmp_path_factory, small_model, small_run, with_noise):
+    """Reports of an output-error fit, of a searched model and of a saved model, names hostile."""
     where = tmp_path_factory.mktemp("pages")
 
     def named(run, words):
@@ -40,13 +41,28 @@ def folder(tmp_path_factory, small_model, small_run, with_noise, reproduction):
     words = "D^alpha y = a D^nu y + c y + b u"
     fit = ftlm.identify(run, replace(ftlm.equation(words), name="fit " + HOSTILE))
     fit.report(where / "fit.html", validation=other)
+    estimated = fit.comparison
+    np.savez(where / "fit.npz", time=estimated.times[0], measured=estimated.measured["y"][0],
+             simulated=estimated.simulated["y"][0])  # fmt: skip
     free = ftlm.equation(words, orders={"alpha": "1.3:1.9:0.1", "nu": "0.2:1.2:0.1"})
     searched = ftlm.identify(run, replace(free, name="search " + HOSTILE), method="multi-innovation")
     warned = replace(searched, warnings=(*searched.warnings, "a warning " + HOSTILE))
     warned.report(where / "search.html")
     model_page(ftlm.load_model(fit.model.save(where / "m.json")), where / "model.html", validation=other)
-    reproduction.page(where / "paper.html")
     return where
+
+
+@pytest.fixture(scope="module")
+def at(request, folder):
+    """Where a page is, by its name; the paper's is made when it is asked for."""
+
+    def path(name):
+        where = folder / f"{name}.html"
+        if not where.exists():
+            request.getfixturevalue("reproduction").page(where)
+        return where
+
+    return path
 
 
 PAGES = ("fit", "search", "model")
@@ -87,13 +103,13 @@ def view_of(page, svg="svg.chart.wide[data-frame]"):
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_a_page_asks_for_nothing_and_complains_of_nothing(browser, folder, name):
-    with Opened(browser, folder / f"{name}.html") as opened:
+def test_a_page_asks_for_nothing_and_complains_of_nothing(browser, at, name):
+    with Opened(browser, at(name)) as opened:
         opened.page.wait_for_timeout(200)
         assert opened.said == []
         assert [url for url in opened.asked if not url.startswith(("file:", "data:"))] == []
         assert len([url for url in opened.asked if url.startswith("file:")]) == 1
-        assert (folder / f"{name}.html").stat().st_size < 2_000_000
+        assert at(name).stat().st_size < 2_000_000
 
 
 @pytest.mark.parametrize("name", PAGES)
@@ -173,14 +189,76 @@ def test_zoom_by_dragging_shows_what_was_dragged_over(browser, folder):
         assert opened.said == []
 
 
+def read(page, k=0):
+    """What the slider of a chart reads out, by its words."""
+    said = page.locator(".slide .reads").nth(k).locator("span")
+    told = [part.inner_text().replace("−", "-").replace("\u00a0", " ").rsplit(" ", 2) for part in said.all()]
+    return {words[0]: float(words[1]) for words in told}
+
+
+@pytest.mark.parametrize("width", [WIDTHS[0], WIDTHS[2]])
+def test_a_slider_reads_out_measured_and_simulated(browser, folder, width):
+    with Opened(browser, folder / "fit.html", viewport={"width": width, "height": 900}) as opened:
+        page = opened.page
+        kept = np.load(folder / "fit.npz")
+        slide = page.locator(".slide").filter(has=page.get_by_label(re.compile("estimation: run"))).first
+        every = page.locator(".slide")
+        assert every.count() == 2
+        own = next(k for k in range(2) if "estimation" in every.nth(k).inner_html())
+        # It begins where the two are farthest apart.
+        apart = np.abs(kept["measured"] - kept["simulated"])
+        far = int(np.argmax(apart))
+        told = read(page, own)
+        assert told["time"] == pytest.approx(kept["time"][far], rel=1e-3)
+        assert told["largest difference"] == pytest.approx(apart[far], rel=2e-3)
+        handle = slide.locator("input")
+        for key, at in (("Home", 0), ("ArrowRight", 1), ("End", -1)):
+            handle.press(key)
+            told = read(page, own)
+            assert told["time"] == pytest.approx(kept["time"][at], abs=1e-3)
+            for name in ("measured", "simulated"):
+                assert told[name] == pytest.approx(kept[name][at], rel=1e-3, abs=1e-5)
+            assert told["difference"] == pytest.approx(apart[at], rel=2e-3, abs=1e-4)
+        assert handle.get_attribute("aria-valuetext").startswith("time ")
+        # Where the chart is zoomed into, its window follows.
+        kind = "narrow" if width < 620 else "wide"
+        figure = page.locator("figure").filter(has=slide)
+        figure.locator(f".zoom.{kind}").get_by_role("button", name="Zoom in").click()
+        chart = figure.locator(f"svg.{kind}[data-frame]")
+        for key, at in (("Home", 0), ("End", -1)):
+            handle.press(key)
+            low, high = [float(v) for v in chart.get_attribute("data-view").split()][:2]
+            assert low <= kept["time"][at] <= high
+            left, _, across, _ = [float(v) for v in chart.get_attribute("data-plot").split()]
+            mark = float(chart.locator(".cursor path").get_attribute("d")[1:].split()[0])
+            assert mark == pytest.approx(left + across * (kept["time"][at] - low) / (high - low), abs=0.1)
+            assert chart.locator(".cursor circle").count() == 2
+        assert opened.said == []
+
+
+def test_a_click_on_a_chart_moves_its_slider(browser, folder):
+    with Opened(browser, folder / "fit.html") as opened:
+        page = opened.page
+        chart = page.locator("svg.wide[data-readings]").first
+        chart.scroll_into_view_if_needed()
+        box, frame = chart.bounding_box(), [float(v) for v in chart.get_attribute("data-frame").split()]
+        left, top, width, height = [float(v) for v in chart.get_attribute("data-plot").split()]
+        scale = box["width"] / float(chart.get_attribute("viewBox").split()[2])
+        page.mouse.click(box["x"] + scale * (left + 0.25 * width), box["y"] + scale * (top + 0.5 * height))
+        span = frame[1] - frame[0]
+        assert read(page)["time"] == pytest.approx(frame[0] + 0.25 * span, abs=0.01 * span)
+        assert chart.get_attribute("data-view") is None
+        assert opened.said == []
+
+
 @pytest.mark.parametrize("name", ALL)
-def test_without_scripts_everything_but_the_zoom_is_there(browser, folder, name):
-    with Opened(browser, folder / f"{name}.html") as opened:
-        opened.page.evaluate("document.querySelectorAll('.zoom').forEach((z) => z.remove())")
+def test_without_scripts_everything_but_zoom_and_sliders_is_there(browser, at, name):
+    with Opened(browser, at(name)) as opened:
+        opened.page.evaluate("document.querySelectorAll('.zoom, .slide').forEach((z) => z.remove())")
         with_scripts = opened.page.locator("main").inner_text()
-    with Opened(browser, folder / f"{name}.html", java_script_enabled=False) as opened:
+    with Opened(browser, at(name), java_script_enabled=False) as opened:
         assert opened.page.locator("main").inner_text() == with_scripts
-        assert opened.page.locator(".zoom").count() == 0
+        assert opened.page.locator(".zoom, .slide").count() == 0
         boxes = [c.bounding_box() for c in opened.page.locator("svg.chart.wide").all()]
         assert len(boxes) >= 4
         assert all(b["width"] > 200 and b["height"] > 80 for b in boxes)
@@ -188,11 +266,11 @@ def test_without_scripts_everything_but_the_zoom_is_there(browser, folder, name)
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", ALL)
-def test_the_accessibility_check_passes(browser, folder, name, scheme):
-    for width in (WIDTHS[0], WIDTHS[2]):
-        with Opened(
-            browser, folder / f"{name}.html", viewport={"width": width, "height": 900}, color_scheme=scheme
-        ) as opened:
+def test_the_accessibility_check_passes(browser, at, name, scheme):
+    # The paper's page is long and takes long; its parts are those of the others.
+    widths = (WIDTHS[0], WIDTHS[2]) if name != "paper" else (WIDTHS[0 if scheme == "dark" else 2],)
+    for width in widths:
+        with Opened(browser, at(name), viewport={"width": width, "height": 900}, color_scheme=scheme) as opened:
             opened.page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
             found = axe.Axe().run(opened.page)
             broken = [(v["id"], [n["html"][:120] for n in v["nodes"]][:3]) for v in found.response["violations"]]
@@ -202,8 +280,8 @@ def test_the_accessibility_check_passes(browser, folder, name, scheme):
 
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("name", ALL)
-def test_no_width_makes_a_page_scroll_sideways(browser, folder, name, width):
-    with Opened(browser, folder / f"{name}.html", viewport={"width": width, "height": 900}) as opened:
+def test_no_width_makes_a_page_scroll_sideways(browser, at, name, width):
+    with Opened(browser, at(name), viewport={"width": width, "height": 900}) as opened:
         page = opened.page
         page.evaluate("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
         assert page.evaluate("document.documentElement.scrollWidth") <= width
@@ -220,15 +298,15 @@ def test_paper_has_no_buttons_and_equations_are_typeset(browser, folder):
         up, base = (page.locator(f"math msup > :nth-child({k})").first.bounding_box() for k in (2, 1))
         assert up["y"] < base["y"]
         page.emulate_media(media="print")
-        assert page.locator(".zoom:visible").count() == 0
+        assert page.locator(".zoom:visible, .slide:visible, .cursor:visible").count() == 0
         assert page.locator("nav").is_hidden()
         printed = page.pdf(format="A4")
         assert printed.startswith(b"%PDF")
         assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(255, 255, 255)"
 
 
-def test_the_paper_s_page_names_what_holds_first(browser, folder):
-    with Opened(browser, folder / "paper.html", viewport={"width": 360, "height": 900}) as opened:
+def test_the_paper_s_page_names_what_holds_first(browser, at):
+    with Opened(browser, at("paper"), viewport={"width": 360, "height": 900}) as opened:
         page = opened.page
         heads = page.locator("h2").all_inner_texts()
         assert heads[0] == "What holds and what does not"

@@ -240,7 +240,7 @@ BAD_TEXT = {
     ),
     "a point among decimal commas": (
         "t;u;y\n0,0;0,5;1\n1,0;1.234,5;1\n2,0;0.7;1\n3,0;0,7;1\n4,0;0,7;1\n",
-        ["column 'u', line 3", "'1.234,5'", "2 in all"],
+        ["column 'u', line 4", "'0.7' has a point where decimals follow a comma", "1 in all; write all numbers alike"],
     ),
     "half a header": ("0.0,abc,3\n1,2,3\n2,2,3\n", ["line 1", "'abc'", "mixes words and numbers", "1 in all"]),
     "nan": (changed(5, 1, "nan"), ["x.csv: column 'u' (signal 'u')", "NaN", "row 3", "1 in all"]),
@@ -542,7 +542,7 @@ def test_damaged_mat_files_give_a_run_or_a_data_error(tmp_path):
             with warnings.catch_warnings():
                 warnings.simplefilter("error")
                 try:
-                    wanted = wanted_of(None, inputs={"u": "V.2"}, outputs={"y": "V.3"})
+                    wanted = wanted_of(None, None, None, {"u": "V.2"}, {"y": "V.3"}, None, None, None)
                     text = f"{path.name} with {run_from([answer], wanted, Options()).length} rows"
                 except DataError as error:
                     text = str(error)

@@ -536,4 +536,143 @@ def test_clocks_of_12_and_of_24_hours_in_one_column_are_refused(tmp_path, monkey
 
 def test_a_column_of_marks_for_missing_numbers_is_named(tmp_path):
     path = write(tmp_path, "t,u,y\n" + "".join(f"{k},N/A,{k}\n" for k in range(5)))
-    assert "no column of numbers is 'u' (line 2: 'N/A' is not a number)" in ftlm.open_file(path).problem
+    opened = ftlm.open_file(path)
+    assert (opened.columns[1].role, opened.columns[1].words) == ("input", "empty")
+    assert "column 'u', line 2: 'N/A' stands for no number" in opened.problem
+    words = write(tmp_path, "t,u,y\n" + "".join(f"{k},off,{k}\n" for k in range(5)))
+    assert "no column of numbers is 'u' (line 2: 'off' is not a number)" in ftlm.open_file(words).problem
+
+
+# --- how numbers are written ------------------------------------------------------------------------------------------
+
+
+def german(value):
+    return f"{value:,.3f}".translate(str.maketrans(",.", ".,"))
+
+
+#: How a number is written, between which cells, and the mark between its thousands.
+GROUPED = {
+    "german": (german, ";", "point"),
+    "american": (lambda v: f"{v:,.3f}", ";", "comma"),
+    "american, quoted": (lambda v: f'"{v:,.3f}"', ",", "comma"),
+    "american, tabs": (lambda v: f"{v:,.2f}", "\t", "comma"),
+    "french": (lambda v: f"{v:,.3f}".replace(",", "\u202f").replace(".", ","), ";", "space"),
+    "typewriter": (lambda v: f"{v:,.3f}".replace(",", " "), ";", "space"),
+    "swiss": (lambda v: f"{v:,.3f}".replace(",", "'"), ";", "apostrophe"),
+    "swiss, typeset": (lambda v: f"{v:,.2f}".replace(",", "’"), "\t", "apostrophe"),
+}
+VALUES = [0.5, -1.25, 12345.5, 999.0, 1000.0, -1234567.5, 1234.5]
+
+
+@pytest.mark.parametrize("case", GROUPED)
+def test_marks_between_thousands_are_read_where_nothing_else_can_be_meant(tmp_path, case):
+    written, between, mark = GROUPED[case]
+    lines = [between.join((str(k), written(v), str(k * k))) for k, v in enumerate(VALUES)]
+    path = write(tmp_path, "\n".join([between.join(("t", "u", "y")), *lines, ""]))
+    run = ftlm.load(path, **SIGNALS)
+    np.testing.assert_array_equal(run["u"], VALUES)
+    (said,) = [w for w in run.warnings if "thousands" in w]
+    assert said.endswith(
+        "group thousands, as in " + repr(written(VALUES[2]).strip('"')) + "; otherwise layout=dict(thousands='none')"
+    )
+    opened = ftlm.open_file(path, **SIGNALS)
+    assert opened.layout.thousands == opened.options["layout"].thousands == mark
+    assert f"--thousands {mark}" in opened.command()
+    assert not any("thousands" in w for w in opened.load().warnings)
+    np.testing.assert_array_equal(opened.load()["u"], VALUES)
+    # Who says that there are none has none.
+    messages(["'u'", "line 4"], lambda: ftlm.load(path, **SIGNALS, layout=dict(thousands="none")))
+
+
+def test_marks_between_thousands_that_may_be_decimals_are_refused_or_said(tmp_path):
+    header = "t;u;y\n"
+    # A point alone, among decimal commas: thousands of one program, decimals of another.
+    mixed = write(tmp_path, header + "0;0,5;1\n1;1.250;2\n2;0,5;3\n")
+    words = ["line 3", "'1.250' has a point where decimals follow a comma", "thousands='point'"]
+    messages(words, lambda: ftlm.load(mixed, **SIGNALS))
+    said = ftlm.load(mixed, **SIGNALS, layout=dict(thousands="point"))
+    np.testing.assert_array_equal(said["u"], [0.5, 1250.0, 0.5])
+    # What the first lines do not show is refused where it comes, with what says it.
+    late = header + "".join(f"{k};0,5;{k}\n" for k in range(9000)) + "9000;1.234,5;1\n"
+    path = write(tmp_path, late)
+    messages(["line 9002", "'1.234,5'", "thousands='point'"], lambda: ftlm.load(path, **SIGNALS))
+    assert ftlm.load(path, **SIGNALS, layout=dict(thousands="point"))["u"][9000] == 1234.5
+    # Groups of other than three digits are none; nor are they decimals.
+    for cell in ("12.34,5", "1.2345,6", "0.123,4", ".123,4", "1..234,5", "1.234,5.6"):
+        wrong = write(tmp_path, header + f"0;1.234,5;1\n1;{cell};2\n2;0,5;3\n")
+        messages(["line 3", repr(cell)], lambda wrong=wrong: ftlm.load(wrong, **SIGNALS))
+    for layout in (dict(thousands="comma", decimal="comma"), dict(thousands="point", decimal="point")):
+        messages(["thousands and decimal are both"], lambda layout=layout: ftlm.load(mixed, **SIGNALS, layout=layout))
+    messages(["separator and thousands are both"],
+             lambda: ftlm.load(mixed, **SIGNALS, layout=dict(thousands="space", separator="space")))  # fmt: skip
+    messages(["thousands is 3"], lambda: ftlm.load(mixed, **SIGNALS, layout=dict(thousands=3)))
+
+
+@pytest.mark.parametrize("between", [",", ";", "\t", "  "])
+def test_exponents_of_fortran_are_exponents(tmp_path, between):
+    cells = ["1.5D-03", "-0.25D+02", "3D+00", "4.d1", ".5D0", "1.25E-3"]
+    lines = [between.join((f"0.{k}D+00", cell, str(k))) for k, cell in enumerate(cells)]
+    run = read(tmp_path, "\n".join([between.join("tuy"), *lines, ""]))
+    np.testing.assert_array_equal(run["u"], [1.5e-3, -25.0, 3.0, 40.0, 0.5, 1.25e-3])
+    comma = read(tmp_path, "t;u;y\n0;1,5D-03;1\n1;2,5D-03;1\n2;3,5E-03;1\n")
+    np.testing.assert_array_equal(comma["u"], [1.5e-3, 2.5e-3, 3.5e-3])
+
+
+@pytest.mark.parametrize("cell", ["1D3", "12D", "D5", "1.5D", "1.5D+", "1.5DD3", "0x1D3", "1.5D-3456", "１.5D-03"])
+def test_what_only_looks_like_an_exponent_is_none(tmp_path, cell):
+    messages(["column 'u', line 3", "is not a number"], lambda: read(tmp_path, f"t,u,y\n0,1,2\n1,{cell},3\n2,1,2\n"))
+
+
+@pytest.mark.parametrize("mark", ["N/A", "n/a", "NA", "#N/A", "null", "None", "-", "--", " - "])
+def test_marks_for_no_number_are_gaps(tmp_path, mark):
+    def lines(cells):
+        return "t;u;y\n" + "".join(f"{k};{k % 3};{cell}\n" for k, cell in enumerate(cells))
+
+    path = write(tmp_path, lines(["1", "2", mark, "4", mark, "6", "7"]))
+    shown = repr(mark.strip())
+    words = ["column 'y', line 4", f"{shown} stands for no number", "row 2, 2 in all", "missing='weight'"]
+    messages(words, lambda: ftlm.load(path, **SIGNALS))
+    run = ftlm.load(path, **SIGNALS, missing="weight")
+    assert np.isnan(run["y"]).tolist() == [False, False, True, False, True, False, False]
+    opened = ftlm.open_file(path)
+    assert [c.role for c in opened.columns] == ["time", "input", "output"]
+    assert f"{shown} stands for no number" in opened.problem
+    assert ftlm.open_file(path, missing="weight").load().length == 7
+    # Beside words that are none of these it is a word.
+    other = write(tmp_path, lines(["1", mark, "broken", "4"]))
+    messages(["'y', line 4", "'broken' is not a number"], lambda: ftlm.load(other, **SIGNALS, missing="weight"))
+
+
+def test_units_behind_a_stroke_are_units(tmp_path):
+    path = write(tmp_path, "t/ms,I/A,phi/rad,v/m/s,T/°C\n" + "".join(f"{k},{k % 3},{k},5,20\n" for k in range(9)))
+    opened = ftlm.open_file(path, inputs={"i": "I"}, outputs={"phi": "phi", "v": "v", "T": "T"})
+    assert opened.options["units"] == {"i": "A", "phi": "rad", "v": "m/s", "T": "°C"}
+    assert opened.load().step == 0.001
+    assert ftlm.load(path, inputs=["I"], outputs={"v": "v/m/s"})["v"][0] == 5.0
+    named = write(tmp_path, "t/s,I/A,theta/deg\n" + "".join(f"{k},{k % 3},{k}\n" for k in range(9)))
+    opened = ftlm.open_file(named)
+    assert [(c.role, c.signal, c.unit) for c in opened.columns] == [
+        ("time", "", "s"), ("input", "I", "A"), ("output", "theta", "deg")
+    ]  # fmt: skip
+    assert opened.load()["theta"][3] == pytest.approx(np.pi / 60)
+    # A path, a unit, an abbreviation and a mark for nothing are none of these.
+    for name in ("rig/ai/V", "m/s", "N/A", "I/O", "1/s", "in/out", "/A", "A/", "U/min"):
+        path = write(tmp_path, f"t,{name},y\n" + "".join(f"{k},{k % 3},{k}\n" for k in range(9)))
+        assert ftlm.open_file(path, inputs={"u": name}, outputs=["y"]).options.get("units", {}) == {}, name
+
+
+def test_units_behind_a_stroke_are_those_of_a_spectrum_too(tmp_path):
+    rows = "".join(f"{k + 1},{k + 2},{k + 3}\n" for k in range(9))
+    data = ftlm.load_frequency(write(tmp_path, "freq/Hz,Re(Z)/mOhm,-Im(Z)/mOhm\n" + rows))
+    assert data.frequency[0] == pytest.approx(2 * np.pi)
+    assert data.response[0] == pytest.approx(0.002 - 0.003j)
+
+
+def test_a_name_of_an_array_is_no_name_with_a_unit(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "x.h5", "w") as file:
+        for k, name in enumerate(("rig/s", "rig/A", "rig/V")):
+            file[name] = np.arange(9.0) * (k + 1)
+    opened = ftlm.open_file(tmp_path / "x.h5", time="rig/s", inputs={"u": "rig/A"}, outputs={"y": "rig/V"})
+    assert "units" not in opened.options
+    assert [c.unit for c in opened.columns] == ["", "", ""]

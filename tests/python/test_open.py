@@ -114,6 +114,17 @@ def test_what_names_leave_open_is_asked_and_then_answered(tmp_path):
     assert json.loads(command(*shlex.split(told["commands"][0])[1:], "--json").stdout)[0]["rows"] == 10
 
 
+@pytest.mark.parametrize("names", ["Frequency (Hz),Z' (Ohm),-Z'' (Ohm)", "f,Magnitude [dB],Phase [deg]"])
+def test_a_spectrum_is_called_one(tmp_path, names):
+    path = tmp_path / "cell.csv"
+    path.write_text(names + "\n" + "".join(f"{k + 1},{k * k + 2},{k + 3}\n" for k in range(9)))
+    opened = ftlm.open_file(path)
+    assert "frequency response or an impedance spectrum" in opened.problem
+    assert "ftlm identify-frequency" in str(opened)
+    # With a time it is a run whose columns have odd names.
+    assert "spectrum" not in ftlm.open_file(path, step=0.1).problem
+
+
 def test_a_run_of_ftlm_is_opened_as_one(tmp_path, small_run):
     small_run.to_csv(tmp_path / "run.csv")
     opened = ftlm.open_file(tmp_path / "run.csv")

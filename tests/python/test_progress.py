@@ -9,11 +9,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import ftlm
 from ftlm.base import progress
 from ftlm.base.pace import by_output_error, expected, pace
 from ftlm.base.progress import PARTS, Course, left_in_words
+from ftlm.cli.app import app
 from ftlm.progress import Progress, Stoppable
 
 
@@ -163,6 +165,25 @@ def test_time_left_follows_what_is_behind(monkeypatch):
     assert "nothing to wonder at" not in written
     assert "10 %" in written
     assert re.search(r"about \d+ s left", written)
+
+
+@pytest.mark.parametrize(
+    ("command", "words"), [("agreement", "fitting all parts"), ("select", "the largest candidate alone")]
+)
+def test_commands_that_take_long_say_so_beforehand(tmp_path, monkeypatch, command, words):
+    told = []
+    monkeypatch.setattr(Progress, "expect", lambda self, what, seconds: told.append((what, seconds)))
+    t = np.arange(320) * 0.05
+    u = np.sign(np.sin(2 * t))
+    y = np.cumsum(u) * 0.05 + 0.01 * np.random.default_rng(1).standard_normal(t.size)
+    lines = [f"{a:.2f},{b:g},{c:.5f}" for a, b, c in zip(t, u, y, strict=True)]
+    (tmp_path / "run.csv").write_text("\n".join(["t,u,y", *lines]))
+    asked = [command, str(tmp_path / "run.csv"), "-u", "u", "-y", "y", "--structure", "D y = a0 y + b0 u"]
+    done = CliRunner().invoke(app, asked)
+    assert done.exit_code == 0, done.stderr
+    ((what, seconds),) = told
+    assert what == words
+    assert seconds > 0
 
 
 def test_expectation_is_a_number_of_this_machine():

@@ -2,6 +2,8 @@
 
 import base64
 import hashlib
+import html
+import json
 import math
 import re
 from dataclasses import replace
@@ -574,6 +576,50 @@ def test_what_is_not_finite_leaves_a_gap_and_is_said():
 def test_a_lone_point_is_a_dot():
     chart = report.line_chart([0, 1, 2], [("y", [np.nan, 1, np.nan])], title="t", x_label="x", y_label="y")
     assert [len(s) for s in paths_of(chart.svg)[0]] == [1]
+
+
+def read_out(chart):
+    """What a slider reads out of a chart: instants, values by line, and where it begins."""
+    (told,) = re.findall(r' data-readings="([^"]*)"', chart.svg)
+    told = json.loads(html.unescape(told))
+
+    def values(said):
+        return np.array([np.nan if k is None else float(f"{k}e{said[0]}") for k in said[1]])
+
+    return values(told["at"]), {line["name"]: values(line["at"]) for line in told["lines"]}, told
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 600, 749, 750, 751, 40_000])
+def test_a_slider_has_samples_and_the_largest_difference_among_them(n):
+    rng = np.random.default_rng(n)
+    x = 3.0 + np.arange(n) * 0.0017
+    y, z = 1e-6 * rng.standard_normal(n), 1e-6 * rng.standard_normal(n)
+    chart = report.line_chart(x, [("measured", y), ("simulated", z)], title="t", x_label="time [s]", y_label="y [m]",
+                              slider=True)  # fmt: skip
+    assert "data-readings" not in chart.narrow
+    at, lines, told = read_out(chart)
+    assert 1 <= at.size <= 753
+    assert n > 750 or at.size == n
+    places = [int(np.argmin(np.abs(x - v))) for v in at]
+    assert at == pytest.approx(x[places], abs=1e-4 * 0.0017 * n + 1e-9)
+    for name, values in (("measured", y), ("simulated", z)):
+        assert lines[name] == pytest.approx(values[places], abs=1e-5 * (np.ptp(values) + 1e-12))
+    assert places[told["begin"]] == np.argmax(np.abs(y - z))
+    assert {0, n - 1} <= set(places)
+    assert (told["name"], told["unit"], told["y"]) == ("time", "s", "m")
+
+
+def test_a_slider_has_nothing_where_there_is_nothing():
+    t, gaps = np.arange(5.0), np.array([1.0, np.nan, np.inf, -1e300, 2e5])
+    drawn = {"x_label": "time [s]", "y_label": "y", "title": "t", "slider": True}
+    at, lines, told = read_out(report.line_chart(t, [("measured", gaps), ("simulated", np.full(5, np.nan))], **drawn))
+    assert at.tolist() == t.tolist()
+    assert np.isnan(lines["simulated"]).all()
+    assert np.isnan(lines["measured"]).tolist() == [False, True, True, False, False]
+    assert lines["measured"][3] == -1e300
+    assert (told["apart"], told["y"]) == (False, "")
+    for other in ({"log_x": True}, {"log_y": True}, {"slider": False}):
+        assert "data-readings" not in report.line_chart(t + 1, [("", t + 1)], **{**drawn, **other}).svg
 
 
 def test_a_run_that_strays_does_not_flatten_the_measured_one():

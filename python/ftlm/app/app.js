@@ -1,4 +1,3 @@
-"use strict";
 // The page asks its own server for parts of itself and puts them in place; what files and people say comes escaped.
 const $ = (id) => document.getElementById(id);
 const said = $("said"), ask = $("ask"), files = $("files"), models = $("models");
@@ -38,6 +37,7 @@ function put(parent, html, first) {
   const part = made.content.firstElementChild, old = document.getElementById(part.id);
   if (!old) {
     if (first) parent.prepend(part); else parent.append(part);
+    liven(part);
     return part;
   }
   const focus = old.contains(document.activeElement) ? document.activeElement.name : "";
@@ -47,6 +47,7 @@ function put(parent, html, first) {
     if (was !== undefined) d.open = was;
   });
   old.replaceWith(part);
+  liven(part);
   if (focus) part.querySelector(`[name="${CSS.escape(focus)}"]`)?.focus();
   return part;
 }
@@ -121,8 +122,10 @@ document.addEventListener("click", async (event) => {
   if (!button) return;
   const card = button.closest(".card"), key = card.dataset.key;
   try {
-    if (button.dataset.do === "stop") put(models, await send(`models/${key}/stop`, {}));
-    else {
+    if (button.dataset.do === "stop" || button.dataset.do === "resume") {
+      put(models, await send(`models/${key}/${button.dataset.do}`, {})).querySelector("button")?.focus();
+      soon();
+    } else {
       await request(`${button.dataset.do === "remove-file" ? "files" : "models"}/${key}`, { method: "DELETE" });
       card.remove();
       say("Removed.");

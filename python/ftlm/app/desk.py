@@ -94,6 +94,8 @@ class Model:
         Why there is none.
     version
         Counts its changes of state.
+    files
+        Keys of the files that it is made of.
     """
 
     key: str
@@ -110,6 +112,7 @@ class Model:
     error: str = ""
     version: int = 0
     task: Task | None = None
+    files: tuple[str, ...] = ()
 
     @property
     def is_busy(self) -> bool:
@@ -279,11 +282,36 @@ class Desk:
         """
         if len(self.models) >= MOST_MODELS:
             raise DataError(f"{MOST_MODELS} models are kept, as many as there may be; remove one")
-        if sum(m.is_busy for m in self.models.values()) >= MOST_WAITING:
-            raise DataError(f"{MOST_WAITING} models wait already; stop one, or wait")
+        self._check_turn()
         self._count += 1
         model = Model(secrets.token_hex(8), self._count, recipe)
+        model.files = tuple(f.key for f in self.files.values() if f.name in _names(recipe))
         self.models[model.key] = model
+        self._begun(self._make(model))
+        return model
+
+    def _check_turn(self) -> None:
+        if sum(m.is_busy for m in self.models.values()) >= MOST_WAITING:
+            raise DataError(f"{MOST_WAITING} models wait already; stop one, or wait")
+
+    def resume(self, key: str) -> Model:
+        """Go on with a model that was stopped: a choice where it was, a fit from its start.
+
+        Raises
+        ------
+        DataError
+            A file of it was removed, or as many models wait as may.
+        """
+        model = self.models[key]
+        if model.state not in (STOPPED, FAILED):
+            return model
+        if any(file not in self.files for file in model.files):
+            raise DataError(
+                f"{' or '.join(sorted(_names(model.recipe)))} is no longer on the page; drop it, and ask anew"
+            )
+        self._check_turn()
+        model.state, model.phase, model.error, model.share, model.left = WAITING, "waiting", "", None, ""
+        model.version += 1
         self._begun(self._make(model))
         return model
 
@@ -295,7 +323,7 @@ class Desk:
             model.version += 1
             asked = {
                 "do": "model", "recipe": model.recipe.to_dict(), "model": f"{model.key}.json",
-                "report": f"{model.key}.html",
+                "report": f"{model.key}.html", "store": f"{model.key}.ftlm" if model.recipe.is_choice else None,
             }  # fmt: skip
             model.task = Task(asked, self.folder, lambda said: _note(model, said))
             try:
@@ -306,7 +334,7 @@ class Desk:
             else:
                 if model.state == RUNNING:
                     model.state, model.told = MADE, told
-            model.took = time.monotonic() - model.begun
+            model.took += time.monotonic() - model.begun
             model.task = None
             model.version += 1
 
@@ -323,7 +351,7 @@ class Desk:
         """Forget a model."""
         self.stop(key)
         del self.models[key]
-        for suffix in (".json", ".html"):
+        for suffix in (".json", ".html", ".ftlm"):
             with contextlib.suppress(OSError):
                 (self.folder / f"{key}{suffix}").unlink()
 

@@ -8,7 +8,7 @@ from typing import Any
 from ftlm.base.errors import DataError
 
 #: Fields of a file's layout that hold whole numbers, and those that hold words.
-NUMBERS, WORDS = ("skip", "header"), ("encoding", "separator", "decimal", "dates", "sheet")
+NUMBERS, WORDS = ("skip", "header"), ("encoding", "separator", "decimal", "thousands", "dates", "sheet")
 ROLES = ("", "time", "input", "output")
 MOST_SIGNALS = 500
 

@@ -139,8 +139,20 @@ class Recipe:
         """
         return [structure_of(text) for text in self.structure]
 
-    def made(self, told: Told) -> Made:
+    @property
+    def is_choice(self) -> bool:
+        """Whether structures are tried, which takes long enough to go on with another time."""
+        return self.way != "fit"
+
+    def made(self, told: Told, store: str | None = None) -> Made:
         """Make the model.
+
+        Parameters
+        ----------
+        told
+            Told how far it is.
+        store
+            File that keeps the fits of a choice, in which one that was stopped goes on.
 
         Raises
         ------
@@ -150,13 +162,13 @@ class Recipe:
         wanted = self.structures()
         told.phase("reading")
         own, other, cut = self._runs()
-        told.phase(CHOOSING if self.way != "fit" else f"fitting{self._takes(own, wanted[0])}")
+        told.phase(CHOOSING if self.is_choice else f"fitting{self._takes(own, wanted[0])}")
         choice = None
-        if self.way == "fit":
+        if not self.is_choice:
             result = identify(own, wanted[0], progress=told, **self.settings())
         else:
             candidates = "auto" if self.way == "auto" else wanted[0] if self.way == "inside" else wanted
-            choice = select(own, candidates, progress=told)
+            choice = select(own, candidates, progress=told, store=store)
             # Chosen from rest, where its run starts so; another run may not.
             told.phase("fitting what was chosen")
             result = identify(own, choice.winner.structure, progress=told)
@@ -193,7 +205,7 @@ class Recipe:
             lines.append(f"run, other = whole.slice(None, {cut!r}), whole.slice({cut!r}, None)")
         if self.validation is not None:
             lines += self.validation.script("other")
-        if self.way == "fit":
+        if not self.is_choice:
             lines.append(f"structure = {written(self.structure[0])}")
             lines += call("result", "ftlm.identify", ["run", "structure"], self.settings())
         else:

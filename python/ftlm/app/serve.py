@@ -14,6 +14,7 @@ import webbrowser
 from collections.abc import AsyncIterator, Sequence
 from pathlib import Path
 
+from ftlm.app.connection import patient
 from ftlm.app.desk import Desk
 from ftlm.app.web import Door
 from ftlm.base.errors import DataError, ModelError
@@ -103,8 +104,8 @@ async def _serve(sock: socket.socket, paths: Sequence[Path], browser: bool) -> N
     hosts = (f"{ADDRESS}:{own}", f"localhost:{own}")
     desk = Desk()
     config = uvicorn.Config(
-        Door(desk, token, hosts, key if browser else ""), log_config=None, access_log=False, lifespan="off",
-        server_header=False, ws="none", http="h11", loop="asyncio", timeout_keep_alive=15,
+        Door(desk, token, hosts, key if browser else ""), log_config=None, log_level="critical", access_log=False,
+        lifespan="off", server_header=False, ws="none", http=patient(), loop="asyncio", timeout_keep_alive=15,
         timeout_graceful_shutdown=1, limit_concurrency=MOST_CONNECTIONS, proxy_headers=False,
     )  # fmt: skip
     server = uvicorn.Server(config)

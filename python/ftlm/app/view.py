@@ -15,14 +15,16 @@ from ftlm._core import __version__
 from ftlm.app.desk import MADE, MOST_BYTES, RUNNING, Desk, File, Model
 from ftlm.app.recipe import LOSSES, METHODS, OFFSETS
 from ftlm.data.units import TIME_UNITS, UNITS
-from ftlm.files.layout import DATES, DECIMALS, SEPARATORS
+from ftlm.files.layout import DATES, DECIMALS, GROUPS, SEPARATORS
 from ftlm.paint.lines import chart_css
+from ftlm.paint.page import chart_script, look
 from ftlm.paint.text import number
 
 #: Ways of Python to say something, and those of the page.
 _FIELDS = {
     "step": "Step", "resample": "Put on the step", "time_unit": "Unit of time", "missing": "Gaps",
-    "separator": "Between cells", "decimal": "Decimals", "skip": "Lines above the table", "header": "Lines of header",
+    "separator": "Between cells", "decimal": "Decimals", "thousands": "Between thousands",
+    "skip": "Lines above the table", "header": "Lines of header",
     "dates": "Dates", "encoding": "Encoding", "sheet": "Sheet", "slice": "From” and “To",
 }  # fmt: skip
 #: An argument of Python with its value, or with a word in capitals that stands for one.
@@ -62,14 +64,14 @@ def _rendered(template: str, **told: Any) -> str:
 
 @cache
 def script() -> str:
-    """The page's script."""
-    return _read("app.js")
+    """The page's script, behind that of its charts."""
+    return f"{chart_script()}\n{_read('app.js')}"
 
 
 @cache
 def style() -> str:
-    """The page's style, with the colours of charts."""
-    return f"{_read('app.css')}\n{chart_css()}"
+    """The look of the reports, and what the page has beyond it."""
+    return f"{look()}\n{chart_css()}\n{_read('app.css')}"
 
 
 def page_words(text: str) -> str:
@@ -102,8 +104,8 @@ def file(shown: File) -> str:
     }  # fmt: skip
     return _rendered(
         "file.html.j2", file=shown, told=told, chosen=chosen, layout=chosen.get("layout", {}), facts=json.dumps(facts),
-        separators=list(SEPARATORS), decimals=list(DECIMALS), dates=DATES, time_units=list(TIME_UNITS),
-        asked=shown.asked,
+        separators=list(SEPARATORS), decimals=list(DECIMALS), groups=list(GROUPS), dates=DATES,
+        time_units=list(TIME_UNITS), asked=shown.asked,
     )  # fmt: skip
 
 

@@ -265,6 +265,8 @@ class Door:
             case "POST", ["stop"]:
                 self._desk.stop(key)
                 return Answer(200, view.model(model), HTML)
+            case "POST", ["resume"]:
+                return Answer(200, view.model(self._desk.resume(key)), HTML)
             case "DELETE", []:
                 self._desk.remove_model(key)
                 return Answer(200, "{}")
@@ -272,7 +274,7 @@ class Door:
                 if model.state != MADE or model.told is None:
                     raise RefusedError(404, "this model is not made yet")
                 return self._download(key, what[0], Path(model.recipe.estimation.file).stem)
-        raise RefusedError(405 if what in ([], ["stop"]) else 404, "not in this way")
+        raise RefusedError(405 if what in ([], ["stop"], ["resume"]) else 404, "not in this way")
 
     def _download(self, key: str, what: str, stem: str) -> Answer:
         """A file of a model; its path is of this program, never of a request."""

@@ -1,8 +1,8 @@
 """Opens a file or makes a model in a process of its own, which a hostile file or a long fit may take with it.
 
 Run as ``python -P -m ftlm.app.work`` in the folder of the files. The first line of standard input is the task, a JSON
-object: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "model", "recipe": …, "model": …, "report": …,
-"name": …}``; where it ends, so does this process. Standard output has a JSON object a line: ``{"phase": words}``,
+object: ``{"do": "open", "file": …, "options": …}`` or ``{"do": "model", "recipe": …, "store": …, "model": …,
+"report": …}``; where it ends, so does this process. Standard output has a JSON object a line: ``{"phase": words}``,
 ``{"done": …, "total": …}`` and at last ``{"answer": …}`` or ``{"error": words}``.
 """
 
@@ -129,7 +129,7 @@ def _seen(found: OpenedFile) -> dict[str, Any]:
 
 def modelled(task: Mapping[str, Any], reports: Reports) -> dict[str, Any]:
     """A model, its files and what the page shows of it."""
-    made = Recipe.of(task["recipe"]).made(reports)
+    made = Recipe.of(task["recipe"]).made(reports, task["store"])
     reports.phase("writing the report")
     made.result.model.save(task["model"])
     made.result.report(task["report"], validation=made.other)

@@ -9,6 +9,7 @@ from typer import Option
 from ftlm.base.output import COMMAND, check_free
 from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show
+from ftlm.cli.identify import fit_seconds
 from ftlm.cli.options import Files, Force, Json, ReadingOptions, StructureOptions, StructureText, Text, Threads
 from ftlm.identification import agreement as parts_of_runs
 
@@ -32,6 +33,8 @@ def agreement(
     runs = reading.runs(files)
     wanted = shape.measured(structure, runs)
     with Progress("fitting parts", quiet=as_json) as progress:
+        count = max(parts or 0, 2) if len(runs) == 1 else len(runs)
+        progress.expect("fitting all parts", fit_seconds(runs, wanted, threads, count))
         found = parts_of_runs.agreement(runs, wanted, parts=parts, loss=loss, threads=threads, progress=progress)
     if report is not None:
         found.report(report, force=force)

@@ -52,6 +52,10 @@ class ResponseOptions:
     decimal: Annotated[Literal["point", "comma"] | None, Option(help="Of numbers in text; default what is there.")] = (
         None
     )
+    thousands: Annotated[
+        Literal["none", "point", "comma", "space", "apostrophe"] | None,
+        Option(help="What groups thousands of numbers in text; default what is there."),
+    ] = None
     skip: Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default what is no table.")] = None
     header: Annotated[
         int | None,
@@ -62,8 +66,9 @@ class ResponseOptions:
     def load(self, file: str) -> FrequencyData:
         """The record of one file."""
         layout = Layout(
-            separator=self.separator, decimal=self.decimal, skip=self.skip, header=self.header, sheet=self.sheet
-        )
+            separator=self.separator, decimal=self.decimal, thousands=self.thousands, skip=self.skip,
+            header=self.header, sheet=self.sheet,
+        )  # fmt: skip
         columns: dict[str, Any] | None = pairs("--column", self.columns) or None
         return load_frequency(
             file, columns=columns, frequency_unit=self.frequency_unit, magnitude_unit=self.magnitude_unit,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -34,6 +34,7 @@ from ftlm.cli.options import (
 )  # fmt: skip
 from ftlm.cli.words import in_options
 from ftlm.data.lattice import Lattice
+from ftlm.data.run import Run
 from ftlm.data.settings import check_used
 from ftlm.data.structures import Structure
 from ftlm.identification import identify as estimation
@@ -46,6 +47,13 @@ from ftlm.search.store import Store
 Method = Literal["output-error", "instrumental-variables", "multi-innovation", "least-squares", "genetic"]
 Estimator = Literal["instrumental-variables", "multi-innovation", "least-squares"]
 StoreFile = Annotated[str, Argument(metavar="STORE", help="A file written with --store.")]
+
+
+def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, fits: int = 1) -> float:
+    """About how long fits by output error of all their numbers take here, the runs shared out among them [s]."""
+    samples = sum(run.length for run in runs) * len(structure.outputs)
+    numbers = len(structure.order_names) + len(structure.coefficient_names) + len(structure.free_inputs)
+    return expected(fits * by_output_error(samples // max(fits, 1), numbers), check_threads(threads))
 
 
 @command
@@ -87,9 +95,7 @@ def identify(
     label = "fitting" if method == "output-error" else "searching orders"
     with resumable(store, "the same command"), Progress(label, quiet=as_json) as progress:
         if method == "output-error":
-            samples = sum(run.length for run in runs) * len(wanted.outputs)
-            numbers = len(wanted.order_names) + len(wanted.coefficient_names) + len(wanted.free_inputs)
-            progress.expect("the fit", expected(by_output_error(samples, numbers), check_threads(threads)))
+            progress.expect("the fit", fit_seconds(runs, wanted, threads))
         result = estimation.identify(
             runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
             genetic=genetic.settings(method), threads=threads, progress=progress, store=store,

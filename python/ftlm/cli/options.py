@@ -90,6 +90,10 @@ class ReadingOptions:
     decimal: Annotated[Literal["point", "comma"] | None, Option(help="Of numbers in text; default what is there.")] = (
         None
     )
+    thousands: Annotated[
+        Literal["none", "point", "comma", "space", "apostrophe"] | None,
+        Option(help="What groups thousands of numbers in text; default what is there."),
+    ] = None
     skip: Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default what is no table.")] = None
     header: Annotated[
         int | None,

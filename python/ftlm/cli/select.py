@@ -11,7 +11,7 @@ from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
 from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show
-from ftlm.cli.identify import resumable
+from ftlm.cli.identify import fit_seconds, resumable
 from ftlm.cli.options import CandidateTexts, Files, Force, Json, Out, ReadingOptions, StructureOptions, Text, Threads
 from ftlm.data.structures import Structure
 from ftlm.selection import select as choice
@@ -55,6 +55,12 @@ def select(
     of_its_own = validation not in (None, "runs", "blocks")
     judges = replace(reading, sliced=None).runs([str(validation)]) if of_its_own else validation
     with resumable(store, "the same command"), Progress("fitting candidates", quiet=as_json) as progress:
+        tried = [candidates] if isinstance(candidates, (str, Structure)) else candidates
+        whole = max((fit_seconds(runs, one, threads) for one in tried if isinstance(one, Structure)), default=0.0)
+        # How many candidates come up turns with what earns its place; they are counted as they do.
+        progress.expect("the largest candidate alone", whole)
+        if candidates == "auto":
+            progress.say("candidates come up as others are fitted; --structure auto takes minutes, and Ctrl-C ends it")
         found = choice.select(runs, candidates, validation=judges, threads=threads, progress=progress, store=store)
     if out is not None:
         found.best.model.save(out, force=force)

@@ -22,6 +22,7 @@ OPTIONS = {
     "validation": "--validation",
     "loss": "--loss", "intervals": "--intervals", "missing": "--missing",
     "encoding": "--encoding", "separator": "--separator", "decimal": "--decimal", "skip": "--skip",
+    "thousands": "--thousands",
     "weights": "--weights", "frequency_unit": "--frequency-unit", "magnitude_unit": "--magnitude-unit",
     "phase_unit": "--phase-unit", "negated": "--negated",
     "duration": "--duration", "peak": "--peak", "slew": "--slew", "limits": "--limit", "names": "--for",

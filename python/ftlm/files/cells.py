@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import functools
 import re
 
 from ftlm.base.errors import DataError
@@ -11,26 +12,70 @@ from ftlm.data.units import TIME_UNITS, header_time, spelled_unit
 DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?|[+-]?\d+,(?:[eE][+-]?\d+)?")
 #: What stands before a unit at the end of a name, where it has no brackets.
 _BEFORE_UNITS = (" / ", ",", " in ")
+#: What people group thousands by, as character classes.
+THOUSANDS = {"point": "[.]", "comma": "[,]", "space": "[ \u00a0\u202f]", "apostrophe": "['\u2019]"}
+#: Exponents of Fortran; without a point or a sign, a D between digits is part of a name.
+_FORTRAN = re.compile(r"\s*[+-]?(?:(?:\d+[.]\d*|[.]\d+)[dD][+-]?\d{1,3}|\d+[dD][+-]\d{1,3})\s*", re.ASCII)
+#: What stands for no number, without capitals.
+_GAPS = frozenset(("", "n/a", "na", "#n/a", "null", "none", "-", "--", "---"))
 
 
-def number(cell: str, *, comma: bool = False) -> float:
+@functools.cache
+def _grouped(mark: str, comma: bool) -> re.Pattern[str]:
+    """A number whose thousands are grouped; its decimals, if any, are a group of the pattern."""
+    point = "," if comma else "[.]"
+    return re.compile(
+        rf"\s*[+-]?[1-9]\d{{0,2}}(?:{THOUSANDS[mark]}\d{{3}})+({point}\d*)?(?:[eE][+-]?\d{{1,3}})?\s*", re.ASCII
+    )
+
+
+def grouping(cell: str, *, comma: bool) -> str | None:
+    """What groups the thousands of a number, where that can be nothing else: decimals stand behind it."""
+    if len(cell) < len("1.234,"):
+        return None
+    for mark in THOUSANDS:
+        found = _grouped(mark, comma).fullmatch(cell) if mark != ("comma" if comma else "point") else None
+        if found and found[1]:
+            return mark
+    return None
+
+
+def may_group(cell: str, mark: str, *, comma: bool) -> bool:
+    """Whether a cell is a number whose thousands this mark may group, decimals behind it or not."""
+    return _grouped(mark, comma).fullmatch(cell) is not None
+
+
+def number(cell: str, *, comma: bool = False, mark: str | None = None) -> float:
     """Return the number in a cell; `ValueError` where there is none.
 
     Python's numbers may have underscores between their digits, those of files have not; where commas are decimal,
-    points may group digits, so that a number with one is none.
+    points may group digits, so that a number with one is none unless `mark` says that they do.
     """
+    if mark is not None and may_group(cell, mark, comma=comma):
+        cell = re.sub(THOUSANDS[mark], "", cell)
     if "_" in cell or (comma and "." in cell):
         raise ValueError(cell)
-    return float(cell.replace(",", ".")) if comma else float(cell)
+    text = cell.replace(",", ".") if comma else cell
+    try:
+        return float(text)
+    except ValueError:
+        if not _FORTRAN.fullmatch(text):
+            raise
+        return float(text.replace("D", "e").replace("d", "e"))
 
 
-def is_number(cell: str, *, comma: bool = False) -> bool:
+def is_number(cell: str, *, comma: bool = False, mark: str | None = None) -> bool:
     """Whether a cell holds a number."""
     try:
-        number(cell, comma=comma)
+        number(cell, comma=comma, mark=mark)
     except ValueError:
         return False
     return True
+
+
+def is_gap(cell: str) -> bool:
+    """Whether a cell is empty, or says that there is no number."""
+    return cell.strip().casefold() in _GAPS
 
 
 def split(lines: list[str], separator: str | None, source: str, first: int) -> list[list[str]]:
@@ -65,6 +110,13 @@ def stated_unit(name: str) -> tuple[str, str]:
     bare, mark, unit = text[:-1].rpartition(opening)
     bare, unit = bare.rstrip().removesuffix(" /").rstrip(), unit.strip()
     return (bare, unit) if mark and bare and unit and text[-1] not in unit else (name, "")
+
+
+def behind_a_stroke(name: str) -> tuple[str, str]:
+    """What a column of text is called, and the known unit behind the stroke of ``I/A``, as written; "" for none."""
+    bare, stroke, unit = (part.strip() for part in name.partition("/"))
+    known = stroke and bare and unit and spelled_unit(unit) is not None
+    return (bare, unit) if known and spelled_unit(name) is None and not is_gap(name) and unit != "1" else (name, "")
 
 
 def _bracketed(cell: str) -> str | None:

@@ -14,7 +14,7 @@ from ftlm.base.checks import bad_rows, listed, nearest
 from ftlm.base.errors import DataError
 from ftlm.data.header import Header
 from ftlm.data.units import header_time, is_time_name
-from ftlm.files.cells import is_time_unit, stated_unit
+from ftlm.files.cells import behind_a_stroke, is_time_unit, stated_unit
 from ftlm.files.layout import Assumption, Layout
 from ftlm.files.moments import Moments
 
@@ -44,6 +44,12 @@ class Column:
     blank: bool = False
     moments: Moments | None = None
     stated: str = ""
+
+    @property
+    def written(self) -> str:
+        """Its name, the unit behind a stroke in it, as in ``I/A``, in brackets."""
+        bare, unit = behind_a_stroke(self.name)
+        return f"{bare} [{unit}]" if unit and unit == self.stated else self.name
 
     def numbers(self, *, blank: bool = False) -> npt.NDArray[np.float64] | npt.NDArray[np.float32]:
         """Return its numbers, or raise why there are none; empty cells may be let pass."""
@@ -118,7 +124,7 @@ class Pool:
         column = self._columns.get(name)
         if column is None:
             # Without the unit in brackets that it ends in, where that leaves one.
-            bare = [c for c in self._columns.values() if stated_unit(c.name) == (spec, c.stated) and c.stated]
+            bare = [c for c in self._columns.values() if stated_unit(c.written) == (spec, c.stated) and c.stated]
             column = bare[0] if len(bare) == 1 else None
         if column is None:
             raise DataError(

@@ -13,11 +13,12 @@ from ftlm.base.errors import DataError
 #: Words for what separates cells; None is white space.
 SEPARATORS: dict[str, str | None] = {"semicolon": ";", "tab": "\t", "comma": ",", "space": None}
 DECIMALS = {"point": ".", "comma": ","}
+GROUPS: dict[str, str | None] = {"none": "", "point": ".", "comma": ",", "space": None, "apostrophe": "'"}
 DATES = ("ymd", "dmy", "mdy")
 #: What spreadsheets leave open of it, and other files.
 OF_SHEETS, OF_TEXT = (
     ("skip", "header", "dates", "sheet"),
-    ("encoding", "separator", "decimal", "skip", "header", "dates"),
+    ("encoding", "separator", "decimal", "thousands", "skip", "header", "dates"),
 )
 _MOST_LINES = 1 << 40
 
@@ -34,6 +35,9 @@ class Layout:
         What stands between the cells of text; the character itself will do. ``"space"`` is any white space.
     decimal : {"point", "comma"}, optional
         What stands between whole numbers and their decimals in text.
+    thousands : {"none", "point", "comma", "space", "apostrophe"}, optional
+        What groups the thousands of numbers in text; found only where decimals stand behind a group, as in
+        ``1.234,5``.
     skip : int, optional
         Lines (rows of a sheet) above the table, header not counted.
     header : {0, 1, 2}, optional
@@ -52,18 +56,23 @@ class Layout:
     encoding: str | None = None
     separator: str | None = None
     decimal: str | None = None
+    thousands: str | None = None
     skip: int | None = None
     header: int | None = None
     dates: str | None = None
     sheet: str | None = None
 
     def __post_init__(self) -> None:
-        for option, known in (("separator", SEPARATORS), ("decimal", DECIMALS)):
+        for option, known in (("separator", SEPARATORS), ("decimal", DECIMALS), ("thousands", GROUPS)):
             given = getattr(self, option)
             if given is not None:
                 object.__setattr__(self, option, _word(option, given, known))
         if self.separator == self.decimal == "comma":
             raise DataError("layout=: separator and decimal are both a comma; cells could not be told apart")
+        if self.thousands is not None and self.thousands == self.decimal:
+            raise DataError(f"layout=: thousands and decimal are both a {self.decimal}; say which of them it is")
+        if self.separator == self.thousands == "space":
+            raise DataError("layout=: separator and thousands are both a space; cells could not be told apart")
         if self.dates is not None and self.dates not in DATES:
             raise DataError(f"layout=: dates is {self.dates!r}; the known orders are {listed(DATES)}")
         for option, most in (("skip", _MOST_LINES), ("header", 2)):

@@ -118,45 +118,41 @@ def load(
     >>> run = load("arm.csv", time="t_s", inputs={"I1": "Im1_meas_A"}, outputs={"theta11": "th11_deg"},
     ...            units={"theta11": "deg"})  # doctest: +SKIP
     """
-    wanted = wanted_of(
-        columns,
-        time=time,
-        step=step,
-        inputs=inputs,
-        outputs=outputs,
-        units=units,
-        intersample=intersample,
-        layout=layout,
-    )
-    chosen = checked_missing(missing or "refuse")
-    tables = tables_of(path, wanted.layout)
-    options = Options(slice, resample, name, time_unit, missing, chosen)
-    run = run_from(tables, wanted, options)
+    wanted = wanted_of(columns, time, step, inputs, outputs, units, intersample, layout)
+    options = Options(slice, resample, name, time_unit, missing)
+    run = run_from(tables_of(path, wanted.layout), wanted, options)
     LOG.info("read: %s: %d rows, %s", run.name, run.length, ", ".join(run.signals))
     return run
 
 
 @dataclass(frozen=True)
 class Options:
-    """What else is asked of a run, as in :func:`load`; `chosen` is `missing` or what stands for none."""
+    """What else is asked of a run, as in :func:`load`, `missing` checked."""
 
     window: Sequence[float | None] | None = None
     resample: float | None = None
     name: str | None = None
     time_unit: str | None = None
     missing: str | None = None
-    chosen: Missing = "refuse"
+
+    def __post_init__(self) -> None:
+        checked_missing(self.missing or "refuse")
+
+    def chosen(self, header: Header | None) -> Missing:
+        """What becomes of gaps: as asked, or as a run of ftlm's own says."""
+        if self.missing is None and header is not None and header.missing:
+            return "weight"
+        return checked_missing(self.missing or "refuse")
 
 
 def run_from(tables: list[FileTable], wanted: Wanted, options: Options) -> Run:
     """Make the run that is wanted of files that have been read."""
-    chosen = options.chosen
     header = tables[0].header
+    chosen = options.chosen(header)
     if header is not None and len(tables) > 1:
         raise DataError(f"{str(tables[0].path)!r} is a whole run of its own; load it alone")
     if header is not None:
         _take_header(wanted, header)
-        chosen = chosen if options.missing is not None or not header.missing else "weight"
     pool = Pool(tables)
     _check_apart(wanted, pool)
     if not wanted.outputs:
@@ -326,8 +322,8 @@ def column_names(path: PathLike) -> tuple[str, ...] | None:
 
 
 def wanted_of(
-    columns: object, *, time: Hashable | None = None, step: object = None, inputs: object = None,
-    outputs: object = None, units: object = None, intersample: object = None, layout: object = None,
+    columns: object, time: Hashable | None, step: object, inputs: object, outputs: object, units: object,
+    intersample: object, layout: object,
 ) -> Wanted:  # fmt: skip
     """What a person wants, by arguments and by a columns file; the arguments go before."""
     told = _columns_file(columns)

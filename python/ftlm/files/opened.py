@@ -14,12 +14,12 @@ import numpy as np
 from ftlm.base.checks import listed
 from ftlm.base.errors import DataError
 from ftlm.data.names import CSV_TIME
-from ftlm.data.readings import checked_missing
 from ftlm.data.run import Run
 from ftlm.data.units import header_time
 from ftlm.files.columns import Column, FileTable, Pool, order_of_dates
 from ftlm.files.layout import Assumption, Layout
 from ftlm.files.load import Options, PathLike, Wanted, header_of, load, run_from, tables_of, wanted_of
+from ftlm.files.response import is_response
 from ftlm.files.roles import guessed_roles, known_unit, signal_names
 
 _SHOWN = 40
@@ -206,17 +206,8 @@ def open_file(
     """
     if not isinstance(path, (str, os.PathLike)):
         raise DataError(f"path is a {type(path).__name__}; pass the path of one file")
-    wanted = wanted_of(
-        columns,
-        time=time,
-        step=step,
-        inputs=inputs,
-        outputs=outputs,
-        units=units,
-        intersample=intersample,
-        layout=layout,
-    )
-    options = Options(slice, resample, None, time_unit, missing, checked_missing(missing or "refuse"))
+    wanted = wanted_of(columns, time, step, inputs, outputs, units, intersample, layout)
+    options = Options(slice, resample, None, time_unit, missing)
     (table,) = tables_of(path, wanted.layout)
     return _Opening(table, Pool([table]), wanted, options).result(os.fspath(path))
 
@@ -263,6 +254,15 @@ class _Opening:
         try:
             clock, assumed = self.pool.time(wanted.time, used)
         except DataError as error:
+            if is_response(self.pool):
+                return (
+                    None,
+                    (),
+                    (
+                        "these are columns of a frequency response or an impedance spectrum, and none is a time; "
+                        "ftlm.load_frequency and ftlm identify-frequency read it as such"
+                    ),
+                )
             return None, (), str(error)
         if assumed is not None:
             return clock, (assumed,), ""
@@ -279,17 +279,18 @@ class _Opening:
         if header is not None and not wanted.inputs and not wanted.outputs:
             wanted.inputs, wanted.outputs = {n: n for n in header.inputs}, {n: n for n in header.outputs}
         elif not wanted.inputs and not wanted.outputs:
-            free = [c.name for c in every if c is not clock and _holds(c) and c.name and c.name.isprintable()]
-            drives, follows = guessed_roles(free)
+            free = [c for c in every if c is not clock and _holds(c) and c.name and c.name.isprintable()]
+            own = {c.written: c.name for c in free}
+            drives, follows = guessed_roles(list(own))
             names = signal_names({**dict.fromkeys(drives, "u"), **dict.fromkeys(follows, "y")})
-            wanted.inputs, wanted.outputs = {names[c]: c for c in drives}, {names[c]: c for c in follows}
+            wanted.inputs, wanted.outputs = {names[c]: own[c] for c in drives}, {names[c]: own[c] for c in follows}
             guessed = bool(drives)
         roles: dict[str, tuple[str, str]] = {} if clock is None else {clock.name: ("time", "")}
         for role, asked in (("input", wanted.inputs), ("output", wanted.outputs)):
             for name, spec in asked.items():
                 column = self.pool.find(spec, f"signal {name!r}")
                 roles[column.name] = (role, name)
-                unit = known_unit(column.stated, column.name)
+                unit = known_unit(column.stated, column.written)
                 if unit and name not in wanted.units and header is None:
                     wanted.units[name] = unit
         said = []

@@ -128,6 +128,15 @@ def load_frequency(
     return FrequencyData(omega, response, deviation, output, input, unit, label, tuple(notes))
 
 
+def is_response(pool: Pool) -> bool:
+    """Whether names of columns tell the parts of a frequency response."""
+    try:
+        _known(pool)
+    except DataError:
+        return False
+    return True
+
+
 def _known(pool: Pool) -> dict[str, _Found]:
     """Columns by what they are called; two of one part are refused."""
     found: dict[str, _Found] = {}
@@ -177,7 +186,7 @@ def _check_parts(found: Mapping[str, _Found], pool: Pool) -> None:
 
 def _parted(column: Column) -> tuple[str, str]:
     """A column's name without its unit, and the unit as written: ``freq/Hz``, ``f_Hz``, ``f (Hz)``."""
-    bare, unit = stated_unit(column.name)
+    bare, unit = stated_unit(column.written)
     if unit:
         return bare, unit
     bare, unit = column.name.strip(), column.stated

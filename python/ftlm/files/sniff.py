@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from ftlm.base.errors import DataError
-from ftlm.files.cells import DECIMAL_COMMA, is_number, is_unit, split, unit_of
+from ftlm.files.cells import DECIMAL_COMMA, grouping, is_number, is_unit, split, unit_of
 from ftlm.files.layout import SEPARATORS, Assumption, Layout
 from ftlm.files.moments import is_moment
 
@@ -29,8 +29,8 @@ class Found:
 
     Parameters
     ----------
-    separator, comma
-        Between cells, and whether decimals follow a comma.
+    separator, comma, mark
+        Between cells, whether decimals follow a comma, and what groups thousands.
     names, units
         Of its columns; None where it has no header.
     begin
@@ -52,6 +52,7 @@ class Found:
     width: int
     layout: Layout
     assumed: tuple[Assumption, ...]
+    mark: str | None = None
 
 
 @dataclass(frozen=True)
@@ -108,20 +109,20 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
         Nothing that could be a row, or more than one way to read it.
     """
     if own:
-        given = Layout(separator="comma", decimal="point", skip=0, header=1).under(given)
+        given = Layout(separator="comma", decimal="point", thousands="none", skip=0, header=1).under(given)
     elif sheet:
-        given = Layout(separator="tab", decimal="point").under(given)
+        given = Layout(separator="tab", decimal="point", thousands="none").under(given)
     kept = [(at, line) for at, line in lines if at > (given.skip or 0)]
     if not kept:
         raise DataError(f"{source}: no table below the first {given.skip} lines; say another number with layout=")
-    separator, comma, cut = _chosen(kept, given, source)
+    separator, comma, mark, cut = _chosen(kept, given, source)
     width = _width(cut)
     first = 0 if given.skip is not None and given.header is not None else _first_row(cut, width)
     top = first if given.skip is None or given.header is None else min(given.header, len(cut))
     names, units, top = _header(cut, top, width, given, source, own=own)
-    layout, assumed = _said(cut, given, separator, comma, names, units, top, first)
+    layout, assumed = _said(cut, given, separator, comma, mark, names, units, top, first)
     if given.skip is None:
-        _check_above(cut[: top - (0 if names is None else 1 if units is None else 2)], width, source, comma=comma)
+        _check_above(cut[: top - (0 if names is None else 1 if units is None else 2)], width, source, (comma, mark))
     if not own and names is None and top < len(cut):
         _check_headless(cut[top], source, given)
     if names is not None and not own and given.separator is None:
@@ -130,24 +131,35 @@ def find_table(lines: Sequence[tuple[int, str]], given: Layout, source: str, *, 
     begin = cut[top].at if top < len(cut) else cut[-1].at + 1
     if names is not None:
         width = len(names)
-    return Found(separator, comma, names, line, units, begin, width, layout, assumed)
+    return Found(separator, comma, names, line, units, begin, width, layout, assumed, mark)
 
 
-def _cut(kept: Sequence[tuple[int, str]], separator: str | None, source: str, *, comma: bool) -> list[_Line]:
-    """Lines cut into cells; a line whose quotes cannot be read is cut as it stands, the rows say so later."""
-    cut = []
+def _cut(
+    kept: Sequence[tuple[int, str]], separator: str | None, source: str, given: Layout, *, comma: bool
+) -> tuple[list[_Line], str | None]:
+    """Lines cut into cells, and what groups thousands in them.
+
+    A line whose quotes cannot be read is cut as it stands; the rows say so later.
+    """
+    cut, parted = [], []
     for at, line in kept:
         try:
             (cells,) = split([line], separator, source, at)
         except DataError:
             cells = line.split(separator)
+        parted.append((at, cells))
+    mark = None if given.thousands == "none" else given.thousands
+    if given.thousands is None:
+        marks = (grouping(cell, comma=comma) for _, cells in parted for cell in cells)
+        mark = next((found for found in marks if found is not None), None)
+    for at, cells in parted:
         there = [bool(cell.strip()) for cell in cells]
         numbers = [
-            full and (is_number(cell, comma=comma) or is_moment(cell))
+            full and (is_number(cell, comma=comma, mark=mark) or is_moment(cell))
             for cell, full in zip(cells, there, strict=True)
         ]  # fmt: skip
         cut.append(_Line(at, cells, numbers, sum(there) - sum(numbers)))
-    return cut
+    return cut, mark
 
 
 def _ways(text: str, given: Layout) -> Iterator[tuple[str | None, bool]]:
@@ -161,12 +173,14 @@ def _ways(text: str, given: Layout) -> Iterator[tuple[str | None, bool]]:
             yield separator, comma
 
 
-def _chosen(kept: Sequence[tuple[int, str]], given: Layout, source: str) -> tuple[str | None, bool, list[_Line]]:
+def _chosen(
+    kept: Sequence[tuple[int, str]], given: Layout, source: str
+) -> tuple[str | None, bool, str | None, list[_Line]]:
     """The way of cutting under which most lines are rows of one width."""
     text = "".join(line for _, line in kept)
-    best: tuple[tuple[int, ...], str | None, bool, list[_Line]] | None = None
+    best: tuple[tuple[int, ...], str | None, bool, str | None, list[_Line]] | None = None
     for separator, comma in _ways(text, given):
-        cut = _cut(kept, separator, source, comma=comma)
+        cut, mark = _cut(kept, separator, source, given, comma=comma)
         if comma and given.decimal is None and _decimal_comma(cut) is None:
             continue
         width = _width(cut)
@@ -174,15 +188,15 @@ def _chosen(kept: Sequence[tuple[int, str]], given: Layout, source: str) -> tupl
         half = 2 * sum(line.width > 1 for line in cut[:20]) >= len(cut[:20])
         rank = (len(rows), -sum(line.words for line in rows), half and not rows)
         if best is None or rank > best[0]:
-            best = rank, separator, comma, cut
+            best = rank, separator, comma, mark, cut
     if best is None:
         raise DataError(f"{source}: the separator and the decimals that layout= says do not go together; say others")
-    _, separator, comma, cut = best
+    _, separator, comma, mark, cut = best
     if given.decimal is None and given.separator is None and separator == ",":
         _check_commas(kept, cut, source)
     if given.decimal is None and comma:
         _check_thousands(cut, source)
-    return separator, comma, cut
+    return separator, comma, mark, cut
 
 
 def _decimal_comma(cut: list[_Line]) -> str | None:
@@ -317,9 +331,10 @@ def _check_headless(line: _Line, source: str, given: Layout) -> None:
         raise _mixed_line(line, source)
 
 
-def _check_above(above: list[_Line], width: int, source: str, *, comma: bool) -> None:
+def _check_above(above: list[_Line], width: int, source: str, marks: tuple[bool, str | None]) -> None:
     """Refuse to leave out what may be rows: lines of several numbers and nothing else."""
-    rows = [line for line in above if line.full and sum(is_number(cell, comma=comma) for cell in line.cells) > 1]
+    comma, mark = marks
+    rows = [line for line in above if line.full and sum(is_number(c, comma=comma, mark=mark) for c in line.cells) > 1]
     if rows:
         raise DataError(
             f"{source}: line {rows[0].at} has {rows[0].width} numbers, {len(rows)} such lines in all, and stands above "
@@ -389,7 +404,7 @@ def _check_mixed(cut: list[_Line], top: int, separator: str | None, comma: bool,
 
 
 def _said(
-    cut: list[_Line], given: Layout, separator: str | None, comma: bool, names: list[str] | None,
+    cut: list[_Line], given: Layout, separator: str | None, comma: bool, mark: str | None, names: list[str] | None,
     units: list[str] | None, top: int, first: int,
 ) -> tuple[Layout, tuple[Assumption, ...]]:  # fmt: skip
     """The layout, and what of it nobody said."""
@@ -397,7 +412,7 @@ def _said(
     start = top - header
     skip = given.skip if given.skip is not None else 0 if start == 0 else cut[start].at - 1 if start < len(cut) else 0
     layout = Layout(
-        separator=_WORDS[separator], decimal="comma" if comma else "point", skip=skip, header=header
+        separator=_WORDS[separator], decimal="comma" if comma else "point", thousands=mark, skip=skip, header=header
     ).under(given)  # fmt: skip
     assumed = []
     if given.separator is None:
@@ -407,6 +422,10 @@ def _said(
         shown = _decimal_comma(cut)
         words, otherwise = f"decimal commas, as in {shown!r}", "layout=dict(decimal='point')"
         assumed.append(Assumption("decimal", "comma", words, otherwise))
+    if given.thousands is None and mark is not None:
+        shown = next(c.strip() for line in cut for c in line.cells if grouping(c, comma=comma) == mark)
+        words = f"{mark}s group thousands, as in {shown!r}"
+        assumed.append(Assumption("thousands", mark, words, "layout=dict(thousands='none')"))
     if given.skip is None and skip:
         words = f"{'line 1 is' if skip == 1 else f'lines 1 to {skip} are'} above the table and left out"
         assumed.append(Assumption("skip", skip, words, "layout=dict(skip=LINES)"))

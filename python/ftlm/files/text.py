@@ -18,7 +18,17 @@ import numpy.typing as npt
 from ftlm.base.checks import bad_rows
 from ftlm.base.errors import DataError
 from ftlm.data.header import LONGEST_HEADER, header_of_line
-from ftlm.files.cells import DECIMAL_COMMA, is_number, number, split, stated_unit
+from ftlm.files.cells import (
+    DECIMAL_COMMA,
+    behind_a_stroke,
+    grouping,
+    is_gap,
+    is_number,
+    may_group,
+    number,
+    split,
+    stated_unit,
+)
 from ftlm.files.columns import Column, FileTable
 from ftlm.files.layout import Assumption, Layout
 from ftlm.files.moments import Moments, is_moment
@@ -30,6 +40,7 @@ _SAMPLE, _SAMPLE_LINES = 1 << 16, 8
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _UTF32 = (codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)
 _LARGEST_UNPACKED = 1 << 30
+_FILL = "fill or remove these rows yourself, or let them be missing with missing='weight' or missing='hold'"
 
 
 @dataclass
@@ -53,12 +64,18 @@ class _Trouble:
         way_out = "correct or remove these rows"
         if not text:
             what = "empty cell" + (", or one with an error or a formula that nobody computed" if self.sheet else "")
-            way_out = (
-                "fill or remove these rows yourself, or let them be missing with missing='weight' or missing='hold'"
-            )
+            way_out = _FILL
+        elif is_gap(text):
+            what = f"{shown} stands for no number"
+            way_out = _FILL
+        elif (mark := grouping(text, comma=self.comma)) is not None:
+            what = f"{shown} has marks between thousands"
+            way_out = f"say layout=dict(thousands={mark!r}), or write all numbers without"
         elif self.comma and "." in text and is_number(text):
             what = f"{shown} has a point where decimals follow a comma"
-            way_out = "write all numbers alike, without marks between thousands"
+            way_out = "write all numbers alike"
+            if may_group(text, "point", comma=True):
+                way_out += ", or say layout=dict(thousands='point') where points group thousands"
         elif DECIMAL_COMMA.fullmatch(text):
             what = f"{shown} has a decimal comma"
             way_out = "write all numbers alike, or say layout=dict(decimal='comma') where all of them have commas"
@@ -240,7 +257,7 @@ def _take(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> 
         rows.ragged += len(wrong)
     if not rows.ragged:
         # Python's numbers may have underscores between their digits, those of files have not.
-        plain = not found.comma and not any("_" in line for _, line in kept)
+        plain = not found.comma and found.mark is None and not any("_" in line for _, line in kept)
         rows.blocks.append(_numbers(rows, cells, [at for at, _ in kept], plain=plain))
     rows.count += len(cells)
 
@@ -248,7 +265,7 @@ def _take(rows: _Rows, first: int, lines: list[str], mark: str, source: str) -> 
 def _check_remark(line: str, at: int, found: Found, source: str) -> None:
     """Refuse a line among the rows that may be a remark or a row whose first cell is one like #N/A."""
     cells = line.split(found.separator)
-    numbers = any(is_number(cell, comma=found.comma) or is_moment(cell) for cell in cells)
+    numbers = any(is_number(cell, comma=found.comma, mark=found.mark) or is_moment(cell) for cell in cells)
     error = len(cells) == 1 and cells[0].strip().endswith(("!", "?", "/A"))
     if len(cells) == found.width and (found.width > 1 or error) and (numbers or error or found.separator is not None):
         raise DataError(
@@ -280,7 +297,7 @@ def _columns(rows: _Rows, path: Path, source: str) -> list[Column]:
                 f"{source}: column {name!r}", f"dates or times of day, not numbers ({moments.first!r})", 0, rows.count,
                 "name it with time=, or choose another column",
             )  # fmt: skip
-        unit = (found.units[k] if found.units is not None else "") or stated_unit(name)[1]
+        unit = (found.units[k] if found.units is not None else "") or stated_unit(name)[1] or behind_a_stroke(name)[1]
         blank = trouble is not None and trouble.blank
         columns.append(Column(name, name, path, column, problem, blank=blank, moments=moments, stated=unit))
     return columns
@@ -382,8 +399,9 @@ def _undecodable(path: Path, error: UnicodeError, line: int, encoding: str) -> D
 
 
 def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bool) -> npt.NDArray[np.float64]:
-    width, comma = len(cells[0]), rows.found.comma
-    value: Callable[[str], float] = float if plain else functools.partial(number, comma=comma)
+    width = len(cells[0])
+    careful = functools.partial(number, comma=rows.found.comma, mark=rows.found.mark)
+    value: Callable[[str], float] = float if plain else careful
     try:
         flat = np.fromiter(map(value, itertools.chain.from_iterable(cells)), dtype=np.float64, count=len(cells) * width)
     except ValueError:
@@ -394,7 +412,7 @@ def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bo
     for index in range(width):
         column = [row[index] for row in cells]
         try:
-            values[:, index] = list(map(value, column))
+            values[:, index] = list(map(careful, column))
         except ValueError:
             _not_numbers(rows, index, column, lines, values)
     return values
@@ -402,13 +420,13 @@ def _numbers(rows: _Rows, cells: list[list[str]], lines: list[int], *, plain: bo
 
 def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], values: npt.NDArray[np.float64]) -> None:
     """Keep moments of a column, or which of its cells are none and no numbers."""
-    comma = rows.found.comma
+    comma, mark = rows.found.comma, rows.found.mark
     if is_moment(column[0]) and rows.count == sum(m.clock.size for m in rows.moments.get(index, [])):
         moments = Moments.read(column)
         if moments is not None:
             rows.moments.setdefault(index, []).append(moments)
             return
-    bad = [row for row, cell in enumerate(column) if not is_number(cell, comma=comma)]
+    bad = [row for row, cell in enumerate(column) if not is_number(cell, comma=comma, mark=mark)]
     dated = [row for row in bad if is_moment(column[row])]
     if dated and 2 * len(dated) > len(column):
         # Among dates it is the numbers that are wrong.
@@ -416,15 +434,19 @@ def _not_numbers(rows: _Rows, index: int, column: list[str], lines: list[int], v
     # Where all are moments, the first that is written otherwise than the first of all.
     ways = [row for row in bad if Moments.read([column[0], column[row]]) is None] if len(dated) == len(column) else []
     bad = ways or bad
-    blank = all(not column[row].strip() for row in bad)
+    # What says nothing beside what says something wrong is not what is to be told of.
+    bad = [row for row in bad if not is_gap(column[row])] or bad
+    blank = all(is_gap(column[row]) for row in bad)
     if blank and not dated:
-        values[:, index] = [number(cell, comma=comma) if cell.strip() else np.nan for cell in column]
+        values[:, index] = [np.nan if is_gap(cell) else number(cell, comma=comma, mark=mark) for cell in column]
     known = rows.troubles.get(index)
     if known is None:
         rows.troubles[index] = _Trouble(
             lines[bad[0]], rows.count + bad[0], column[bad[0]], len(bad), blank and not dated, comma, bool(dated),
             rows.sheet, column[0].strip()[:40] if ways else "",
         )  # fmt: skip
-    else:
-        known.count += len(bad)
-        known.blank &= blank and not dated
+        return
+    if known.blank and (dated or not blank):
+        known.line, known.row, known.cell = lines[bad[0]], rows.count + bad[0], column[bad[0]]
+    known.count += len(bad)
+    known.blank &= blank and not dated

@@ -46,7 +46,7 @@ def comparison_charts(
             pulse_times(comparison, k),
             [("measured", comparison.measured[name][k]), ("simulated", comparison.simulated[name][k])],
             title=f"{symbol(name)}, {f'{label}: ' if label else ''}{run}", x_label="time [s]",
-            y_label=with_unit(symbol(name), units, name), points=points,
+            y_label=with_unit(symbol(name), units, name), points=points, slider=True,
             caption=f"Free run: fit {number(figures.fit)}\u00a0%, NR {number(figures.nr)}.",
         )
         for k, (run, _, output_error) in enumerate(comparison.per_run)

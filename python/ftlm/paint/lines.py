@@ -13,6 +13,7 @@ from ftlm.base.arrays import Floats
 from ftlm.base.errors import DataError
 from ftlm.paint.axes import POINTS, STRAY, Ticks, decimate, limits, log_ticks, snapped, ticks
 from ftlm.paint.figure import LETTER, LINE, NARROW, Figure, svg, svg_text, text_width
+from ftlm.paint.readings import readings
 from ftlm.paint.text import number, shortened
 
 #: Values beyond this are drawn as gaps: differences of two of them leave the range of double precision.
@@ -109,6 +110,7 @@ def line_chart(
     x: ArrayLike, lines: Sequence[tuple[str, ArrayLike]], *, title: str, x_label: str, y_label: str, width: int = 720,
     height: int = 260, log_x: bool = False, log_y: bool = False, caption: str = "", points: int = POINTS,
     bands: Sequence[tuple[ArrayLike, ArrayLike]] = (), stems: bool = False, dots: Collection[str] = (),
+    slider: bool = False,
 ) -> Figure:  # fmt: skip
     """Chart of one or several lines over a common axis.
 
@@ -135,6 +137,9 @@ def line_chart(
         Draw every value as a stem from 0 instead of a line.
     dots
         Names of lines that are dots where they have a value, and nothing elsewhere.
+    slider
+        Give a page's script what it needs for a slider that reads the lines out, sample by sample; on axes that are
+        not logarithmic.
 
     Returns
     -------
@@ -164,7 +169,12 @@ def line_chart(
     chart = _Chart(
         title, described, x_label, y_label, drawn, shades, (x_low, x_high, y_low, y_high), log_x, log_y, stems
     )
-    wide = _drawing(chart, width, height, points, narrow=False)
+    read = ""
+    if slider and not (log_x or log_y):
+        # A page of many charts has few points a line, and room for as few to be read out.
+        values = [(line.name, line.style, line.y) for line in drawn]
+        read = readings(drawn[0].x, values, x_label, y_label, max(2, points // 2))
+    wide = _drawing(chart, width, height, points, narrow=False, read=read)
     small = _drawing(chart, NARROW, 240, max(4, points // 2), narrow=True)
     return Figure(title, wide, small, " ".join(([caption] if caption else []) + notes))
 
@@ -246,7 +256,7 @@ def _described(line: _Line, log_y: bool) -> str:
     return f"{line.name or 'Values'}: from {low} to {high}, at the end {last}."
 
 
-def _drawing(chart: _Chart, width: int, height: int, points: int, *, narrow: bool) -> Markup:
+def _drawing(chart: _Chart, width: int, height: int, points: int, *, narrow: bool, read: str = "") -> Markup:
     across, upward = chart.ticks(narrow=narrow)
     named = chart.named
     legend = _legend(named, width) if narrow else []
@@ -263,8 +273,10 @@ def _drawing(chart: _Chart, width: int, height: int, points: int, *, narrow: boo
     if named:
         parts += _legend_marks(legend) if narrow else _end_labels(named, plot)
     parts.append(Markup("</g>"))
-    zoom = "" if chart.log_x or chart.log_y or chart.stems else _zoomable(plot, across, upward)
-    return svg(width, height, chart.title, chart.described, parts, narrow=narrow, attributes=zoom)
+    told = Markup("") if chart.log_x or chart.log_y or chart.stems else _zoomable(plot, across, upward)
+    if read:
+        told += Markup(' data-readings="{}"').format(read)
+    return svg(width, height, chart.title, chart.described, parts, narrow=narrow, attributes=told)
 
 
 def _grid(plot: _Plot, across: Ticks, upward: Ticks) -> list[Markup]:

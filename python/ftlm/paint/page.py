@@ -70,9 +70,21 @@ def _template() -> Template:
 
 
 @cache
+def look() -> Markup:
+    """What all pages look alike in."""
+    return Markup(resources.files("ftlm.paint").joinpath("look.css").read_text("utf-8"))  # our own file
+
+
+@cache
+def chart_script() -> str:
+    """What makes charts zoom, and sliders read them out."""
+    return resources.files("ftlm.paint").joinpath("charts.js").read_text("utf-8")
+
+
+@cache
 def _script() -> tuple[Markup, str]:
-    """The zoom of the charts, and the hash under which the page allows it and nothing else."""
-    text = resources.files("ftlm.paint").joinpath("zoom.js").read_text("utf-8")
+    """The script of the charts, and the hash under which the page allows it and nothing else."""
+    text = chart_script()
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return Markup(text), f"sha256-{digest}"  # our own file
 
@@ -110,8 +122,8 @@ def write_page(
     """
     script, digest = _script()
     page = _template().render(
-        title=title, lead=lead, sections=list(sections), version=__version__, chart_css=chart_css(), script=script,
-        script_hash=digest, verdict=verdict,
+        title=title, lead=lead, sections=list(sections), version=__version__, look=look(), chart_css=chart_css(),
+        script=script, script_hash=digest, verdict=verdict,
     )  # fmt: skip
     # A name may hold half a surrogate pair, which no file can.
     return write_atomically(path, page.encode("utf-8", "backslashreplace"), force=force)

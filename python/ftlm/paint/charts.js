@@ -1,11 +1,12 @@
 "use strict";
-// Zoom for the charts of a page: drag across a plot, or the buttons below it. Without this script the page is complete.
-document.querySelectorAll("svg.chart[data-frame]").forEach(function (svg) {
+// Zoom and sliders for the charts of a page. Without this script the page is complete, but for these.
+function zoomable(svg) {
   const plot = svg.querySelector("svg.plot"), grid = svg.querySelector(".grid"), texts = svg.querySelector(".ticks");
-  if (!plot || !grid || !texts) return;
+  if (!plot || !grid || !texts || svg.nextElementSibling?.classList.contains("zoom")) return null;
   const numbers = (name) => svg.dataset[name].split(" ").map(Number);
   const whole = numbers("frame"), [left, top, width, height] = numbers("plot"), [px, py] = numbers("powers");
   const box = plot.viewBox.baseVal, full = [box.width, box.height], narrow = svg.classList.contains("narrow");
+  const chart = { shown: () => {}, picked: () => {} };
   let view = whole.slice();
 
   function ticks(low, high, most, power) {
@@ -23,6 +24,7 @@ document.querySelectorAll("svg.chart[data-frame]").forEach(function (svg) {
     Object.entries(attributes).forEach(([key, value]) => element.setAttribute(key, value));
     if (text !== undefined) element.textContent = text;
     parent.appendChild(element);
+    return element;
   }
 
   function show() {
@@ -46,6 +48,7 @@ document.querySelectorAll("svg.chart[data-frame]").forEach(function (svg) {
     svg.dataset.view = view.join(" ");
     const zoomed = view.some((v, i) => v !== whole[i]);
     [out, back, on, all].forEach((b) => { b.disabled = !zoomed; });
+    chart.shown();
   }
 
   function move(x0, x1, y0, y1) {
@@ -91,12 +94,13 @@ document.querySelectorAll("svg.chart[data-frame]").forEach(function (svg) {
     const x = (event.clientX - rect.left) * scale, y = (event.clientY - rect.top) * scale;
     return [Math.min(Math.max(x, left), left + width), Math.min(Math.max(y, top), top + height)];
   }
+  const toX = (v) => view[0] + ((v - left) / width) * (view[1] - view[0]);
+  const toY = (v) => view[3] - ((v - top) / height) * (view[3] - view[2]);
   svg.addEventListener("pointerdown", function (event) {
     if (event.button !== 0) return;
     from = at(event);
     svg.setPointerCapture(event.pointerId);
-    add(svg, "rect", { class: "mark", x: from[0], y: top, width: 0, height: height });
-    mark = svg.lastElementChild;
+    mark = add(svg, "rect", { class: "mark", x: from[0], y: top, width: 0, height: height });
   });
   svg.addEventListener("pointermove", function (event) {
     if (!from) return;
@@ -111,13 +115,99 @@ document.querySelectorAll("svg.chart[data-frame]").forEach(function (svg) {
     const [x, y] = at(event), begun = from, tall = event.pointerType === "mouse" && Math.abs(y - begun[1]) > 24;
     from = null;
     mark.remove();
-    if (event.type === "pointercancel" || Math.abs(x - begun[0]) < 8) return;
-    const toX = (v) => view[0] + ((v - left) / width) * (view[1] - view[0]);
-    const toY = (v) => view[3] - ((v - top) / height) * (view[3] - view[2]);
+    if (event.type === "pointercancel") return;
+    if (Math.abs(x - begun[0]) < 8) { chart.picked(toX(x)); return; }
     const ys = tall ? [toY(Math.max(y, begun[1])), toY(Math.min(y, begun[1]))] : [view[2], view[3]];
     move(toX(Math.min(x, begun[0])), toX(Math.max(x, begun[0])), ys[0], ys[1]);
   }
   svg.addEventListener("pointerup", end);
   svg.addEventListener("pointercancel", end);
   svg.addEventListener("dblclick", () => { view = whole.slice(); show(); });
-});
+
+  // Where a slider is: a line across the plot, and a ring on every line of the chart.
+  const cursor = add(svg, "g", { class: "cursor" });
+  chart.point = (x, values) => {
+    cursor.replaceChildren();
+    if (x < view[0] || x > view[1]) return;
+    const across = left + (width * (x - view[0])) / (view[1] - view[0]);
+    add(cursor, "path", { d: `M${across} ${top}v${height}` });
+    values.forEach(([y, style]) => {
+      if (y === null || y < view[2] || y > view[3]) return;
+      const down = top + (height * (view[3] - y)) / (view[3] - view[2]);
+      add(cursor, "circle", { class: `line${style}`, cx: across, cy: down, r: 4.5 });
+    });
+  };
+  // A window that was zoomed into follows the slider.
+  chart.follow = (x) => {
+    const wide = view[1] - view[0];
+    if (x < view[0] || x > view[1]) move(x - wide / 2, x + wide / 2, view[2], view[3]);
+  };
+  return chart;
+}
+
+let sliders = 0;
+// A slider below a chart reads out what its lines are at an instant, and how far apart.
+function slider(svg, charts) {
+  const figure = svg.parentElement, told = JSON.parse(svg.dataset.readings), name = svg.querySelector("title").textContent;
+  const times = told.at[1];
+  // Whole numbers and their power of ten, put together as text so that 3 tenths are 0.3.
+  const scaled = ([power, whole], k) => (whole[k] === null ? null : Number(`${whole[k]}e${power}`));
+  const time = (k) => scaled(told.at, k), value = (i, k) => scaled(told.lines[i].at, k);
+  function words(v, unit) {
+    if (v === null) return "none";
+    const [mantissa, power] = v.toExponential(3).split("e").map(Number);
+    const raised = [...String(power)].map((c) => "\u207b\u2070\u00b9\u00b2\u00b3\u2074\u2075\u2076\u2077\u2078\u2079"["-0123456789".indexOf(c)]);
+    const text = v === 0 || (power > -4 && power < 5) ? String(Number(v.toPrecision(4))) : `${mantissa}\u00d710${raised.join("")}`;
+    return text.replace("-", "\u2212") + (unit && unit !== "1" ? `\u00a0${unit}` : "");
+  }
+
+  const row = document.createElement("div"), label = document.createElement("label"), range = document.createElement("input");
+  const said = document.createElement("p");
+  row.className = "slide";
+  range.type = "range";
+  range.id = `slide-${++sliders}`;
+  Object.assign(range, { min: 0, max: times.length - 1, step: 1, value: told.begin });
+  label.htmlFor = range.id;
+  label.textContent = told.name;
+  range.setAttribute("aria-label", `${told.name}, ${name}`);
+  said.className = "reads";
+  row.append(label, range, said);
+  figure.insertBefore(row, figure.querySelector(".note"));
+
+  function show(follow) {
+    const k = Number(range.value), parts = told.lines.map((line, i) => [line.name || "value", words(value(i, k), told.y)]);
+    if (told.apart && value(0, k) !== null && value(1, k) !== null) {
+      parts.push([k === told.begin ? "largest difference" : "difference", words(Math.abs(value(0, k) - value(1, k)), told.y)]);
+    }
+    parts.unshift([told.name, words(time(k), told.unit)]);
+    said.replaceChildren(...parts.map(([what, text]) => {
+      const part = document.createElement("span"), strong = document.createElement("b");
+      strong.textContent = text;
+      part.append(`${what} `, strong);
+      return part;
+    }));
+    range.setAttribute("aria-valuetext", parts.map(([what, text]) => `${what} ${text}`).join(", "));
+    if (follow) charts.forEach((chart) => chart.follow(time(k)));
+    charts.forEach((chart) => chart.point(time(k), told.lines.map((line, i) => [value(i, k), line.style])));
+  }
+  range.addEventListener("input", () => show(true));
+  charts.forEach((chart) => {
+    chart.shown = () => show(false);
+    chart.picked = (x) => {
+      let best = 0;
+      times.forEach((_, k) => { if (Math.abs(time(k) - x) < Math.abs(time(best) - x)) best = k; });
+      range.value = best;
+      show(false);
+    };
+  });
+  show(false);
+}
+
+function liven(root) {
+  root.querySelectorAll("figure").forEach((figure) => {
+    const charts = [...figure.querySelectorAll("svg.chart[data-frame]")].map(zoomable).filter(Boolean);
+    const read = figure.querySelector("svg[data-readings]");
+    if (read && charts.length) slider(read, charts);
+  });
+}
+liven(document);
