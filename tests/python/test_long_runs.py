@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter, ss2tf
 from scipy.special import erfcx
 
 import ftlm
+from ftlm.fit.grid import Grid
+from ftlm.fit.problem import FreeProblem
+from ftlm.fit.race import COARSE_SAMPLES, thinned
+from ftlm.fit.starts import power_frequency
 from ftlm.solve import long
 from ftlm.solve.refined import refined
 from ftlm.solve.sampled import started
@@ -129,3 +135,21 @@ def test_too_few_pulses_are_an_error_and_what_grows_is_one_too():
         model.simulate(run, largest_m=30_000)
     with pytest.raises(ftlm.errors.ConvergenceError, match="leaves the range of numbers"):
         ftlm.Model(ftlm.equation("D^1.4 y = 4 y + 2 u")).simulate(run)
+
+
+def test_starts_of_a_long_fast_record_compete_on_a_part_that_still_shows_its_motion() -> None:
+    """Thinned to 1200 samples, 60 000 of a swing of 20 rad/s would be read every 0.5 s, two turns and a half."""
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.choice([-1.0, 1.0], size=1200), 50)
+    y = lfilter(*(np.ravel(p) for p in cont2discrete(([1.0], [1.0, 2.0, 400.0]), 0.01)[:2]), u)
+    runs = [ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})]
+    problem = FreeProblem.of(ftlm.equation("D^2 y = d D y + a y + b u", initial="rest"))
+    grid = thinned(Grid(problem, runs, [1.0]))
+    carried = math.pi / (power_frequency(runs[0], "y") * 0.01)
+    assert 10 <= grid.decimation <= max(10.0, carried)
+    assert grid.runs[0].length == COARSE_SAMPLES * grid.decimation + 1
+    np.testing.assert_array_equal(grid.runs[0]["y"], y[: grid.runs[0].length])
+    assert grid.experiments[0][2].shape[1] == COARSE_SAMPLES + 1
+    # What stands still at first does not stand for what moves later.
+    still = [ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": np.where(np.arange(y.size) < 3e4, 0.0, y)})]
+    assert thinned(Grid(problem, still, [1.0])).runs is still

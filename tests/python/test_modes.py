@@ -269,3 +269,9 @@ def test_a_dead_time_is_waited_for_and_an_order_of_nearly_0_is_0():
     assert abs(late.step().values[0, 0, -1] - 1.5) < 5e-3
     nearly = ftlm.Model(ftlm.equation("D^1.8 y = -0.6 D^0.8 y - 9 D^0.00001 y + 4 u"))
     assert abs(nearly.dcgain()[0, 0] - 4 / 9) < 1e-3
+
+
+def test_a_pole_beyond_the_range_of_numbers_is_none() -> None:
+    # D^0.01 y = -1e-6 y has its zero at (1e-6)^(100) rad/s.
+    model = ftlm.Model(ftlm.equation("D^1.01 y = -1 D y - 1e-6 D^0.99 y + u"))
+    assert all(math.isfinite(m.time_constant) and m.frequency > 0 for m in modes(model))

@@ -34,8 +34,9 @@ BENT = 0.1
 #: way from the optimum.
 NEAR = 0.1
 FOUND = 0.02
-#: A valley is looked at on half as fine a grid where its optimum is no further off than this share of standard errors.
-NEARBY = 2.0
+#: A valley is looked at on half as fine a grid where its optimum is no further off than so many standard errors, or
+#: than this share of the numbers themselves.
+NEARBY, ALIKE = 2.0, 1e-3
 #: Evaluations of one refit, and refits an end at most.
 LAP = 120
 REFITS = 40
@@ -110,7 +111,8 @@ class Valley:
             with contextlib.suppress(FtlmError):
                 coarse = replace(grid, every=joint.refinement // 2)
                 found = cls.at(coarse, joint.on_grid, np.zeros(len(problem.names)))
-                if found.best.converged and np.all(np.abs(found.best.values - joint.on_grid) <= NEARBY * found.errors):
+                near = np.maximum(NEARBY * found.errors, ALIKE * np.abs(joint.on_grid))
+                if found.best.converged and np.all(np.abs(found.best.values - joint.on_grid) <= near):
                     return replace(found, shift=joint.values - found.best.values)
         return cls.at(grid, joint.on_grid, joint.values - joint.on_grid)
 

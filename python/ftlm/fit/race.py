@@ -15,10 +15,13 @@ from ftlm.fit.clock import Clock
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.simpler import LowerOrder, Simpler, Whole, held, lower_orders, simpler, whole
-from ftlm.fit.starts import delayed_attempts
+from ftlm.fit.starts import delayed_attempts, power_frequency
 
 #: Samples a run of the coarse fits that compare starts; the best ones continue on all samples.
 COARSE_SAMPLES = 1200
+#: So many samples become one without asking what that shows; half a turn of what holds 90 % of the power is to be as
+#: many at least; a part of a record stands for it if its outputs deviate by this share of the whole's.
+THINNEST, SHOWN, AS_LIVELY = 10, 1.0, 0.7
 #: Evaluations of every coarse fit, then of those that are ahead: one in RUNNERS, but not fewer than FEWEST.
 FIRST_LAP = 15
 SECOND_LAP = 60
@@ -179,8 +182,24 @@ def with_history(
 
 
 def thinned(grid: Grid) -> Grid:
-    """A grid of as many samples as starts compete on."""
-    return replace(grid, decimation=max(1, round(min(run.length - 1 for run in grid.runs) / COARSE_SAMPLES)))
+    """A grid of as many samples as starts compete on.
+
+    Thinned until they no longer show the motion, the samples of a long record tell no start from another: then its
+    first part is taken, if that moves as the whole does.
+    """
+    decimation = max(1, round(min(run.length - 1 for run in grid.runs) / COARSE_SAMPLES))
+    if decimation <= THINNEST or grid.shares is not None:
+        return replace(grid, decimation=decimation)
+    outputs = grid.problem.structure.outputs
+    fastest = max(power_frequency(run, o) * run.step for run in grid.runs for o in outputs)
+    carried = max(THINNEST, int(math.pi / (SHOWN * fastest)))
+    if carried >= decimation:
+        return replace(grid, decimation=decimation)
+    firsts = [run.slice(None, (COARSE_SAMPLES * carried + 0.5) * run.step) for run in grid.runs]
+    pairs = [(first[o], run[o]) for first, run in zip(firsts, grid.runs, strict=True) for o in outputs]
+    if any(not np.nanstd(part) >= AS_LIVELY * np.nanstd(whole) for part, whole in pairs):
+        return replace(grid, decimation=decimation)
+    return replace(grid, runs=firsts, decimation=carried)
 
 
 def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> tuple[Grid, list[Attempt]]:

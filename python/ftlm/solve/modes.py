@@ -27,6 +27,8 @@ from ftlm.solve.stability import characteristic, roots_in_base
 
 #: A zero this close to the negative axis [rad], or within its own uncertainty of it, relaxes: it swings no more there.
 NEAR_REAL = 0.02 * math.pi
+#: Logarithms of frequencies that are numbers.
+RANGE = 700.0
 #: Orders as they are printed: below half of their last digit one is 0.
 SEEN_ORDER = 5e-5
 #: Zeros up to here are a relaxation where no pole is there at all: D^0.5 y = -a y has its own at arg s = 2 pi.
@@ -119,7 +121,8 @@ def modes(model: Solved, *, coupling: str = "simulated") -> tuple[Mode, ...]:
     coupled = is_coupled(coupling)
     found: list[Mode] = []
     for at, polynomial in enumerate(characteristic(model, coupled=coupled)):
-        sheet = zeros_of(polynomial) or _nearest(polynomial)
+        # Beyond the range of numbers a pole is one at the origin, or of nothing that ever shows.
+        sheet = [w for w in zeros_of(polynomial) or _nearest(polynomial) if abs(w.real) < RANGE]
         spreads = _spreads(model, at, np.array(sheet), coupled=coupled)
         found += [_mode(w, spread) for w, spread in zip(sheet, spreads, strict=True)]
     return tuple(sorted(found, key=lambda mode: (mode.frequency, mode.pole.imag)))
