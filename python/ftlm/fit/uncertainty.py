@@ -77,7 +77,10 @@ def covariance_of(jacobian: Floats, series: list[Floats], squares: float) -> Flo
         basis = rows[seen][:, :count]
         answers = inverse @ basis
         middle = _wider(_of_colour(answers, basis, series), long_run(answers, series))
-    result: Floats = middle / np.outer(np.where(spread > 0, spread, 1.0), np.where(spread > 0, spread, 1.0))
+    # Of what moves next to nothing a variance may be beyond the numbers.
+    with np.errstate(over="ignore"):
+        result: Floats = middle / np.outer(np.where(spread > 0, spread, 1.0), np.where(spread > 0, spread, 1.0))
+    unseen |= ~np.isfinite(np.diag(result))
     result[unseen, :] = result[:, unseen] = np.nan
     result[unseen, unseen] = np.inf
     return result

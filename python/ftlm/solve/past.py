@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
 from ftlm.base.statistics import chi_squared, colour
 from ftlm.data.readings import read
@@ -22,26 +23,41 @@ from ftlm.solve.sampled import FIRST_REFINEMENT, measured_samples, own_times, sa
 RARE = 0.01
 
 
+#: A run is said to have been in motion if estimating its past halves what the model leaves over at least, by so many
+#: points of fit, and to this many standard deviations or less; a model that misses more than MISSES of them from rest
+#: tells nothing of the run.
+HALVES, POINTS, FOLLOWS, MISSES = 0.5, 0.01, 0.2, 3.0
+
+
 def in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
     """Whether what a solved structure leaves over of runs from rest, of all together, asks for a history."""
     excess, terms, spread = 0.0, 0, 1.0
     for run in runs:
-        ends = []
-        for start in ("rest", history(run, structure)):
-            model = Solved(replace(structure, initial=start))
-            try:
-                samples, found = sampled(model, run, FIRST_REFINEMENT, None, own_times(model, run))
-            except FtlmError:
-                return False
-            if not np.all(np.isfinite(samples)):
-                return False
-            ends.append(missed(measured_samples(model, run, FIRST_REFINEMENT), samples))
-            terms += sum(map(len, found.values())) if start != "rest" else 0
-        sizes = np.nanstd([run[o] for o in structure.outputs], axis=1).tolist()
-        excess += misfit([*ends[0]], [*ends[1]], sizes)
-        spread = max([spread, *map(colour, map(read, ends[1]))])
+        ends = _both(structure, run)
+        if ends is None:
+            return False
+        rest, past, more = ends
+        terms += more
+        excess += misfit([*rest], [*past], np.nanstd([run[o] for o in structure.outputs], axis=1).tolist())
+        spread = max([spread, *map(colour, map(read, past))])
     # Noise that is coloured is followed by slow terms in any run.
     return terms > 0 and excess / spread > chi_squared(terms, RARE)
+
+
+def _both(structure: Structure, run: Run) -> tuple[Floats, Floats, int] | None:
+    """What is left over from rest and with a history, a row an output, and its terms; None without numbers."""
+    ends, terms = [], 0
+    for start in ("rest", history(run, structure)):
+        model = Solved(replace(structure, initial=start))
+        try:
+            samples, found = sampled(model, run, FIRST_REFINEMENT, None, own_times(model, run))
+        except FtlmError:
+            return None
+        if not np.all(np.isfinite(samples)):
+            return None
+        ends.append(missed(measured_samples(model, run, FIRST_REFINEMENT), samples))
+        terms = sum(map(len, found.values()))
+    return ends[0], ends[1], terms
 
 
 def looked_like_rest(model: Solved, runs: Sequence[Run]) -> list[str]:
@@ -49,4 +65,17 @@ def looked_like_rest(model: Solved, runs: Sequence[Run]) -> list[str]:
     structure = model.structure
     if structure.initial != "auto" or structure.has_friction or not has_memory(structure):
         return []
-    return [run.name for run in runs if decided(run, structure) == "rest" and in_motion(structure, [run])]
+    looked = [run for run in runs if decided(run, structure) == "rest"]
+    return [run.name for run in looked if _told_by(structure, run) and in_motion(structure, [run])]
+
+
+def _told_by(structure: Structure, run: Run) -> bool:
+    """Whether a model follows a run with a history, and misses it from rest, by enough to be said."""
+    ends = _both(structure, run)
+    if ends is None:
+        return False
+    sizes = np.nanstd([run[o] for o in structure.outputs], axis=1)
+    rest, past = (np.sqrt(np.nanmean(end**2, axis=1)) / sizes for end in ends[:2])
+    return bool(np.any(
+        (past <= HALVES * rest) & (rest - past >= POINTS) & (past <= FOLLOWS) & (rest <= MISSES)
+    ))  # fmt: skip
