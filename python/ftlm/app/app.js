@@ -117,21 +117,29 @@ files.addEventListener("change", async (event) => {
 });
 files.addEventListener("submit", (event) => event.preventDefault());
 
+const gone = new Set();
+let looking = new AbortController();
+
 document.addEventListener("click", async (event) => {
   const button = event.target.closest("[data-do]");
   if (!button) return;
   const card = button.closest(".card"), key = card.dataset.key;
+  const place = `${button.dataset.do === "remove-file" ? "files" : "models"}/${key}`;
   try {
     if (button.dataset.do === "stop" || button.dataset.do === "resume") {
       put(models, await send(`models/${key}/${button.dataset.do}`, {})).querySelector("button")?.focus();
       soon();
     } else {
-      await request(`${button.dataset.do === "remove-file" ? "files" : "models"}/${key}`, { method: "DELETE" });
+      // Nobody is to ask any more for what is about to go.
+      gone.add(place);
+      looking.abort();
+      await request(place, { method: "DELETE" });
       card.remove();
       say("Removed.");
       (files.querySelector("button") || $("pick")).focus();
     }
   } catch (error) {
+    gone.delete(place);
     say(error.message, true);
   }
   arrange();
@@ -285,12 +293,15 @@ function progress(card, state) {
 }
 
 async function look() {
-  const state = JSON.parse(await request("state"));
+  looking = new AbortController();
+  const { signal } = looking;
+  const state = JSON.parse(await request("state", { signal }));
   let changed = false;
   for (const [key, each] of Object.entries(state.models)) {
+    if (gone.has(`models/${key}`)) continue;
     const card = document.getElementById(`model-${key}`);
     if (!card || Number(card.dataset.version) !== each.version) {
-      const part = put(models, await request(`models/${key}`), true);
+      const part = put(models, await request(`models/${key}`, { signal }), true);
       changed = true;
       if (!each.busy && card && part.dataset.state !== card.dataset.state) {
         say(`Model ${part.querySelector("h3").textContent}: ${part.querySelector(".first strong, .box strong")?.textContent || part.dataset.state}`);
@@ -301,9 +312,10 @@ async function look() {
     if (!(card.dataset.key in state.models)) { card.remove(); changed = true; }
   }
   for (const [key, version] of Object.entries(state.files)) {
+    if (gone.has(`files/${key}`)) continue;
     const card = document.getElementById(`file-${key}`);
     if (version && (!card || Number(card.dataset.version) < version) && !files.querySelector("[aria-busy]")) {
-      say(`“${put(files, await request(`files/${key}`)).querySelector("h3").textContent}” is read.`);
+      say(`“${put(files, await request(`files/${key}`, { signal })).querySelector("h3").textContent}” is read.`);
       changed = true;
     }
   }
@@ -319,7 +331,7 @@ async function again() {
     busy = await look();
     if (lost) { lost = false; say("ftlm app answers again."); }
   } catch (error) {
-    if (!lost) { lost = true; say(error.message, true); }
+    if (!lost && !looking.signal.aborted) { lost = true; say(error.message, true); }
   }
   timer = setTimeout(again, busy ? 300 : lost ? 3000 : 2000);
 }
