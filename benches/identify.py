@@ -2,7 +2,7 @@
 
 ``python benches/identify.py [five] [three] [long] [longest]``: theta22 of both laboratories' runs at 8 ms, five
 coefficients (promise P9), the same with three free orders, and one run of 50 000 samples, then of 500 000, with a free
-order (P10). Each in a process of its own; the rival of the first is SciPy's least_squares on the two numbers of the
+order (P10). Each in a process of its own, modules imported before (P8); the rival of the first is SciPy's least_squares on the two numbers of the
 link, all that is linear projected out by run (less than the five numbers that both runs share), from twenty starts.
 """
 
@@ -66,8 +66,8 @@ def arm(name: str) -> None:
     """Both runs of the arm."""
     runs = [arm_run("psf"), arm_run("lqr")]
     structure = ftlm.equation(WORDS[name], sensor_filter=ftlm.SensorFilter.low_pass(FILTERED))
-    before, found = peak(), []
-    seconds = spent(lambda: found.append(ftlm.identify(runs, structure, threads=1)))
+    identify, before, found = ftlm.identify, peak(), []
+    seconds = spent(lambda: found.append(identify(runs, structure, threads=1)))
     numbers = ", ".join(f"{n} {v:.4g}" for n, v in found[0].joint_values.items())
     told(name, seconds, before, f"{found[0].fit_percent['theta22']:.2f} %: {numbers}")
 
@@ -106,8 +106,8 @@ def long(samples: int) -> None:
     y = machine.simulate(drive, tolerance=1e-4)["y"]
     y = y + 0.01 * np.std(y) * rng.normal(size=samples)
     run = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y})
-    before, found = peak(), []
-    seconds = spent(lambda: found.append(ftlm.identify(run, ftlm.equation("D^alpha y = a y + b u"), threads=1)))
+    identify, before, found = ftlm.identify, peak(), []
+    seconds = spent(lambda: found.append(identify(run, ftlm.equation("D^alpha y = a y + b u"), threads=1)))
     numbers = ", ".join(f"{n} {v:.6g}" for n, v in found[0].joint_values.items())
     told(f"{samples} samples", seconds, before, f"{found[0].fit_percent['y']:.2f} %: {numbers}")
 

@@ -3,7 +3,7 @@
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
 
-use crate::abreast;
+use crate::{abreast, orthogonal};
 
 /// Rows over which one product of long columns is summed, at least, and into how many such parts their rows are cut at
 /// most; the parts do not depend on the threads, nor do their sums.
@@ -83,8 +83,12 @@ fn pieces(m: usize) -> Vec<(usize, usize)> {
 /// Needs at least as many rows as columns; shorter columns are padded with zero rows, which leaves R unchanged.
 #[must_use]
 pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
+    if let Some(factor) = orthogonal::triangular_factor(columns) {
+        return factor;
+    }
+    // Squares leave the numbers: norms are to be scaled.
     let k = columns.len();
-    let m = columns.first().map_or(0, Vec::len);
+    let m = columns.iter().map(Vec::len).max().unwrap_or(0);
     let x = Mat::from_fn(m.max(k), k, |i, j| columns[j].get(i).copied().unwrap_or(0.0));
     let qr = x.qr();
     let r = qr.thin_R();
@@ -95,24 +99,6 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
         }
     }
     out
-}
-
-/// Adds a column to an orthonormal basis unless less than this share of it lies outside the span. O(k m).
-pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share: f64) {
-    let size = |v: &[f64]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
-    let whole = size(&column);
-    // Twice is enough (Kahan, Parlett).
-    for _ in 0..2 {
-        for direction in basis.iter() {
-            let along: f64 = direction.iter().zip(&column).map(|(q, v)| q * v).sum();
-            column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
-        }
-    }
-    let left = size(&column);
-    if left > share * whole && left.is_finite() {
-        column.iter_mut().for_each(|v| *v /= left);
-        basis.push(column);
-    }
 }
 
 /// Inner products of every left with every right column (all of one length), row-major left × right. O(left·right·m), on

@@ -102,7 +102,7 @@ impl<'a> System<'a> {
         let mut rhs = self.rhs.clone();
         for (b, terms) in rhs.iter_mut().zip(&driving) {
             for &(exponent, coefficient) in terms {
-                b.iter_mut().zip(self.record.initial_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
+                b.iter_mut().zip(self.record.driving_term(exponent)).for_each(|(b, v)| *b += coefficient * v);
             }
         }
         (rhs, beside)
@@ -182,7 +182,7 @@ impl<'a> System<'a> {
         }
         let alone = |i: usize, exponent: f64| {
             let mut rows = vec![vec![0.0; m]; n];
-            rows[i] = self.record.initial_term(exponent);
+            rows[i] = self.record.driving_term(exponent);
             rows
         };
         let inverse = solver.inverse()?;
@@ -213,7 +213,7 @@ impl<'a> System<'a> {
                 if self.is_beside(exponent) {
                     return alone(i, exponent);
                 }
-                let term = self.record.initial_term(exponent);
+                let term = self.record.driving_term(exponent);
                 kernels.iter().map(|row| through(&row[i], &term)).collect()
             })
             .collect())

@@ -1,12 +1,8 @@
 //! Kernels of the fractional integral I^η and of its derivative with respect to η, Grünwald–Letnikov weights, and pulse
 //! means of powers of t.
 
-use std::cell::RefCell;
-use std::sync::Arc;
-use std::thread::LocalKey;
-
 use crate::error::{Error, Result};
-use crate::shared::Shared;
+use crate::powers::{odd_powers, whole_logarithms, whole_powers};
 
 /// Highest order of an integral, and of an equation: five lightly damped modes in one. The kernels are exact to a few ε
 /// up to here; what a division loses to rounding grows as (ωT)^α/Γ(α+1), so long records of many modes need fewer orders.
@@ -42,9 +38,10 @@ pub fn block_pulse_kernel(eta: f64, m: usize, step: f64) -> Vec<f64> {
     if m < SIEVED {
         return (1..=m).map(|n| scale * differences.value(n)).collect();
     }
-    let (head, powers) = (differences.head(scale), whole_powers(eta + 1.0, m));
-    let tail = powers.iter().enumerate().skip(HEAD);
-    head.iter().map(|&(v, _)| v).chain(tail.map(|(c, &power)| scale * differences.far(c, power))).collect()
+    let powers = whole_powers(eta + 1.0, m);
+    let head = (1..=HEAD).map(|n| differences.near(n, powers[n - 1]));
+    let tail = powers.iter().enumerate().skip(HEAD).map(|(c, &power)| differences.far(c, power));
+    head.chain(tail).map(|v| scale * v).collect()
 }
 
 /// Derivative of [`block_pulse_kernel`] with respect to η.
@@ -65,12 +62,12 @@ pub fn kernel_with_derivative(eta: f64, m: usize, step: f64) -> (Vec<f64>, Vec<f
         let powers = whole_powers(eta + 1.0, m);
         let logarithms = whole_logarithms(m);
         let (mut kernel, mut slopes) = (Vec::with_capacity(m), Vec::with_capacity(m));
-        for (v, dv) in differences.head(1.0) {
-            kernel.push(scale * v);
-            slopes.push(scale * (v * slope + dv));
-        }
-        for (c, (&power, &logarithm)) in powers.iter().zip(logarithms.iter()).enumerate().skip(HEAD) {
-            let (v, dv) = differences.far_with_slope(c, power, logarithm);
+        for (c, (&power, &logarithm)) in powers.iter().zip(logarithms.iter()).enumerate() {
+            let (v, dv) = if c < HEAD {
+                differences.near_with_slope(c + 1, power, logarithm)
+            } else {
+                differences.far_with_slope(c, power, logarithm)
+            };
             kernel.push(scale * v);
             slopes.push(scale * (v * slope + dv));
         }
@@ -123,28 +120,42 @@ impl SecondDifferences {
 
     #[allow(clippy::cast_precision_loss)]
     pub(crate) fn value(&self, n: usize) -> f64 {
+        self.near(n, if n > 2 { libm::pow((n - 1) as f64, self.eta + 1.0) } else { 1.0 })
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn value_and_slope(&self, n: usize) -> (f64, f64) {
+        let centre = n.saturating_sub(1) as f64;
+        let (power, logarithm) =
+            if n > 2 { (libm::pow(centre, self.eta + 1.0), libm::log(centre)) } else { (1.0, 0.0) };
+        self.near_with_slope(n, power, logarithm)
+    }
+
+    /// `v_n` from (n−1)^{η+1}.
+    #[allow(clippy::cast_precision_loss)]
+    fn near(&self, n: usize, power: f64) -> f64 {
         match n {
             0 => 0.0,
             1 => 1.0,
             2 => 2.0 * libm::expm1(self.eta * std::f64::consts::LN_2),
             _ => {
                 let centre = (n - 1) as f64;
-                let sum = Self::sum(&self.coefficients, n - 1, 1.0 / (centre * centre));
-                2.0 * libm::pow(centre, self.eta + 1.0) * sum
+                2.0 * power * Self::sum(&self.coefficients, n - 1, 1.0 / (centre * centre))
             }
         }
     }
 
+    /// `v_n` and its derivative from (n−1)^{η+1} and ln(n−1).
     #[allow(clippy::cast_precision_loss)]
-    fn value_and_slope(&self, n: usize) -> (f64, f64) {
-        let value = self.value(n);
+    fn near_with_slope(&self, n: usize, power: f64, logarithm: f64) -> (f64, f64) {
+        let value = self.near(n, power);
         match n {
             0 | 1 => (value, 0.0),
             2 => (value, 2.0 * libm::exp2(self.eta) * std::f64::consts::LN_2),
             _ => {
                 let centre = (n - 1) as f64;
                 let slope = Self::sum(&self.slopes, n - 1, 1.0 / (centre * centre));
-                (value, value * libm::log(centre) + 2.0 * libm::pow(centre, self.eta + 1.0) * slope)
+                (value, value * logarithm + 2.0 * power * slope)
             }
         }
     }
@@ -165,11 +176,6 @@ const fn terms_at(centre: usize) -> usize {
 }
 
 impl SecondDifferences {
-    /// The first [`HEAD`] terms and slopes, times `scale`.
-    fn head(&self, scale: f64) -> Vec<(f64, f64)> {
-        (1..=HEAD).map(|n| self.value_and_slope(n)).map(|(v, dv)| (scale * v, scale * dv)).collect()
-    }
-
     /// `v_n` at n = centre + 1 > [`HEAD`] from centre^{η+1}.
     #[allow(clippy::cast_precision_loss)]
     fn far(&self, centre: usize, power: f64) -> f64 {
@@ -191,101 +197,6 @@ impl SecondDifferences {
         let value = 2.0 * power * sum;
         (value, value * logarithm + 2.0 * power * slope)
     }
-}
-
-/// `n^exponent` for n = 0 … m−1. Powers are multiplicative: only primes cost a power, everything else one product, so
-/// the relative error grows by half an ε per prime factor, of which n < 2^20 has at most 19.
-#[allow(clippy::cast_precision_loss)]
-fn whole_powers(exponent: f64, m: usize) -> Vec<f64> {
-    let divisors = least_divisors(m);
-    let mut powers = vec![0.0; m];
-    for n in 1..m {
-        let divisor = divisors[n] as usize;
-        powers[n] = if n == 1 {
-            1.0
-        } else if divisor == n {
-            libm::pow(n as f64, exponent)
-        } else {
-            powers[divisor] * powers[n / divisor]
-        };
-    }
-    powers
-}
-
-/// `(2k+1)^exponent` for k = 0 … m−1, as [`whole_powers`].
-#[allow(clippy::cast_precision_loss)]
-fn odd_powers(exponent: f64, m: usize) -> Vec<f64> {
-    let divisors = least_divisors(2 * m);
-    let mut powers = vec![1.0; m];
-    for k in 1..m {
-        let n = 2 * k + 1;
-        let divisor = divisors[n] as usize;
-        powers[k] =
-            if divisor == n { libm::pow(n as f64, exponent) } else { powers[divisor / 2] * powers[n / divisor / 2] };
-    }
-    powers
-}
-
-/// A table that only ever grows: one for all threads, and one of a thread's own for when that is not to be had.
-struct Table<T: 'static> {
-    shared: &'static Shared<Values<T>>,
-    own: &'static LocalKey<RefCell<Values<T>>>,
-    make: fn(usize) -> Vec<T>,
-}
-
-type Values<T> = Option<Arc<Vec<T>>>;
-
-impl<T> Table<T> {
-    /// At least m values.
-    fn of(&self, m: usize) -> Arc<Vec<T>> {
-        let enough = |values: &Values<T>| values.as_ref().filter(|values| values.len() >= m).map(Arc::clone);
-        let own = || self.own.with_borrow(enough);
-        if let Some(values) = own().or_else(|| self.shared.with(|values| enough(values)).flatten()) {
-            return values;
-        }
-        let made = Arc::new((self.make)(m.next_power_of_two()));
-        // What is replaced is given back, so that its memory is not freed behind the lock.
-        let kept = self.shared.with(|values| {
-            let longer = values.as_ref().is_none_or(|values| values.len() < made.len());
-            longer.then(|| values.replace(Arc::clone(&made)))
-        });
-        if kept.is_none() {
-            self.own.set(Some(Arc::clone(&made)));
-        }
-        made
-    }
-}
-
-/// Least prime divisor of each n < m (at least).
-#[allow(clippy::cast_possible_truncation)]
-fn least_divisors(m: usize) -> Arc<Vec<u32>> {
-    static SHARED: Shared<Values<u32>> = Shared::new(None);
-    thread_local!(static OWN: RefCell<Values<u32>> = const { RefCell::new(None) });
-    let make = |len| {
-        let mut divisors: Vec<u32> = (0..len as u32).collect();
-        let mut prime = 2;
-        while prime * prime < len {
-            if divisors[prime] as usize == prime {
-                for multiple in (prime * prime..len).step_by(prime) {
-                    if divisors[multiple] as usize == multiple {
-                        divisors[multiple] = prime as u32;
-                    }
-                }
-            }
-            prime += 1;
-        }
-        divisors
-    };
-    Table { shared: &SHARED, own: &OWN, make }.of(m)
-}
-
-/// ln n for n < m (at least); 0 at n = 0, which nobody reads. Longer than m: zip it with what is m long.
-#[allow(clippy::cast_precision_loss)]
-fn whole_logarithms(m: usize) -> Arc<Vec<f64>> {
-    static SHARED: Shared<Values<f64>> = Shared::new(None);
-    thread_local!(static OWN: RefCell<Values<f64>> = const { RefCell::new(None) });
-    let make = |len| (0..len).map(|n: usize| libm::log(n.max(1) as f64)).collect();
-    Table { shared: &SHARED, own: &OWN, make }.of(m)
 }
 
 /// ψ(x) for x > 0, NaN elsewhere: recurrence up to x ≥ 10, then the asymptotic series (DLMF 5.11.2).
@@ -343,32 +254,162 @@ pub fn power_means(exponent: f64, m: usize, step: f64) -> Vec<f64> {
         let scale = libm::pow(step, exponent);
         return first.iter().zip(&next).map(|(a, b)| scale * (a + 0.5 * (order + 1.0) * b)).collect();
     }
-    let a = exponent + 1.0;
-    let scale = libm::pow(step, exponent);
-    let near = (1..=m.min(if m < SIEVED { m } else { HEAD })).map(|k| {
-        let k = k as f64;
-        // k^a − (k−1)^a without the cancellation.
-        scale / a * if k == 1.0 { 1.0 } else { -libm::pow(k, a) * libm::expm1(a * libm::log1p(-1.0 / k)) }
-    });
-    let mut means: Vec<f64> = near.collect();
-    if means.len() < m {
-        // About the middle of a pulse, at d/2 for an odd d, it is (d/2)^e·Σ C(a, 2j+1)/a·d^−2j.
-        let mut sums = [0.0; terms_at(0)];
-        let mut c = 1.0;
-        for (j, sum) in sums.iter_mut().enumerate() {
-            *sum = c;
-            let next = (2 * j + 1) as f64;
-            c *= (a - next) * (a - next - 1.0) / ((next + 1.0) * (next + 2.0));
-        }
-        let half = scale * libm::exp2(-exponent);
+    let means = PowerMeans::new(exponent, step);
+    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.near(k as f64)).collect();
+    if out.len() < m {
         let odd = odd_powers(exponent, m);
-        means.extend(odd.iter().enumerate().skip(HEAD).map(|(k, &power)| {
-            let d = (2 * k + 1) as f64;
-            let shrink = 1.0 / (d * d);
-            half * power * sums[..terms_at(2 * k)].iter().rev().fold(0.0, |sum, &c| sum * shrink + c)
-        }));
+        out.extend(odd.iter().enumerate().skip(FEW).map(|(k, &power)| means.far(k, power)));
     }
-    means
+    out
+}
+
+/// Derivative of [`power_means`] with respect to an exponent above −1.
+///
+/// ```
+/// // Means of t^0 stay 1 whatever the pulse; of t^e they grow with e as ln t does: ∫ ln t over [0, 1] is −1.
+/// let slope = ftlm::kernels::power_means_slope(0.0, 1, 1.0);
+/// assert!((slope[0] + 1.0).abs() < 1e-15);
+/// ```
+#[must_use]
+#[allow(clippy::cast_precision_loss)]
+pub fn power_means_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+    let means = PowerMeans::new(exponent, step);
+    let mut out: Vec<f64> = (1..=near_pulses(m)).map(|k| means.near_slope(k as f64)).collect();
+    if out.len() < m {
+        let (odd, logarithms) = (odd_powers(exponent, m), whole_logarithms(2 * m));
+        let far = odd.iter().enumerate().skip(FEW);
+        out.extend(far.map(|(k, &power)| means.far_slope(k, power, logarithms[2 * k + 1])));
+    }
+    out
+}
+
+/// Pulses whose means come from powers of their ends in a long record, and terms about the middle of those before the
+/// [`HEAD`] after them: 33^−16 is below the rounding error.
+const FEW: usize = 16;
+const MIDDLE: usize = 8;
+
+/// Pulses whose means come from powers of their ends; those of all others from that of their middle.
+fn near_pulses(m: usize) -> usize {
+    m.min(if m < SIEVED { m } else { FEW })
+}
+
+/// Means of t^e over pulses of length h, one by one.
+struct PowerMeans {
+    /// e + 1.
+    a: f64,
+    scale: f64,
+    half: f64,
+    ln_step: f64,
+    /// C(a, 2j+1)/a and their derivatives.
+    sums: [f64; MIDDLE],
+    slopes: [f64; MIDDLE],
+}
+
+impl PowerMeans {
+    #[allow(clippy::cast_precision_loss)]
+    fn new(exponent: f64, step: f64) -> Self {
+        let (a, scale) = (exponent + 1.0, libm::pow(step, exponent));
+        let (mut sums, mut slopes) = ([0.0; MIDDLE], [0.0; MIDDLE]);
+        let (mut c, mut dc) = (1.0, 0.0);
+        for (j, (sum, slope)) in sums.iter_mut().zip(&mut slopes).enumerate() {
+            (*sum, *slope) = (c, dc);
+            let next = (2 * j + 1) as f64;
+            let (factor, divisor) = ((a - next) * (a - next - 1.0), (next + 1.0) * (next + 2.0));
+            dc = (dc * factor + c * (2.0 * (a - next) - 1.0)) / divisor;
+            c *= factor / divisor;
+        }
+        Self { a, scale, half: scale * libm::exp2(-exponent), ln_step: libm::log(step), sums, slopes }
+    }
+
+    /// Mean over pulse k: k^a − (k−1)^a without the cancellation.
+    fn near(&self, k: f64) -> f64 {
+        let a = self.a;
+        self.scale / a * if k == 1.0 { 1.0 } else { -libm::pow(k, a) * libm::expm1(a * libm::log1p(-1.0 / k)) }
+    }
+
+    /// Its derivative.
+    fn near_slope(&self, k: f64) -> f64 {
+        let a = self.a;
+        let turned = |k: f64| if k > 1.0 { libm::pow(k, a) * libm::log(k) } else { 0.0 };
+        self.near(k) * (self.ln_step - 1.0 / a) + self.scale / a * (turned(k) - turned(k - 1.0))
+    }
+
+    /// Σ over the terms that count at the middle of pulse k + 1, at d/2 for d = 2k + 1.
+    #[allow(clippy::cast_precision_loss)]
+    fn sum(sums: &[f64; MIDDLE], k: usize) -> f64 {
+        let d = (2 * k + 1) as f64;
+        let shrink = 1.0 / (d * d);
+        let terms = if k < HEAD { MIDDLE } else { terms_at(2 * k) };
+        sums[..terms].iter().rev().fold(0.0, |sum, &c| sum * shrink + c)
+    }
+
+    /// Mean over pulse k + 1 from d^e: about the middle it is (d/2)^e·Σ C(a, 2j+1)/a·d^−2j.
+    fn far(&self, k: usize, power: f64) -> f64 {
+        self.half * power * Self::sum(&self.sums, k)
+    }
+
+    /// Its derivative.
+    fn far_slope(&self, k: usize, power: f64, logarithm: f64) -> f64 {
+        let turned = self.ln_step - std::f64::consts::LN_2 + logarithm;
+        self.half * power * (Self::sum(&self.sums, k) * turned + Self::sum(&self.slopes, k))
+    }
+}
+
+/// Pulses that drive as t^e does, from their means: of −1 < e < 0 the first two carry what else moves a smooth answer by the
+/// power e + 2 of the step, the others' moments about their middles (corrected as in doi:10.1137/0517050, by one step).
+///
+/// Σ_j ∫_j (t − t_j) t^e dt over all pulses is h^{e+2} ζ(−1−e)/(1+e): so much of the first pulse belongs to the second.
+#[must_use]
+pub fn power_pulses(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+    let mut pulses = power_means(exponent, m, step);
+    if is_singular(exponent) {
+        shift(&mut pulses, moment(exponent) * libm::pow(step, exponent));
+    }
+    pulses
+}
+
+/// Derivative of [`power_pulses`] with respect to an exponent above −1.
+#[must_use]
+pub fn power_pulses_slope(exponent: f64, m: usize, step: f64) -> Vec<f64> {
+    let mut slopes = power_means_slope(exponent, m, step);
+    if is_singular(exponent) {
+        let h = 1e-4_f64.min(0.5 * (exponent + 1.0));
+        let turned = (moment(exponent + h) - moment(exponent - h)) / (2.0 * h);
+        shift(&mut slopes, (turned + moment(exponent) * libm::log(step)) * libm::pow(step, exponent));
+    }
+    slopes
+}
+
+/// Whether a power of t is infinite where it begins, and no impulse.
+fn is_singular(exponent: f64) -> bool {
+    exponent > -1.0 && exponent < 0.0
+}
+
+/// Takes this from the first pulse and gives it to the second.
+fn shift(pulses: &mut [f64], value: f64) {
+    if let [first, second, ..] = pulses {
+        *first -= value;
+        *second += value;
+    }
+}
+
+/// First moments of t^e about the middles of pulses of length 1, all together: ζ(−1−e)/(1+e), −1 < e < 0.
+fn moment(exponent: f64) -> f64 {
+    // Euler and Maclaurin from ten on.
+    const FROM: f64 = 10.0;
+    const BERNOULLI: [f64; 4] = [1.0 / 12.0, -1.0 / 720.0, 1.0 / 30240.0, -1.0 / 1_209_600.0];
+    let a = exponent + 1.0;
+    let first: f64 = (1..10).map(|n| libm::pow(f64::from(n), a)).sum();
+    let power = libm::pow(FROM, a);
+    let mut zeta = first - power * FROM / (a + 1.0) + 0.5 * power;
+    // s (s+1) (s+2) … N^{−s−2j+1} for s = −a.
+    let mut term = -a * power / FROM;
+    for (j, b) in (1..).zip(BERNOULLI) {
+        zeta += b * term;
+        let next = f64::from(2 * j - 1) - a;
+        term *= next * (next + 1.0) / (FROM * FROM);
+    }
+    zeta / a
 }
 
 /// Refuses an order outside [0, [`MAX_ORDER`]].
@@ -385,26 +426,5 @@ pub fn check_order(name: &str, order: f64) -> Result<()> {
             range: format!("[0, {MAX_ORDER}]"),
             remedy: "split a higher order into a whole and a fractional part".into(),
         })
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_lock_that_is_never_given_back_stops_no_table() {
-        static SHARED: Shared<Values<usize>> = Shared::new(None);
-        thread_local!(static OWN: RefCell<Values<usize>> = const { RefCell::new(None) });
-        let table = Table { shared: &SHARED, own: &OWN, make: |len| (0..len).collect() };
-        let (first, second) = SHARED.held(|| (table.of(5), table.of(8)));
-        assert_eq!(*first, [0, 1, 2, 3, 4, 5, 6, 7]);
-        assert!(Arc::ptr_eq(&first, &second), "made once");
-        let longer = table.of(9);
-        assert_eq!(longer.len(), 16);
-        // Another thread takes what is shared, and a shorter one made meanwhile replaces nothing.
-        std::thread::scope(|scope| {
-            scope.spawn(|| assert!(Arc::ptr_eq(&table.of(16), &longer)));
-        });
     }
 }

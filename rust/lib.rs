@@ -62,6 +62,8 @@ mod abreast;
 pub mod dense;
 pub mod fft;
 pub mod lanes;
+mod orthogonal;
+mod powers;
 mod shared;
 
 mod driven;

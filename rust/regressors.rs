@@ -6,7 +6,7 @@ use crate::abreast;
 use crate::equation::{grains, tidy};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::excess::kernel;
-use crate::kernels::power_means;
+use crate::kernels::{power_means, power_pulses};
 use crate::series::{self, Buffers, Kernel};
 
 /// Largest bank that is made for itself, and what a search takes in all where no other limit is given, in bytes.
@@ -173,7 +173,18 @@ impl Record {
     /// ```
     #[must_use]
     pub fn initial_term(&self, exponent: f64) -> Vec<f64> {
-        let powers = power_means(exponent, self.m(), self.step);
+        self.behind_filter(power_means(exponent, self.m(), self.step))
+    }
+
+    /// The same to drive a free run ([`power_pulses`]): where a filter makes something smooth of it.
+    pub(crate) fn driving_term(&self, exponent: f64) -> Vec<f64> {
+        match &self.filter {
+            None => self.initial_term(exponent),
+            Some(_) => self.behind_filter(power_pulses(exponent, self.m(), self.step)),
+        }
+    }
+
+    fn behind_filter(&self, powers: Vec<f64>) -> Vec<f64> {
         match &self.filter {
             None => powers,
             Some(filter) => series::multiply(filter, &powers, self.m()),

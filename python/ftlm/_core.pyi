@@ -48,6 +48,7 @@ __all__ = [
     "panic_on_purpose",
     "point_samples",
     "portable",
+    "projected_errors",
     "pulse_means",
     "read_at",
     "respond",
@@ -191,6 +192,15 @@ def least_squares(
     fixed: Sequence[float | None],
     terms: _Initial,
 ) -> _Estimate: ...
+def projected_errors(
+    runs: Sequence[_Record],
+    equation: _Structure,
+    inputs: Sequence[bool],
+    fixed: Sequence[float | None],
+    terms: _Initial,
+    own: Sequence[float],
+    points: Sequence[Sequence[float]],
+) -> list[tuple[float, list[float]] | None]: ...
 def multi_innovation(
     runs: Sequence[_Record],
     equation: _Structure,

@@ -4,4 +4,5 @@ pub mod iv;
 pub mod least_squares;
 pub mod multi_innovation;
 pub mod output_error;
+pub mod resonances;
 pub mod streaming;

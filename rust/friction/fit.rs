@@ -1,10 +1,10 @@
 //! Output error of bodies with friction, by Levenberg–Marquardt: orders, coefficients, and the states of every run.
 
 use super::model::{Evaluation, FrictionModel, Point};
-use crate::dense;
 use crate::error::{check_finite, check_length, Result};
 use crate::estimate::output_error::levenberg_marquardt::{minimise, Problem, Settings, Status};
 use crate::estimate::output_error::Experiment;
+use crate::orthogonal::extend_orthonormal;
 use crate::stop::Stop;
 
 /// Where a fit starts.
@@ -280,7 +280,7 @@ pub fn fit_until(
     let numbers = found.point.orders.len() + found.point.coefficients.len() + found.point.inputs.len();
     let mut basis = Vec::new();
     for column in found.jacobian.iter().skip(numbers) {
-        dense::extend_orthonormal(&mut basis, column.clone(), SPANNED);
+        extend_orthonormal(&mut basis, column.clone(), SPANNED);
     }
     let mut jacobian = found.jacobian;
     jacobian.truncate(numbers);

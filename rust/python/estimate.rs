@@ -13,7 +13,9 @@ use crate::error::{check_finite, check_length, Error};
 use crate::estimate::least_squares::Estimate;
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::estimate::streaming::Streaming as StreamingFit;
-use crate::estimate::{iv as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint};
+use crate::estimate::{
+    iv as instruments, least_squares as batch, multi_innovation as stepwise, output_error as joint, resonances,
+};
 use crate::readings::{Jumps, Readings};
 use crate::regressors::Record;
 
@@ -49,6 +51,32 @@ pub fn least_squares(
     let initial = initial(terms)?;
     let points = pulses(&records);
     Ok(tuple(leavable(py, points, None, move |_| batch::fit(&records, &structure, &fixed, &initial))?))
+}
+
+/// Output error and coefficients of each point; none where it is no number.
+type PointTuple = Option<(f64, Vec<f64>)>;
+
+#[pyfunction]
+#[allow(clippy::too_many_arguments, clippy::needless_pass_by_value)]
+pub fn projected_errors(
+    py: Python<'_>,
+    runs: List<RecordArg<'_>>,
+    equation: StructureArg,
+    inputs: List<bool>,
+    fixed: List<Option<f64>>,
+    terms: InitialArg,
+    own: List<f64>,
+    points: List<List<f64>>,
+) -> PyResult<Vec<PointTuple>> {
+    let records = records(&runs)?;
+    let structure = structure(equation, inputs.len(), &inputs)?;
+    let initial = initial(terms)?;
+    let points: Vec<Vec<f64>> = points.iter().map(|point| point.to_vec()).collect();
+    let work = pulses(&records).saturating_mul(points.len());
+    let found = leavable(py, work, None, move |_| {
+        resonances::projected(&records, &structure, &fixed, &initial, &own, &points)
+    })?;
+    Ok(found.into_iter().map(|at| at.map(|p| (p.error, p.coefficients))).collect())
 }
 
 #[pyfunction]

@@ -26,7 +26,9 @@ mod _core {
     };
 
     #[pymodule_export]
-    use super::estimate::{grows, instrumental_variables, least_squares, multi_innovation, output_error, Streaming};
+    use super::estimate::{
+        grows, instrumental_variables, least_squares, multi_innovation, output_error, projected_errors, Streaming,
+    };
 
     #[pymodule_export]
     use super::friction::{friction_error, friction_respond};

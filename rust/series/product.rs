@@ -80,6 +80,11 @@ impl Kernel {
         out[..read].copy_from_slice(&buffers.time[..read]);
     }
 
+    /// Multiplies with another series that is cached for the same number of terms, in all factors together.
+    pub fn multiply(&mut self, other: &Self) {
+        self.spectrum.iter_mut().zip(&other.spectrum).for_each(|(x, y)| *x *= y);
+    }
+
     /// The first `out.len()` terms of the product with another cached series of the same length: one transform.
     pub fn times(&self, other: &Self, out: &mut [f64], buffers: &mut Buffers) {
         buffers.spectrum.clear();

@@ -2,7 +2,7 @@
 
 use ftlm::kernels::{
     block_pulse_kernel, block_pulse_kernel_derivative, digamma, grunwald_letnikov_weights, power_means,
-    second_difference,
+    power_means_slope, second_difference,
 };
 use ftlm::series;
 use proptest::prelude::*;
@@ -93,6 +93,28 @@ fn power_means_of_many_pulses_are_those_of_few() {
         }
     }
     check("means of powers", worst, 2e-14);
+}
+
+#[test]
+fn power_means_turn_with_their_exponent_as_differences_say() {
+    let mut worst = 0.0_f64;
+    for (m, step) in [(200, 0.3), (6000, 0.01)] {
+        for exponent in [-0.95, -0.5, 0.0, 0.4, 1.0, 2.3, 6.5] {
+            let found = power_means_slope(exponent, m, step);
+            assert_eq!(found.len(), m);
+            // Five points of a smooth function: what they leave out is of the fourth order.
+            let at = |shift: f64| power_means(exponent + shift, m, step);
+            let (h, middle) = (1e-3, at(0.0));
+            let sides = [at(-2.0 * h), at(-h), at(h), at(2.0 * h)];
+            for (k, v) in found.iter().enumerate() {
+                let [a, b, c, d] = [sides[0][k], sides[1][k], sides[2][k], sides[3][k]];
+                let truth = (a - 8.0 * b + 8.0 * c - d) / (12.0 * h);
+                // Where t is about 1 the slope passes through 0.
+                worst = worst.max((v - truth).abs() / (truth.abs() + middle[k]));
+            }
+        }
+    }
+    check("slopes of means of powers", worst, 1e-6);
 }
 
 #[test]

@@ -8,15 +8,14 @@ terms, follow by linear least squares on the output error itself.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from ftlm import _core
-from ftlm.base.errors import FtlmError
 from ftlm.data.equations import Equation
-from ftlm.solve.records import Record, equation_tuple, named_coefficients, structure_tuple
+from ftlm.solve.records import Record, named_coefficients, structure_tuple
 
 #: Frequencies of the scan in units of the frequency below which 90 % of the output's power lies.
 FREQUENCIES = tuple(np.geomspace(0.15, 8.0, 14).tolist())
@@ -46,60 +45,31 @@ def scan_equation(
     output's size, and the coefficients by name.
     """
     others = tuple(t for t in item.terms if t.signal != item.output)
-    if not others or len(others) == len(item.terms):
+    own = [t for t in item.terms if t.signal == item.output]
+    if not others or not own:
         return []
-    rest = replace(item, terms=others)
-    points = []
-    for share in FREQUENCIES:
-        best: tuple[float, dict[str, float]] | None = None
-        for damping in DAMPINGS:
-            own = own_coefficients(item, share * frequency, damping)
-            if own is None:
-                return []
-            try:
-                point = _projected(records, item, rest, own)
-            except FtlmError:
-                # Too fast for the step, or regressors that this filter makes alike.
-                continue
-            if math.isfinite(point[0]) and (best is None or point[0] < best[0]):
-                best = point
-        if best is not None:
-            points.append(best)
-    return sorted(points, key=lambda p: p[0])[:keep]
-
-
-def _projected(
-    records: Sequence[Record], item: Equation, rest: Equation, own: Mapping[str, float]
-) -> tuple[float, dict[str, float]]:
-    """Least squares on the output error over all coefficients but the own ones."""
-    filtered, inputs = [], list(records[0].inputs)
-    for rec in records:
-        divisor = np.zeros(rec.m)
-        divisor[0] = 1.0
-        for term in item.terms:
-            if term.signal == item.output:
-                eta = item.order.constant - term.order.constant
-                value = own[str(term.coefficient)] * term.factor
-                divisor -= value * _core.block_pulse_kernel(eta, rec.m, rec.step)
-        unit = np.zeros(rec.m)
-        unit[0] = 1.0
-        response = _core.series_divide(unit, divisor)
-        means = rec.means.copy()
-        for row, signal in enumerate(rec.signals):
-            if signal != item.output:
-                means[row] = _core.series_multiply(response, np.ascontiguousarray(means[row]), rec.m)
-        sensor = response if rec.sensor is None else _core.series_multiply(response, rec.sensor, rec.m)
-        filtered.append(replace(rec, means=means, sensor=sensor))
+    grid = [(share * frequency, damping) for share in FREQUENCIES for damping in DAMPINGS]
+    tried: list[dict[str, float]] = []
+    for omega, damping in grid:
+        values = own_coefficients(item, omega, damping)
+        if values is None:
+            return []
+        tried.append(values)
     # Caputo's powers of the whole equation: the rest alone would not know those of the own terms.
-    initial = records[0].start
-    signals = records[0].signals
-    cores = [r.core() for r in filtered]
-    raw = _core.least_squares(cores, structure_tuple(rest, signals), inputs, [t.fixed for t in rest.terms], initial)[0]
-    values = {**own, **named_coefficients(rest, raw)}
-    solved = equation_tuple(rest.with_coefficients(values), signals)
-    missed = [_core.equation_error(core, solved, inputs, initial) for core in cores]
-    size = math.sqrt(sum(float(np.sum(np.square(r.of(item.output)))) for r in records))
-    # A point that the step does not carry grows beyond the numbers; the caller leaves out what is not finite.
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = math.sqrt(sum(float(e @ e) for e in missed)) / max(size, 1e-300)
-    return error, values
+    rest, initial, signals = replace(item, terms=others), records[0].start, records[0].signals
+    found = _core.projected_errors(
+        [r.core() for r in records], structure_tuple(rest, signals), list(records[0].inputs),
+        [t.fixed for t in others], initial, [item.order.constant - t.order.constant for t in own],
+        [[values[str(t.coefficient)] * t.factor for t in own] for values in tried],
+    )  # fmt: skip
+    points = []
+    for first in range(0, len(grid), len(DAMPINGS)):
+        # What is not there is too fast for the step, or has regressors that this filter makes alike.
+        there = [
+            (at[0], {**values, **named_coefficients(rest, at[1])})
+            for at, values in zip(found[first : first + len(DAMPINGS)], tried[first:], strict=False)
+            if at is not None and math.isfinite(at[0])
+        ]
+        if there:
+            points.append(min(there, key=lambda point: point[0]))
+    return sorted(points, key=lambda p: p[0])[:keep]

@@ -1,10 +1,10 @@
 //! Clean substitutes for measured outputs: their projections on what the inputs excite.
 
 use super::common::dot;
-use crate::dense;
 use crate::equation::Filter;
 use crate::error::{Error, Result};
 use crate::kernels::block_pulse_kernel;
+use crate::orthogonal::extend_orthonormal;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 
@@ -75,7 +75,7 @@ pub fn project(record: &Record, signal: usize, inputs: &[usize], at_rest: bool) 
     let target = record.signal(signal);
     let mut basis = Vec::with_capacity(columns.len());
     for column in columns {
-        dense::extend_orthonormal(&mut basis, column, SPANNED);
+        extend_orthonormal(&mut basis, column, SPANNED);
     }
     let mut out = vec![0.0; m];
     for direction in &basis {

@@ -9,11 +9,11 @@ use super::model::{FreeModel, Point};
 use super::operator::Operator;
 use super::part::Part;
 use super::shelf::Shelf;
-use crate::dense;
 use crate::equation::Structure;
 use crate::error::{Error, Result};
 use crate::estimate::least_squares;
 use crate::excess::MAX_EXCESS;
+use crate::orthogonal::extend_orthonormal;
 use crate::regressors::Record;
 use crate::series::{Buffers, Recursion, SumOfProducts};
 use std::borrow::Cow;
@@ -151,7 +151,7 @@ impl FreeModel {
                         (samples, means)
                     }
                 };
-                dense::extend_orthonormal(&mut basis, samples.clone(), SPANNED);
+                extend_orthonormal(&mut basis, samples.clone(), SPANNED);
                 free.push(Free { equation: i, samples, means });
             }
         }

@@ -102,20 +102,20 @@ impl<'a> Rights<'a> {
         }
     }
 
-    /// Adds a series as it is.
+    /// Adds a series as it is; of it and its spectrum that is asked for which is needed.
     pub(super) fn add_series(
         &mut self,
         equation: usize,
-        series: Cow<'a, [f64]>,
-        spectrum: impl FnOnce(&[f64]) -> Rc<Kernel>,
+        series: impl FnOnce() -> Cow<'a, [f64]>,
+        spectrum: impl FnOnce() -> Rc<Kernel>,
     ) {
         match self {
             Self::Spectra(rights) => {
                 let (used, right) = &mut rights[equation];
                 *used = true;
-                right.add_series(&spectrum(&series));
+                right.add_series(&spectrum());
             }
-            Self::Sums(sources) => sources.push((equation, 0, 1.0, series)),
+            Self::Sums(sources) => sources.push((equation, 0, 1.0, series())),
         }
     }
 }
@@ -190,7 +190,7 @@ impl Solved {
             open.len(),
             |place, rights| {
                 let power = &powers[place];
-                rights.add_series(open[place].0, Cow::Borrowed(&power.series), |_| power.spectrum());
+                rights.add_series(open[place].0, || Cow::Borrowed(power.series()), || power.spectrum());
                 Ok(())
             },
             |place, means| {

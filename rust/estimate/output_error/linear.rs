@@ -9,6 +9,7 @@ use super::part::{Driven, Part};
 use super::shelf::Shelf;
 use crate::dense;
 use crate::error::{Error, Result};
+use crate::orthogonal::{norm, project_out};
 use crate::small::back_substitute;
 use std::borrow::Cow;
 
@@ -96,9 +97,9 @@ pub(super) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
     }
     let mut scales = Vec::with_capacity(count);
     for (place, column) in columns.iter_mut().enumerate() {
-        let norm = column.iter().map(|v| v * v).sum::<f64>().sqrt();
+        let size = norm(column);
         if place < count {
-            let scale = if norm > 0.0 && norm.is_finite() { 1.0 / norm } else { 0.0 };
+            let scale = if size > 0.0 && size.is_finite() { 1.0 / size } else { 0.0 };
             column.iter_mut().for_each(|v| *v *= scale);
             scales.push(scale);
         }
@@ -115,13 +116,5 @@ pub(super) fn best_moves(sides: &[(&[f64], &Part)]) -> Result<Vec<f64>> {
     match moves.iter().position(|v| !v.is_finite()) {
         Some(index) => Err(Error::Diverged { what: "linear coefficient".into(), index }),
         None => Ok(moves),
-    }
-}
-
-/// Takes what lies along an orthonormal basis out of a column.
-pub(super) fn project_out(basis: &[Vec<f64>], column: &mut [f64]) {
-    for direction in basis {
-        let along: f64 = direction.iter().zip(column.iter()).map(|(q, v)| q * v).sum();
-        column.iter_mut().zip(direction).for_each(|(v, q)| *v -= along * q);
     }
 }

@@ -1,7 +1,8 @@
 //! The integral of a term and the power of t of an initial term, with spectra that are made when they are asked for.
 
 use crate::excess::{kernel, kernel_and_slope};
-use crate::series::{Kernel, MAX_SUMS};
+use crate::kernels::{power_means, power_means_slope, power_pulses, power_pulses_slope};
+use crate::series::{multiply, Kernel, MAX_SUMS};
 use std::cell::OnceCell;
 use std::rc::Rc;
 
@@ -74,24 +75,72 @@ impl Operator {
     }
 }
 
-/// What an initial term t^e adds, and its spectrum for products of [`FACTORS`] series.
+/// What an initial term t^e adds, behind the filter that all signals pass, and how that turns with its exponent.
 pub(super) struct Power {
-    pub(super) series: Vec<f64>,
+    exponent: f64,
+    step: f64,
+    filter: Option<Rc<Filter>>,
+    raw: Vec<f64>,
+    series: OnceCell<Vec<f64>>,
     spectrum: OnceCell<Rc<Kernel>>,
+    slope: OnceCell<Vec<f64>>,
+}
+
+/// A filter with its spectrum for products of [`FACTORS`] series.
+pub(super) struct Filter {
+    series: Vec<f64>,
+    spectrum: Kernel,
+}
+
+impl Filter {
+    /// Of its series.
+    pub(super) fn new(series: &[f64]) -> Self {
+        Self { series: series.to_vec(), spectrum: Kernel::with_length(series, FACTORS * series.len()) }
+    }
+
+    /// What it makes of a series.
+    pub(super) fn of(&self, series: &[f64]) -> Vec<f64> {
+        multiply(&self.series, series, series.len())
+    }
 }
 
 impl Power {
-    /// Of its series.
-    pub(super) fn new(series: Vec<f64>) -> Self {
-        Self { series, spectrum: OnceCell::new() }
+    /// On a grid of m pulses.
+    pub(super) fn new(exponent: f64, m: usize, step: f64, filter: Option<Rc<Filter>>) -> Self {
+        let raw = if filter.is_some() { power_pulses(exponent, m, step) } else { power_means(exponent, m, step) };
+        let (series, spectrum, slope) = Default::default();
+        Self { exponent, step, filter, raw, series, spectrum, slope }
     }
 
-    /// Its spectrum.
+    /// Pulse means.
+    pub(super) fn series(&self) -> &[f64] {
+        match &self.filter {
+            None => &self.raw,
+            Some(filter) => self.series.get_or_init(|| filter.of(&self.raw)),
+        }
+    }
+
+    /// The derivative of t^e with respect to e, before the filter.
+    pub(super) fn slope(&self) -> &[f64] {
+        let of = if self.filter.is_some() { power_pulses_slope } else { power_means_slope };
+        self.slope.get_or_init(|| of(self.exponent, self.raw.len(), self.step))
+    }
+
+    /// Their spectrum, for a product with one more series.
     pub(super) fn spectrum(&self) -> Rc<Kernel> {
-        let made = || Rc::new(Kernel::with_length(&self.series, FACTORS * self.series.len()));
-        if self.series.len() > KEPT_PULSES {
+        let made = || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref()));
+        if self.raw.len() > KEPT_PULSES {
             return made();
         }
         self.spectrum.get_or_init(made).clone()
     }
+}
+
+/// The spectrum of a series that passes a filter, for a product with one more series.
+pub(super) fn filtered_spectrum(series: &[f64], filter: Option<&Filter>) -> Kernel {
+    let mut spectrum = Kernel::with_length(series, FACTORS * series.len());
+    if let Some(filter) = filter {
+        spectrum.multiply(&filter.spectrum);
+    }
+    spectrum
 }

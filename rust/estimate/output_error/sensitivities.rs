@@ -2,12 +2,12 @@
 
 use super::experiment::Experiment;
 use super::free_run::Evaluation;
-use super::linear::project_out;
 use super::model::{FreeModel, Point};
 use super::part::Part;
 use super::shelf::Shelf;
 use crate::equation::AffineOrder;
 use crate::error::{Error, Result};
+use crate::orthogonal::project_out;
 use crate::series::Kernel;
 use std::borrow::Cow;
 use std::rc::Rc;
@@ -85,7 +85,8 @@ impl FreeModel {
                         if let Some(moved) =
                             initial_slope(self, (i, parameter), orders, &initial[i], (experiment, shelf))?
                         {
-                            rights.add_series(i, Cow::Owned(moved), |series| shelf.spectrum(series));
+                            let series = || Cow::Owned(shelf.filtered(&moved));
+                            rights.add_series(i, series, || shelf.filtered_spectrum(&moved));
                         }
                     }
                 }
@@ -130,7 +131,8 @@ impl FreeModel {
     }
 }
 
-/// How the initial terms of equation i move with a free order, weighted by their coefficients; none if they do not.
+/// How the initial terms of equation i move with a free order, weighted by their coefficients, before the filter; none if
+/// they do not.
 fn initial_slope(
     model: &FreeModel,
     (i, parameter): (usize, usize),
@@ -138,34 +140,30 @@ fn initial_slope(
     values: &[f64],
     (experiment, shelf): (&Experiment, &Shelf),
 ) -> Result<Option<Vec<f64>>> {
-    // Exponents move linearly with orders, and powers of t smoothly with exponents: a central difference of the
-    // powers has an error of 1e−10, far below what a Jacobian needs.
-    const SHIFT: f64 = 1e-5;
+    // Exponents are sums of orders: any shift tells how they follow them.
+    const SHIFT: f64 = 1e-4;
     if values.is_empty() || !model.initial.follows_orders() {
         return Ok(None);
     }
-    let mut lists = Vec::with_capacity(2);
-    for sign in [1.0, -1.0] {
+    let exponents = |shift: f64| {
         let mut moved = orders.to_vec();
-        moved[parameter] += sign * SHIFT;
-        lists.push(model.exponents(experiment, i, &model.structures(&moved)[i]));
-    }
-    if lists.iter().any(|l| l.len() != values.len()) {
+        moved[parameter] += shift;
+        model.exponents(experiment, i, &model.structures(&moved)[i])
+    };
+    let (below, here, above) = (exponents(-SHIFT), exponents(0.0), exponents(SHIFT));
+    if [&below, &here, &above].iter().any(|list| list.len() != values.len()) {
         // An exponent appears or merges here: the projection follows it in the next evaluation.
         return Ok(None);
     }
-    let record = &experiment.record;
-    let mut out = vec![0.0; record.m()];
-    let mut moved = false;
-    for ((&up, &down), &x) in lists[0].iter().zip(&lists[1]).zip(values) {
-        if (up - down).abs() < 1e-9 || x == 0.0 {
+    let mut out = Vec::new();
+    for (k, (&exponent, &x)) in here.iter().zip(values).enumerate() {
+        let follows = (above[k] - below[k]) / (2.0 * SHIFT);
+        if follows.abs() < 1e-4 || x == 0.0 {
             continue;
         }
-        moved = true;
-        let (above, below) = (shelf.power(up), shelf.power(down));
-        out.iter_mut()
-            .zip(above.series.iter().zip(&below.series))
-            .for_each(|(v, (a, b))| *v += x * (a - b) / (2.0 * SHIFT));
+        out.resize(experiment.record.m(), 0.0);
+        let power = shelf.power(exponent);
+        out.iter_mut().zip(power.slope()).for_each(|(v, slope)| *v += x * follows * slope);
     }
-    Ok(moved.then_some(out))
+    Ok(Some(out).filter(|out| !out.is_empty()))
 }

@@ -4,7 +4,7 @@
 use super::experiment::Experiment;
 use super::inverse::{Means, Solved};
 use super::model::FreeModel;
-use super::operator::{Operator, Power, FACTORS, KEPT_PULSES};
+use super::operator::{filtered_spectrum, Filter, Operator, Power, FACTORS, KEPT_PULSES};
 use crate::error::Result;
 use crate::regressors::Record;
 use crate::series::Kernel;
@@ -23,6 +23,8 @@ const AS_LONG: f64 = 0.7;
 struct Grid {
     /// A record of nothing, as long as the longest.
     bare: Record,
+    /// The filter that all its signals pass.
+    filter: Option<Rc<Filter>>,
     runs: usize,
     /// The last operator of each term of each equation.
     operators: HashMap<(usize, usize), Rc<Operator>>,
@@ -77,8 +79,9 @@ impl Shelf {
                     let record = &experiments[k].record;
                     let bare =
                         Record::new(record.step(), vec![vec![0.0; record.m()]], record.filter().map(<[f64]>::to_vec))?;
+                    let filter = record.filter().map(|series| Rc::new(Filter::new(series)));
                     let (operators, powers) = (HashMap::new(), HashMap::new());
-                    let grid = Rc::new(RefCell::new(Grid { bare, runs: 0, operators, powers, solved: None }));
+                    let grid = Rc::new(RefCell::new(Grid { bare, filter, runs: 0, operators, powers, solved: None }));
                     grids.push(grid.clone());
                     grid
                 }
@@ -186,9 +189,19 @@ impl Shelf {
         if let Some(known) = grid.powers.get(&exponent.to_bits()) {
             return known.clone();
         }
-        let made = Rc::new(Power::new(grid.bare.initial_term(exponent)));
+        let made = Rc::new(Power::new(exponent, grid.bare.m(), grid.bare.step(), grid.filter.clone()));
         grid.powers.insert(exponent.to_bits(), made.clone());
         made
+    }
+
+    /// What the filter makes of a series that is no signal of the record.
+    pub(super) fn filtered(&self, series: &[f64]) -> Vec<f64> {
+        self.grid.borrow().filter.as_ref().map_or_else(|| series.to_vec(), |filter| filter.of(series))
+    }
+
+    /// Its spectrum, for a product with one more series.
+    pub(super) fn filtered_spectrum(&self, series: &[f64]) -> Rc<Kernel> {
+        Rc::new(filtered_spectrum(series, self.grid.borrow().filter.as_deref()))
     }
 
     /// Weighted samples of an impulse, or of a derivative of one, that only the filter of an output gets.

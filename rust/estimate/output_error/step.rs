@@ -3,6 +3,7 @@
 use super::curvature::Curvature;
 use super::problem::Problem;
 use crate::dense;
+use crate::orthogonal::norm;
 use crate::small::{self, back_substitute};
 
 /// Least damping: below it the factor's rounding damps more.
@@ -47,11 +48,11 @@ impl Linear {
             for (other, slope) in problem.carried(point, i) {
                 column.iter_mut().zip(&jacobian[other]).for_each(|(v, w)| *v += slope * w);
             }
-            let norm = column.iter().map(|v| v * v).sum::<f64>().sqrt();
-            let scale = if norm > 0.0 { 1.0 / norm } else { 0.0 };
+            let size = norm(&column);
+            let scale = if size > 0.0 { 1.0 / size } else { 0.0 };
             column.iter_mut().for_each(|v| *v *= scale);
             columns.push(column);
-            scales.push(norm);
+            scales.push(size);
         }
         let gradient: Vec<f64> = columns.iter().map(|c| c.iter().zip(residuals).map(|(j, e)| j * e).sum()).collect();
         columns.push(residuals.to_vec());
@@ -64,8 +65,16 @@ impl Linear {
                 out || scales[place] <= 0.0 || (corners && problem.kinked(point, order[place]))
             })
             .collect();
-        let norm = residuals.iter().map(|e| e * e).sum::<f64>().sqrt();
-        Self { r: dense::triangular_factor(&columns), order, scales, gradient, room, held, projected, norm }
+        Self {
+            r: dense::triangular_factor(&columns),
+            order,
+            scales,
+            gradient,
+            room,
+            held,
+            projected,
+            norm: norm(residuals),
+        }
     }
 
     /// Largest component of the gradient along what is free to move.

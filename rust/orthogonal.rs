@@ -1,0 +1,136 @@
+//! Long columns against one another: orthonormal bases, projections, triangular factors, in the widest vectors at hand.
+
+use crate::lanes::{dot, widest, Kernel};
+
+/// Rows that are taken into a triangular factor at a time: what fits a cache.
+const ROWS: usize = 1 << 10;
+
+/// Squares of what is factored lie between these: beyond, sums of them are not what they should be.
+const LEAST: f64 = 1e-280;
+const MOST: f64 = 1e280;
+
+/// Upper triangle R of [R; rows] by Householder's reflections, column by column; false where a square leaves the numbers.
+struct Reflections<'a> {
+    columns: &'a mut [Vec<f64>],
+}
+
+impl Kernel for Reflections<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run(self) -> bool {
+        let k = self.columns.len();
+        for j in 0..k {
+            let (before, later) = self.columns.split_at_mut(j + 1);
+            let reflected = &mut before[j][j..];
+            let square = dot(reflected, reflected);
+            if square == 0.0 && reflected.iter().all(|v| *v == 0.0) {
+                continue;
+            }
+            if !(LEAST..=MOST).contains(&square) {
+                return false;
+            }
+            let first = reflected[0];
+            let turned = -square.sqrt().copysign(first);
+            reflected[0] = first - turned;
+            let factor = 1.0 / (turned * (turned - first));
+            for column in later {
+                let below = &mut column[j..];
+                let along = factor * dot(reflected, below);
+                for (v, w) in below.iter_mut().zip(reflected.iter()) {
+                    *v -= along * w;
+                }
+            }
+            reflected[0] = turned;
+        }
+        true
+    }
+}
+
+/// Upper-triangular factor of the given columns, row-major k × k, part of the rows after part; none where squares leave the
+/// numbers. O(k²m).
+pub(crate) fn triangular_factor(columns: &[Vec<f64>]) -> Option<Vec<f64>> {
+    let k = columns.len();
+    let m = columns.iter().map(Vec::len).max().unwrap_or(0);
+    // R of what is done on top, the next rows below.
+    let mut stacked: Vec<Vec<f64>> = vec![Vec::with_capacity(k + ROWS.min(m)); k];
+    stacked.iter_mut().for_each(|column| column.resize(k, 0.0));
+    for from in (0..m).step_by(ROWS) {
+        for (j, (column, given)) in stacked.iter_mut().zip(columns).enumerate() {
+            // What a reflection leaves below the triangle is its own vector.
+            column.truncate(k);
+            column.iter_mut().skip(j + 1).for_each(|v| *v = 0.0);
+            let rows = given.get(from..given.len().min(from + ROWS)).unwrap_or_default();
+            column.extend_from_slice(rows);
+            column.resize(k + ROWS.min(m - from), 0.0);
+        }
+        if !widest(Reflections { columns: &mut stacked }) {
+            return None;
+        }
+    }
+    let mut out = vec![0.0; k * k];
+    for i in 0..k {
+        for j in i..k {
+            out[i * k + j] = stacked[j][i];
+        }
+    }
+    out.iter().all(|v| v.is_finite()).then_some(out)
+}
+
+/// Takes what lies along an orthonormal basis out of a column, `times` over.
+struct Projection<'a> {
+    basis: &'a [Vec<f64>],
+    column: &'a mut [f64],
+    times: usize,
+}
+
+impl Kernel for Projection<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run(self) {
+        for _ in 0..self.times {
+            for direction in self.basis {
+                let along = dot(direction, self.column);
+                for (v, q) in self.column.iter_mut().zip(direction) {
+                    *v -= along * q;
+                }
+            }
+        }
+    }
+}
+
+/// Takes what lies along an orthonormal basis out of a column of the same length. O(k m).
+pub fn project_out(basis: &[Vec<f64>], column: &mut [f64]) {
+    widest(Projection { basis, column, times: 1 });
+}
+
+/// Adds a column to an orthonormal basis unless less than this share of it lies outside the span. O(k m).
+pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share: f64) {
+    let whole = norm(&column);
+    // Twice is enough (Kahan, Parlett).
+    widest(Projection { basis, column: &mut column, times: 2 });
+    let left = norm(&column);
+    if left > share * whole && left.is_finite() {
+        column.iter_mut().for_each(|v| *v /= left);
+        basis.push(column);
+    }
+}
+
+/// √Σ v².
+struct Norm<'a>(&'a [f64]);
+
+impl Kernel for Norm<'_> {
+    type Output = f64;
+
+    #[inline(always)]
+    fn run(self) -> f64 {
+        dot(self.0, self.0).sqrt()
+    }
+}
+
+/// Euclidean length of a column whose squares are numbers.
+#[must_use]
+pub fn norm(column: &[f64]) -> f64 {
+    widest(Norm(column))
+}
