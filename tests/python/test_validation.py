@@ -10,6 +10,8 @@ import ftlm
 import oracles
 from ftlm import _core
 from ftlm.judge.comparison import compare_means, near_identity
+from ftlm.solve import past
+from ftlm.solve.sampled import sampled
 
 
 def noisy(run, sigma, seed):
@@ -278,7 +280,7 @@ def test_metrics_of_the_core_are_the_public_ones():
     assert _core.metrics(y, y - prediction) == (found.error, found.rmse, found.nr, found.fit)
 
 
-def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest() -> None:
+def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest(monkeypatch):
     rng = np.random.default_rng(3)
     u = np.repeat(rng.choice([-1.0, 1.0], size=60), 40)
     truth = ftlm.Model(ftlm.equation("D^1.4 y = -4 y + 2 u", initial="rest"))
@@ -295,5 +297,16 @@ def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest() ->
     assert len(words) == 1
     assert words[0].startswith("cut starts at zero and is simulated from rest")
     assert "initial='history'" in words[0]
+    # Two free runs tell it of each, from rest and with a history, and both questions are asked of these.
+    simulated = []
+
+    def counted(model, run, *more):
+        simulated.append(run.name)
+        return sampled(model, run, *more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(past, "sampled", counted)
+        assert past.looked_like_rest(model, [from_rest, cut]) == ["cut"]
+    assert simulated == ["from rest", "from rest", "cut", "cut"]
     asked = ftlm.Model(replace(model.structure, initial="history"))
     assert ftlm.compare(asked, cut).fit_percent["y"] > ftlm.compare(model, cut).fit_percent["y"] + 1.0
