@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import nearest, real_number, shown
+from ftlm.base.checks import check_seed, nearest, real_number, shown, whole_number
 from ftlm.base.errors import ModelError
 
 #: Rates of a loop [Hz]: beyond, floating point tells no margins.
@@ -46,6 +46,22 @@ def positive(name: str, value: object) -> float:
     if not (math.isfinite(number) and number > 0):
         raise ModelError(f"{name} = {shown(value)} is not a finite number above 0")
     return number
+
+
+def largest(limit: object) -> float:
+    """The largest command, which may be infinite."""
+    most = real_number("limit", limit)
+    if not most > 0:
+        raise ModelError(f"limit = {shown(limit)} is not a number above 0")
+    return most
+
+
+def drawn_from(samples: object, seed: object) -> tuple[int, int]:
+    """How many samples of a model's numbers are drawn, and from which seed."""
+    count = whole_number(samples)
+    if count is None or not 0 <= count <= 10_000:
+        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
+    return count, check_seed(seed)
 
 
 def sums(what: str, text: object, outputs: tuple[str, ...]) -> Floats:

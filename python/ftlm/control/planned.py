@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import real_number, shown, whole_number
+from ftlm.base.checks import real_number, shown
 from ftlm.base.errors import DataError, ModelError
 from ftlm.control.margins import Plant
-from ftlm.control.names import positive, sums
+from ftlm.control.names import drawn_from, largest, positive, sums
 from ftlm.control.pid import known_least
 from ftlm.data.solved import Solved
 
@@ -164,14 +164,8 @@ def inverse(
     does: Bayo (1987), doi:10.1002/rob.4620040406.
     """
     rows = _path(path)
-    count, start = whole_number(samples), whole_number(seed)
-    if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
-    if start is None or start < 0:
-        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
-    most = real_number("limit", limit)
-    if not most > 0:
-        raise ModelError(f"limit = {shown(limit)} is not a number above 0")
+    count, start = drawn_from(samples, seed)
+    most = largest(limit)
     names = tuple(p.output for p in design.plants)
     row = sums("of", names[0] if of is None and len(names) == 1 else of, names)
     size = 1 << math.ceil(math.log2(LONGER * len(rows)))

@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import real_number, shown, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.control.kalman import UNKNOWN, Observer, filtered, noises, plants_of
-from ftlm.control.margins import Margins, Plant, margins_of, margins_told
-from ftlm.control.names import names_of, positive, sums
+from ftlm.control.margins import JudgedLoop, Margins, Plant, margins_of
+from ftlm.control.names import drawn_from, largest, names_of, positive, sums
 from ftlm.control.pid import BROKEN, known_least
 from ftlm.control.realisation import Realisation, python_control, realised
 from ftlm.data.solved import Solved
@@ -47,10 +46,7 @@ class Lqg:
     """
 
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
-        most = real_number("limit", limit)
-        if not most > 0:
-            raise ModelError(f"limit = {shown(limit)} is not a number above 0")
-        self.observer, self.tracked, self.limit = observer, tracked, most
+        self.observer, self.tracked, self.limit = observer, tracked, largest(limit)
         realisation = observer.realisation
         self.rate = realisation.rate
         gains = np.array(feedback, dtype=np.float64).reshape(1, -1)
@@ -130,7 +126,7 @@ class Lqg:
 
 
 @dataclass(frozen=True)
-class LqgDesign:
+class LqgDesign(JudgedLoop):
     """A linear-quadratic controller with the margins of its loop on the exact model.
 
     Parameters
@@ -158,19 +154,6 @@ class LqgDesign:
         """Of the loop [Hz]."""
         return self.realisation.rate
 
-    @property
-    def kept(self) -> float:
-        """Share of the samples whose loop is stable; 1 where there are none."""
-        return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
-
-    def within(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
-        """Where 95 % of the samples have a margin."""
-        if not self.samples:
-            value = getattr(self.nominal, what)
-            return value, value
-        low, high = np.quantile([getattr(m, what) for m in self.samples], [0.025, 0.975])
-        return float(low), float(high)
-
     def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Outputs it reads, its response to each of them and to the reference, at frequencies [rad/s]."""
         heard, asked = self.controller.response(w)
@@ -187,18 +170,11 @@ class LqgDesign:
             "design": "lqg", "rate": self.rate, "input": made.input, "tracked": self.controller.tracked,
             "measured": list(self.controller.observer.measured), "states": made.states, "band": list(made.band),
             "gain_error_db": made.gain_error, "phase_error_degrees": made.phase_error,
-            **margins_told(self.nominal, self.samples),
+            **self._margins(),
         }  # fmt: skip
 
     def __str__(self) -> str:
-        lines = [str(self.controller), f"realised by {self.realisation}", f"at the values: {self.nominal}"]
-        if self.samples:
-            phase, gain, peak = (self.within(n) for n in ("phase", "gain", "sensitivity"))
-            lines.append(
-                f"over the intervals ({len(self.samples)} samples, {100 * self.kept:.0f} % stable), 95 % between: "
-                f"phase margin {phase[0]:.3g} and {phase[1]:.3g} degrees, gain margin {gain[0]:.3g} and {gain[1]:.3g}, "
-                f"largest sensitivity {peak[0]:.3g} and {peak[1]:.3g}"
-            )
+        lines = [str(self.controller), f"realised by {self.realisation}", *self._judged()]
         return "\n".join(lines)
 
 
@@ -249,11 +225,7 @@ def lqg(
     have no guaranteed margins: Doyle (1978), doi:10.1109/TAC.1978.1101812. So they are judged by the argument principle
     on the exact response.
     """
-    count, start = whole_number(samples), whole_number(seed)
-    if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
-    if start is None or start < 0:
-        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
+    count, start = drawn_from(samples, seed)
     dear = positive("effort", effort)
     walks = 0.2 * dear if drift is None else positive("drift", drift)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
