@@ -10,7 +10,7 @@ from typing import Generic, Protocol, TypeVar
 
 import msgspec
 
-from ftlm.base.checks import shown
+from ftlm.base.checks import shown, words_of
 from ftlm.base.errors import DataError
 
 #: Longest name of a file in a message.
@@ -70,7 +70,7 @@ class Saved(Generic[T]):
         try:
             return msgspec.json.decode(content, type=self.kind)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            raise DataError(f"{file} is no ftlm {self.what}: {error}; give {self.source}") from error
+            raise DataError(f"{file} is no ftlm {self.what}: {words_of(error, LONGEST)}; give {self.source}") from error
 
     def _content(self, file: Path) -> bytes:
         """All of a file that may be one of this kind."""

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from ftlm._core import __version__
+from ftlm.base.checks import words_of
 from ftlm.base.errors import DataError, FtlmError, ModelError
 from ftlm.base.output import write_atomically
 from ftlm.base.saved import Saved
@@ -101,6 +102,8 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
                 raise ModelError(f"{name} is not finite")
         if not 0 < size <= MOST + 1:
             raise ModelError(f"{size} states are not 1 to {MOST + 1}")
+        if not 0 < len(self.poles) <= size:
+            raise ModelError(f"{len(self.poles)} poles are not those of {size} states")
         absent = [n for n in (*self.measured, self.tracked) if n not in self.outputs]
         if absent:
             raise ModelError(f"{absent[0]} is not one of its outputs")
@@ -181,7 +184,7 @@ def load_controller(path: str | os.PathLike[str]) -> Realised | Lqg:
     try:
         return read.controller.controller()
     except (FtlmError, ValueError) as error:
-        raise DataError(f"{path} is damaged: {error}; write it again") from error
+        raise DataError(f"{path} is damaged: {words_of(error)}; write it again") from error
 
 
 def _limit(value: float) -> float | None:

@@ -13,6 +13,8 @@ from ftlm.base.errors import ModelError
 
 #: Rates of a loop [Hz]: beyond, floating point tells no margins.
 RATES = (1e-9, 1e9)
+#: Deviations and times.
+SIZES = (1e-100, 1e100)
 
 
 def checked_rate(rate: object) -> float:
@@ -29,15 +31,19 @@ def names_of(what: str, given: Sequence[str] | None, outputs: tuple[str, ...]) -
     """Outputs by name, all of them where none is named."""
     if given is None:
         return outputs
-    if isinstance(given, str) or not isinstance(given, Sequence) or not given or len(set(given)) < len(given):
-        raise ModelError(f"{what} = {given!r} is no list of outputs, each once; the input reaches {', '.join(outputs)}")
-    for name in given:
-        if name not in outputs:
-            raise ModelError(
-                f"{what} = {name!r} is not one of the outputs that the input reaches{nearest(name, outputs)}; they are "
-                f"{', '.join(outputs)}"
-            )
-    return tuple(given)
+    names = [] if isinstance(given, str) or not isinstance(given, Sequence) else [*given[: len(outputs) + 1]]
+    absent = [n for n in names if not (isinstance(n, str) and n in outputs)]
+    if not names or (not absent and len(set(names)) < len(names)):
+        raise ModelError(
+            f"{what} = {shown(given)} is no list of outputs, each once; the input reaches {', '.join(outputs)}"
+        )
+    if absent:
+        near = nearest(absent[0], outputs) if isinstance(absent[0], str) else ""
+        raise ModelError(
+            f"{what} = {shown(absent[0])} is not one of the outputs that the input reaches{near}; they are "
+            f"{', '.join(outputs)}"
+        )
+    return tuple(names)
 
 
 def positive(name: str, value: object) -> float:
@@ -45,6 +51,8 @@ def positive(name: str, value: object) -> float:
     number = real_number(name, value)
     if not (math.isfinite(number) and number > 0):
         raise ModelError(f"{name} = {shown(value)} is not a finite number above 0")
+    if not SIZES[0] <= number <= SIZES[1]:
+        raise ModelError(f"{name} = {shown(value)} is outside [{SIZES[0]:g}, {SIZES[1]:g}], where squares are numbers")
     return number
 
 
@@ -67,11 +75,12 @@ def drawn_from(samples: object, seed: object) -> tuple[int, int]:
 def sums(what: str, text: object, outputs: tuple[str, ...]) -> Floats:
     """A sum of outputs in words, such as "theta11 + theta12", as the row of its factors."""
     row = np.zeros(len(outputs))
-    for part in str(text).split("+"):
+    for part in text.split("+") if isinstance(text, str) else [""]:
         name = part.strip()
         if name not in outputs:
+            near = nearest(name, outputs)
             raise ModelError(
-                f"{what} = {text!r} is not a sum of outputs that the input reaches{nearest(name, outputs)}; they are "
+                f"{what} = {shown(text)} is not a sum of outputs that the input reaches{near}; they are "
                 f"{', '.join(outputs)}"
             )
         row[outputs.index(name)] += 1.0

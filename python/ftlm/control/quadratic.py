@@ -11,12 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Complex, Floats
+from ftlm.base.checks import shown
 from ftlm.base.errors import ModelError
 from ftlm.control.kalman import UNKNOWN, Observer, filtered, noises, plants_of
 from ftlm.control.margins import JudgedLoop, Margins, Plant, margins_of
 from ftlm.control.names import drawn_from, largest, names_of, positive, sums
 from ftlm.control.pid import BROKEN, known_least
-from ftlm.control.realisation import Realisation, python_control, realised
+from ftlm.control.realisation import Realisation, python_control, realised, solving
 from ftlm.data.solved import Solved
 
 #: Largest sensitivity of a loop that is a design: a phase margin of 19 degrees and gain margins of 1.5 at least.
@@ -80,11 +81,16 @@ class Lqg:
     def __call__(self, measured: Sequence[float] | Floats, reference: float) -> float:
         """The command for what is measured at a sample, in the observer's order, and what is asked for."""
         y = np.asarray(measured, dtype=np.float64)
-        if self._states is None:
-            self._states = np.append(self.observer.rest(y), 0.0)
-        corrected = self._states + self.observer.gain @ (y - self._c @ self._states)
-        self._states = self._a @ corrected + self._b[:, 0] * self._applied
-        command = self.ahead * reference - float(self._gains[0] @ self._states)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self._states is None:
+                self._states = np.append(self.observer.rest(y), 0.0)
+            corrected = self._states + self.observer.gain @ (y - self._c @ self._states)
+            self._states = self._a @ corrected + self._b[:, 0] * self._applied
+            command = self.ahead * reference - float(self._gains[0] @ self._states)
+        if not math.isfinite(command):
+            raise ModelError(
+                f"the command is {command}, which no machine takes: what is measured, asked for or held is not finite"
+            )
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
 
@@ -238,10 +244,8 @@ def lqg(
     c = realisation.c
     cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
     no = "no state feedback brings the model to rest; allow for deviations of every output that integrates"
-    try:
+    with solving(*no.split("; ")):
         gains, _, own = python_control().dlqr(realisation.a, realisation.b, cost, np.eye(1) / dear**2)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise ModelError(f"{no} ({error})") from None
     if np.max(np.abs(own)) >= 1.0 - AT_ONE:
         raise ModelError(no)
     controller = Lqg(seen, gains, tracked, limit=limit)
@@ -287,16 +291,16 @@ def _weights(allowed: Mapping[str, float], names: tuple[str, ...]) -> list[tuple
     """Rows of outputs that are summed up, and the deviations that are allowed for."""
     if not isinstance(allowed, Mapping) or not allowed:
         raise ModelError(
-            f"allowed = {allowed!r} is no mapping from outputs, or sums of them, to deviations; give such as "
+            f"allowed = {shown(allowed)} is no mapping from outputs, or sums of them, to deviations; give such as "
             f"{{{names[0]!r}: 0.01}}"
         )
-    return [(sums("allowed", text, names), positive(f"allowed[{text!r}]", size)) for text, size in allowed.items()]
+    return [(sums("allowed", text, names), positive(f"allowed[{shown(text)}]", size)) for text, size in allowed.items()]
 
 
 def _equilibrium(realisation: Realisation, tracked: str) -> Floats:
     """States and input at rest with the tracked output at 1."""
     if tracked not in realisation.outputs:
-        raise ModelError(f"tracked = {tracked!r} is not one of the outputs {', '.join(realisation.outputs)}")
+        raise ModelError(f"tracked = {shown(tracked)} is not one of the outputs {', '.join(realisation.outputs)}")
     size = realisation.states
     matrix = np.zeros((size + 1, size + 1))
     matrix[:size, :size] = realisation.a - np.eye(size)

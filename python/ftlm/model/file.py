@@ -10,6 +10,7 @@ from typing import Literal
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from ftlm.base.checks import words_of
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import write_atomically
 from ftlm.base.saved import Saved
@@ -242,4 +243,4 @@ def read_model(path: str | os.PathLike[str]) -> Solved:
     try:
         return read.solved()
     except ModelError as error:
-        raise DataError(f"{path} holds no usable model: {error}") from error
+        raise DataError(f"{path} holds no usable model: {words_of(error)}") from error
