@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 import ftlm
 from ftlm.base.output import COMMAND, PLAIN, RUN, check_free, check_new, write_atomically
 from ftlm.data.equations import numeric
+from ftlm.data.filters import SensorFilter
 from ftlm.data.language import parse_equation
 from ftlm.data.orders import grid, parse_values
-from ftlm.data.structures import SensorFilter, check_initial
+from ftlm.data.structures import check_initial
 from ftlm.model.file import ModelFile
 
 # ----------------------------------------------------------------------------------------------------------------------

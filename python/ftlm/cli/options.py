@@ -13,11 +13,12 @@ from typer import Argument, Option
 from ftlm.arm.link import Law, flexible_link
 from ftlm.base.errors import DataError, ModelError
 from ftlm.cli.words import interval, numbers, pairs, ranges
+from ftlm.data.filters import SensorFilter
 from ftlm.data.language import equation
 from ftlm.data.lattice import Lattice, lattice
 from ftlm.data.run import Run
 from ftlm.data.settings import Criterion
-from ftlm.data.structures import START_WORDS, SensorFilter, Structure, check_initial
+from ftlm.data.structures import START_WORDS, Structure, check_initial
 from ftlm.files.layout import Layout
 from ftlm.files.load import load
 from ftlm.files.opened import OpenedFile, open_file

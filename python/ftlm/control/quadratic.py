@@ -44,6 +44,12 @@ class Lqg:
         The output that follows the reference.
     limit
         Largest command.
+
+    Raises
+    ------
+    ModelError
+        Feedback of another shape or that is not finite, a limit that is not above 0, an output that cannot be held;
+        when it is called, a command that is no number.
     """
 
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:

@@ -15,10 +15,11 @@ from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import write_atomically
 from ftlm.base.saved import Saved
 from ftlm.data.equations import Equation, Friction, Stribeck, Term
+from ftlm.data.filters import SensorFilter
 from ftlm.data.limits import Limit, LimitLaw
 from ftlm.data.orders import Order
 from ftlm.data.solved import Estimate, Solved
-from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
+from ftlm.data.structures import Offset, Structure, check_initial
 
 #: Schema of a model that every version since the first reads, of one that has an offset, of one that has intervals by
 #: profile likelihood or whose sensor filter names what is no output, of one that has friction, of one whose inputs have
