@@ -1,10 +1,14 @@
 """Calls of functions of Python that the extension does not judge, each with one or two bad values among sound ones.
 
-Shapers, controllers, what runs them, and a rig's loop; what is a design or a fit takes seconds and is not called here.
+Shapers, designs of controllers and observers, planned moves, files of controllers, what runs them, and a rig's loop; a
+fit takes seconds and is not called here.
 """
 
+import json
 import signal
+import tempfile
 import warnings
+from pathlib import Path
 
 import hostile
 import numpy as np
@@ -54,6 +58,33 @@ ODD = (
 )  # fmt: skip
 
 
+class Unwritable(ftlm.DataError):
+    """What the attack itself cannot write down."""
+
+
+def file_of(controller):
+    """What stands in the file of a controller."""
+    with tempfile.TemporaryDirectory() as folder:
+        control.save_controller(controller, Path(folder) / "c.json")
+        return json.loads((Path(folder) / "c.json").read_bytes())
+
+
+def ran_from(content):
+    """Reads a controller from a file of this content, and runs it."""
+    try:
+        text = json.dumps(content).encode()
+    except (TypeError, ValueError, hostile.OursError) as error:
+        raise Unwritable("no JSON") from error
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "c.json"
+        path.write_bytes(text)
+        made = control.load_controller(path)
+    for _ in range(3):
+        put = made(0.1) if isinstance(made, control.Realised) else made([0.1] * len(made.observer.measured), 0.2)
+        if not abs(put) <= made.limit:
+            raise AssertionError(f"{put!r} is over the limit of {made.limit!r}")
+
+
 def recipes():
     """Functions by name with sound arguments."""
     hub = ftlm.Model(ftlm.equation("D^2 theta = -63 D^0.95 theta + 140 I"))
@@ -61,6 +92,13 @@ def recipes():
     shaper = control.input_shaper(POLE)
     ran = {"reference": REST, "rig": "virtual", "limit": 30.0, "rate": 500.0, "seed": 0, "parameters": "effective",
            "paced": False, "watchdog": 0.1, "arm": False, "name": "control"}  # fmt: skip
+    turning = "D^2 hub = 160 bend - 30 D hub + 100 I; D^2 bend = -300 bend - 4 D bend - D^2 hub"
+    watching = {
+        "model": ftlm.Model(ftlm.equation(turning, coupling="simulated")), "input": "I", "measured": ["hub", "bend"],
+        "noise": {"hub": 3e-4, "bend": 2e-4}, "rate": 500.0, "band": (0.5, 150.0), "poles": 4,
+        "coupling": "simulated", "sensor": False,
+    }  # fmt: skip
+    quick = watching | {"allowed": {"hub": 0.02}, "effort": 1.0}
     return {
         "input_shaper": (
             control.input_shaper, {"model": link, "kind": "zv", "modes_shaped": 1, "coupling": "measured"}
@@ -73,6 +111,23 @@ def recipes():
             {"model": hub, "output": "theta", "input": "I", "crossover": 40.0, "phase_margin": 60.0, "rate": 500.0,
              "samples": 2, "seed": 0, "coupling": "simulated"},
         ),
+        "observer": (control.observer, watching | {"drift": 0.2}),
+        "lqg": (
+            control.lqg,
+            watching | {"allowed": {"hub": 0.02, "hub + bend": 0.02}, "effort": 1.0, "output": "hub", "drift": None,
+                        "limit": 5.0, "samples": 2, "seed": 0},
+        ),
+        "smooth_move": (
+            control.smooth_move, {"size": 0.3, "duration": 0.5, "rate": 500.0, "before": 0.3, "after": 1.2}
+        ),
+        "inverse": (
+            control.inverse,
+            {"design": control.fractional_pid(hub, crossover=40.0), "path": control.smooth_move(0.3, 0.5),
+             "of": "theta", "limit": 30.0, "samples": 2, "seed": 0},
+        ),
+        "load_controller": (control.load_controller, {"path": "none.json"}),
+        "load_controller of a PID": (lambda **content: ran_from(content), file_of(control.Realised(PID, 500.0))),
+        "load_controller of an LQG": (lambda **content: ran_from(content), file_of(control.lqg(**quick).controller)),
         "FractionalPid": (
             lambda **numbers: control.Realised(control.FractionalPid(**numbers), 500.0)(0.1),
             {"kp": 1.0, "ki": 2.0, "kd": 0.1, "lam": 0.7, "mu": 0.8},
@@ -123,11 +178,11 @@ def outcome(function, given):
     return None
 
 
-def calls(r, count):
-    """(name, what was wrong or None) of so many calls, each of a function by chance."""
+def calls(r, count, only=()):
+    """(name, what was wrong or None) of so many calls, each of a function by chance, of all or of some."""
     known = recipes()
     for _ in range(count):
-        name = r.choice(list(known))
+        name = r.choice(list(only or known))
         function, given = known[name]
         for _ in range(2 if r.random() < hostile.TWICE else 1):
             at = r.choice(list(hostile.places(given)))

@@ -16,13 +16,14 @@ if _typing.TYPE_CHECKING:
     from ftlm.arm.parameters import PARAMETERS, LinkParameters
     from ftlm.base.errors import ConvergenceError, DataError, FtlmError, InternalError, ModelError, RigFault
     from ftlm.data.equations import Equation, Friction, Stribeck, Term
+    from ftlm.data.filters import SensorFilter
     from ftlm.data.language import equation
     from ftlm.data.lattice import Lattice, lattice
     from ftlm.data.orders import Order
     from ftlm.data.response import FrequencyData
     from ftlm.data.run import Run
     from ftlm.data.solved import Estimate
-    from ftlm.data.structures import SensorFilter, Structure
+    from ftlm.data.structures import Structure
     from ftlm.excitation.experiment import design_input
     from ftlm.excitation.result import DesignedInput
     from ftlm.files.layout import Assumption, Layout

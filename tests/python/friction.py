@@ -321,6 +321,19 @@ def bodies(
     return places, rates
 
 
+def two_records() -> tuple[list[tuple], tuple]:
+    """Two driven records of noise, on grids of their own, and the law of a body, as the core takes them."""
+    rng = np.random.default_rng(1)
+
+    def experiment(m: int, every: int) -> tuple:
+        u = 2 * np.sin(0.012 * np.arange(m)) + 0.3 * rng.normal(size=m) + 0.2
+        samples = rng.normal(size=(1, m // every + 1))
+        return ((0.004, np.stack([0 * u, u]), None), every, samples, None, [1.3], [(None, False)] * 2, None, None)
+
+    law = (0, (0.0, [1.0, 0.0]), [(0, (0.0, [0.0, 1.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0, 0.0]), (1.0, [(1, 1)]))])
+    return [experiment(400, 1), experiment(600, 2)], law
+
+
 def slope_errors(at: Callable[[np.ndarray], dict], point: np.ndarray, numbers: int) -> list[float]:
     """How far the derivatives of `at` are from central differences, each as a share of the difference's norm.
 

@@ -4,10 +4,12 @@ import ast
 import importlib
 import importlib.util
 import inspect
+import pydoc
 import re
 import shutil
 import subprocess
 import sys
+import textwrap
 import tomllib
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -399,6 +401,115 @@ def test_every_public_member_has_a_docstring(name):
         if member.startswith("_") or not (callable(value) or isinstance(value, (property, classmethod))):
             continue
         assert inspect.getdoc(getattr(getattr(ftlm, name), member)), member
+
+
+def in_the_reference():
+    """What docs/api.md shows: functions, classes and the members of these that it names, or all."""
+    found, holder = {}, ""
+    for line in (ROOT / "docs" / "api.md").read_text(encoding="utf-8").splitlines():
+        if shown := re.match(r"\.\. auto(?:function|class):: ([\w.]+)", line):
+            holder = shown[1]
+            found[holder] = pydoc.locate(holder)
+        elif members := re.match(r"   :members:(.*)", line):
+            known = [n.strip() for n in members[1].split(",") if n.strip()] or [
+                n for n, value in vars(found[holder]).items() if not n.startswith("_") and inspect.getdoc(value)
+            ]
+            found |= {f"{holder}.{n}": inspect.getattr_static(found[holder], n, None) for n in known}
+    return {n: v.__func__ if isinstance(v, (classmethod, staticmethod)) else v for n, v in found.items()}
+
+
+REFERENCE = in_the_reference()
+
+
+def referred_to(name, text):
+    """Docstrings that one refers to for what it does not say itself: what is in its class, its module, or anywhere."""
+    for other in re.findall(r":(?:func|meth):`~?([\w.]+)`", text):
+        homes = (name.rpartition(".")[0], name.rpartition(".")[0].rpartition(".")[0], "ftlm", "")
+        known = (pydoc.locate(f"{home}.{other}".lstrip(".")) for home in homes)
+        yield next((inspect.getdoc(o) for o in known if o is not None), "") or ""
+
+
+def untold(name, function):
+    """What a docstring does not say of arguments and refusals, nor one that it refers to."""
+    text = inspect.getdoc(function) or ""
+    named = set(inspect.signature(function).parameters) - {"self", "cls"}
+    others = list(referred_to(name, text))
+    own, method = documented(text), inspect.isclass(pydoc.locate(name.rpartition(".")[0]))
+    # A method of one argument says in its line what it is.
+    enough = own == named if own else (method and len(named) <= 1) or any(named <= documented(o) for o in ("", *others))
+    body = ast.parse(textwrap.dedent(inspect.getsource(function)))
+    raised = [n.exc for n in ast.walk(body) if isinstance(n, ast.Raise)]
+    kinds = {ast.unparse(e.func).rpartition(".")[2] for e in raised if isinstance(e, ast.Call)}
+    told = [t.partition("Raises\n------\n")[2] for t in (text, *others)]
+    silent = {
+        k for k in kinds & {"DataError", "ModelError", "ConvergenceError", "RigFault"} if not any(k in t for t in told)
+    }
+    sections = re.findall(r"^(\w[\w ]*)\n-{3,}$", text, re.MULTILINE)
+    ordered = [s for s in ("Parameters", "Returns", "Warns", "Raises", "Notes", "Examples") if s in sections]
+    return [*([] if enough else [f"arguments {sorted(named ^ own)}"]), *sorted(silent),
+            *([] if sections == ordered else [f"sections {sections}"])]  # fmt: skip
+
+
+def test_everything_in_the_reference_exists():
+    assert [name for name, value in REFERENCE.items() if value is None] == []
+    assert len(REFERENCE) > 250
+
+
+@pytest.mark.parametrize("name", [n for n, v in REFERENCE.items() if inspect.isfunction(v)])
+def test_the_reference_tells_every_argument_and_refusal(name):
+    assert untold(name, REFERENCE[name]) == []
+
+
+@pytest.mark.parametrize("name", [n for n, v in REFERENCE.items() if inspect.isclass(v)])
+def test_the_reference_tells_what_a_class_is_made_of(name):
+    made = REFERENCE[name]
+    text = inspect.getdoc(made)
+    # A run, say, is made by its own methods.
+    given = set(inspect.signature(made).parameters) - {"args", "kwargs"}
+    assert documented(text) >= given
+    written = [vars(made)[n] for n in ("__init__", "__post_init__") if n in vars(made)]
+    checks = [f for f in map(inspect.unwrap, written) if not f.__code__.co_filename.startswith("<")]
+    if given and any(re.search(r"raise (Model|Data)Error", inspect.getsource(f)) for f in checks):
+        assert "\nRaises\n------\n" in text
+
+
+def test_what_a_docstring_does_not_say_is_seen():
+    def none(first, second):
+        """Do something."""
+
+    def part(first, second):
+        """Do something.
+
+        Parameters
+        ----------
+        first
+            One.
+        """
+        raise ftlm.ModelError("no")
+
+    def other(first):
+        """See :func:`ftlm.nothing`.
+
+        Raises
+        ------
+        DataError
+            Always.
+
+        Parameters
+        ----------
+        first
+            One.
+        """
+        raise ftlm.DataError("no")
+
+    def refers(run):
+        """See :func:`ftlm.resid`."""
+
+    assert untold("ftlm.none", none) == ["arguments ['first', 'second']"]
+    assert untold("ftlm.part", part) == ["arguments ['second']", "ModelError"]
+    assert untold("ftlm.other", other) == ["sections ['Raises', 'Parameters']"]
+    assert untold("ftlm.refers", refers) == ["arguments ['run']"]
+    assert untold("ftlm.Model.refers", refers) == []
 
 
 # ----------------------------------------------------------------------------------------------------------------------

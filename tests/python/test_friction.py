@@ -200,15 +200,7 @@ def test_initial_terms_are_level_and_velocity() -> None:
 
 @pytest.mark.parametrize("orders", [(1.9, 0.9), (1.8, 0.4), (1.95, 1.2)])
 def test_derivatives_are_those_of_finite_differences(orders) -> None:
-    rng = np.random.default_rng(1)
-
-    def experiment(m: int, every: int):
-        u = 2 * np.sin(0.012 * np.arange(m)) + 0.3 * rng.normal(size=m) + 0.2
-        samples = rng.normal(size=(1, m // every + 1))
-        return ((0.004, np.stack([0 * u, u]), None), every, samples, None, [1.3], [(None, False)] * 2, None, None)
-
-    runs = [experiment(400, 1), experiment(600, 2)]
-    law = (0, (0.0, [1.0, 0.0]), [(0, (0.0, [0.0, 1.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0, 0.0]), (1.0, [(1, 1)]))])
+    runs, law = friction.two_records()
 
     def at(point):
         return _core.friction_error(

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 import ftlm
 from ftlm.base.output import COMMAND, PLAIN, RUN, check_free, check_new, write_atomically
 from ftlm.data.equations import numeric
+from ftlm.data.filters import SensorFilter
 from ftlm.data.language import parse_equation
 from ftlm.data.orders import grid, parse_values
-from ftlm.data.structures import SensorFilter, check_initial
+from ftlm.data.structures import check_initial
 from ftlm.model.file import ModelFile
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -738,6 +739,20 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
     assert message.startswith(str(path))
     expected = {"too large": "1048577 bytes", "later schema": "schema 3, this version reads up to 2; upgrade ftlm"}
     assert expected.get(kind, "") in message
+
+
+@pytest.mark.parametrize("load", [ftlm.load_model, ftlm.control.load_controller])
+def test_what_is_no_path_of_a_file_is_refused(load, tmp_path):
+    for wrong in (5, None, b"model.json", ["model.json"], 10**5000):
+        with pytest.raises(ftlm.DataError, match=r"^path = .* is no path of a file; give a file "):
+            load(wrong)
+    with pytest.raises(ftlm.DataError, match="is no regular file; give a file "):
+        load(tmp_path)
+    for absent in (tmp_path / "none.json", "a\0b", "\ud800.json", "x" * 5000):
+        with pytest.raises(ftlm.DataError, match=r"cannot be read: .*; check the path$") as refused:
+            load(absent)
+        assert str(refused.value).isprintable()
+        assert len(str(refused.value)) < 1000
 
 
 def test_a_model_file_cut_anywhere_is_refused(tmp_path):

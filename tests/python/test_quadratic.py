@@ -269,6 +269,16 @@ REFUSED = [
     ({"measured": "hub"}, "measured = 'hub' is no list"),
     ({"measured": ["hubb"]}, "did you mean 'hub'"),
     ({"measured": ["hub", "hub"]}, "is no list of outputs, each once"),
+    ({"measured": [["hub"], "bend"]}, r"measured = \['hub'\] is not one of the outputs"),
+    ({"measured": ["h" * 9999]}, "measured = 'h{59}… is not one of the outputs"),
+    ({"noise": {("hub",): 1e-4}}, r"noise of \('hub',\) is of nothing"),
+    ({"noise": {"hub": 1e308, "bend": 1e-4}}, "noise of hub = 1e.308 is outside"),
+    ({"noise": {"hub": 1e30, "bend": 1e-4}}, "no observer from hub, bend .*; measure more, or narrow the band"),
+    ({"allowed": {"hub": 5e-324}}, "= 5e-324 is outside"),
+    ({"allowed": {7: 0.1}}, "allowed = 7 is not a sum"),
+    ({"allowed": 10**5000}, "allowed = an integer of 16610 bits is no mapping"),
+    ({"band": (1e-320, 100.0)}, "; use a narrower band"),
+    ({"band": (10**5000,)}, "band = a tuple is no pair"),
     ({"measured": ["bend"], "noise": {"bend": 1e-4}}, "no observer from bend"),
     ({"output": "huub"}, "did you mean 'hub'"),
     ({"output": "bend"}, "bend cannot be held at a value by I"),
@@ -298,6 +308,24 @@ def test_what_is_no_loop_is_refused(case):
     told = ftlm.Model(ftlm.equation(text, coupling="simulated", fixed=fixed))
     with pytest.raises(ftlm.ModelError, match=words):
         control.lqg(told, **given)
+
+
+def test_what_is_no_model_or_no_loop_is_refused_by_name():
+    for wrong in (None, 3, "hub", {}, ftlm.Model):
+        with pytest.raises(ftlm.ModelError, match=r"model is .*, not a Model"):
+            control.lqg(wrong, allowed=DEAR, effort=1.0)
+        with pytest.raises(ftlm.ModelError, match=r"model is .*, not a Model"):
+            control.observer(wrong, drift=1.0)
+        with pytest.raises(ftlm.ModelError, match=r"design is a .*, no PidDesign or LqgDesign"):
+            control.inverse(wrong, control.smooth_move(0.3, 0.5))
+
+
+def test_a_controller_answers_no_command_that_is_no_number():
+    running = designed(WHOLE, samples=0).controller
+    for measured, asked in (([math.nan, 0.0], 0.0), ([0.0, 0.0], math.inf), ([1e308, -1e308], 0.0)):
+        running.reset()
+        with pytest.raises(ftlm.ModelError, match="which no machine takes"):
+            running(measured, asked)
 
 
 def test_without_python_control_its_name_is_said(monkeypatch):
@@ -381,6 +409,8 @@ PATHS = [
     ({"path": "text"}, ftlm.DataError, "no array of 16"),
     ({"path": [1.0, 2.0]}, ftlm.DataError, "no array of 16"),
     ({"path": np.zeros(100)}, ftlm.DataError, "stands still"),
+    ({"path": np.r_[np.zeros(50), 1e308, 1e308]}, ftlm.DataError, r"beyond 1e.100 at row 50 .2 such"),
+    ({"of": 10**5000}, ftlm.ModelError, "of = an integer of 16610 bits is not a sum"),
     ({"path": np.arange(100.0)}, ftlm.DataError, "does not begin at rest"),
     ({"path": np.r_[0, 0, np.arange(100.0)]}, ftlm.DataError, "does not end at rest"),
     ({"path": np.r_[0, 0, np.nan, np.inf, np.ones(50)]}, ftlm.DataError, r"not finite at row 2 .2 such"),

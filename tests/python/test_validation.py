@@ -10,18 +10,8 @@ import ftlm
 import oracles
 from ftlm import _core
 from ftlm.judge.comparison import compare_means, near_identity
-
-
-def noisy(run, sigma, seed):
-    rng = np.random.default_rng(seed)
-    return ftlm.Run.from_arrays(
-        step=run.step,
-        inputs={n: run[n] for n in run.inputs},
-        outputs={n: run[n] + sigma * rng.standard_normal(run.length) for n in run.outputs},
-        units={n: u for n, u in run.units.items() if u},
-        name=f"seed {seed}",
-    )
-
+from ftlm.solve import past
+from ftlm.solve.sampled import sampled
 
 # ----------------------------------------------------------------------------------------------------------------------
 # The four figures
@@ -144,8 +134,8 @@ def test_initial_terms_are_fitted_anew_for_every_run(small_model):
     assert resting.fit_percent["y"] < 1
 
 
-def test_several_runs_are_pooled_about_their_own_means(small_model, small_run):
-    first, second = noisy(small_run, 0.01, 1), noisy(small_run.slice(0, 6), 0.05, 2)
+def test_several_runs_are_pooled_about_their_own_means(small_model, small_run, with_noise):
+    first, second = with_noise(small_run, 0.01, 1), with_noise(small_run.slice(0, 6), 0.05, 2)
     together = compare_means(small_model, [first, second], m=256)
     alone = [compare_means(small_model, run, m=256) for run in (first, second)]
     for kind in ("output_error", "equation_error"):
@@ -155,7 +145,7 @@ def test_several_runs_are_pooled_about_their_own_means(small_model, small_run):
         assert pooled.rmse == pytest.approx(np.sqrt(squares / 512), rel=1e-12)
         deviation = sum(256 * (p.rmse / p.nr) ** 2 for p in parts)
         assert pooled.nr == pytest.approx(np.sqrt(squares / deviation), rel=1e-12)
-    assert [name for name, _, _ in together.per_run] == ["seed 1", "seed 2"]
+    assert [name for name, _, _ in together.per_run] == [first.name, second.name]
     for (_, equation, output), c in zip(together.per_run, alone, strict=True):
         assert equation == c.equation_error
         assert output == c.output_error
@@ -171,8 +161,9 @@ def test_a_model_that_knows_no_m_takes_what_the_run_carries(small_model, small_r
         small_model.compare(small_run, m=513)
 
 
-def test_comparison_prints_and_is_json(small_model, small_run):
-    found = small_model.compare([small_run, noisy(small_run, 0.01, 1)], m=64)
+def test_comparison_prints_and_is_json(small_model, small_run, with_noise):
+    other = with_noise(small_run, 0.01, 1)
+    found = small_model.compare([small_run, other], m=64)
     lines = str(found).splitlines()
     assert lines[0].split() == ["output", "error", "RMSE", "NR", "fit", "%"]
     assert [line.split()[:3] for line in lines[1:3]] == [["y", "equation", "error"], ["y", "output", "error"]]
@@ -182,7 +173,7 @@ def test_comparison_prints_and_is_json(small_model, small_run):
     document = json.loads(json.dumps(found.to_dict(), allow_nan=False))
     assert document["m"] == 64
     assert document["output_error"]["y"]["fit"] == found.fit_percent["y"]
-    assert [r["run"] for r in document["runs"]] == ["small, simulated", "seed 1"]
+    assert [r["run"] for r in document["runs"]] == ["small, simulated", other.name]
 
 
 # ----------------------------------------------------------------------------------------------------------------------
@@ -278,7 +269,7 @@ def test_metrics_of_the_core_are_the_public_ones():
     assert _core.metrics(y, y - prediction) == (found.error, found.rmse, found.nr, found.fit)
 
 
-def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest() -> None:
+def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest(monkeypatch):
     rng = np.random.default_rng(3)
     u = np.repeat(rng.choice([-1.0, 1.0], size=60), 40)
     truth = ftlm.Model(ftlm.equation("D^1.4 y = -4 y + 2 u", initial="rest"))
@@ -295,5 +286,16 @@ def test_a_run_in_motion_that_starts_at_zero_is_said_to_be_no_run_from_rest() ->
     assert len(words) == 1
     assert words[0].startswith("cut starts at zero and is simulated from rest")
     assert "initial='history'" in words[0]
+    # Two free runs tell it of each, from rest and with a history, and both questions are asked of these.
+    simulated = []
+
+    def counted(model, run, *more):
+        simulated.append(run.name)
+        return sampled(model, run, *more)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(past, "sampled", counted)
+        assert past.looked_like_rest(model, [from_rest, cut]) == ["cut"]
+    assert simulated == ["from rest", "from rest", "cut", "cut"]
     asked = ftlm.Model(replace(model.structure, initial="history"))
     assert ftlm.compare(asked, cut).fit_percent["y"] > ftlm.compare(model, cut).fit_percent["y"] + 1.0

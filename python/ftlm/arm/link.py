@@ -16,8 +16,9 @@ from typing import Literal, TypeAlias
 from ftlm.arm.parameters import INTEGER_ORDERS, PARAMETERS, LinkParameters
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Friction, Term
+from ftlm.data.filters import SensorFilter
 from ftlm.data.orders import Order
-from ftlm.data.structures import Hints, SensorFilter, Structure, check_offset
+from ftlm.data.structures import Hints, Structure, check_offset
 from ftlm.model.model import Model
 
 #: Orders of the cross-stage terms: torques of the other stage act through its angles and its current as they are.

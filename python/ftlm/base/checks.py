@@ -60,6 +60,14 @@ def whole_number(value: object) -> int | None:
         return None
 
 
+def check_seed(seed: object) -> int:
+    """Return the seed of random numbers as an int."""
+    number = whole_number(seed)
+    if number is None or number < 0:
+        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
+    return number
+
+
 def check_pulses(m: object, below: float = 1 << 62) -> int:
     """Return a number of block pulses, of which the core counts fewer than 2^62."""
     pulses = whole_number(m)

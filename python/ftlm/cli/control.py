@@ -13,8 +13,9 @@ from ftlm import control as designs
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free, write_atomically
 from ftlm.cli.command import command, show_json
-from ftlm.cli.options import Force, Json, Number, SavedModel, Text, Texts
+from ftlm.cli.options import Force, Json, Noise, Number, SavedModel, Text, Texts
 from ftlm.cli.words import in_options, numbers, several
+from ftlm.cli.written import check_ending, say_written
 from ftlm.model.model import load_model
 
 #: Options that one design has and the other has not.
@@ -26,7 +27,7 @@ OF_LQG = ("allowed", "effort", "drift", "noise", "measured", "band", "poles")
 def control(
     *, model: SavedModel,
     design: Annotated[
-        Literal["pid", "lqg"], Option(help="A fractional PID, or an observer with state feedback.")
+        Literal["pid", "lqg"], Option(help="A fractional PID, or LQG: an observer (of --noise) and state feedback.")
     ] = "pid",
     signal: Annotated[
         Text, Option("--input", metavar="NAME", help="What is controlled with, if there are several.")
@@ -41,9 +42,7 @@ def control(
     drift: Annotated[
         Number, Option(help="Of LQG: what is unknown of the input walks so far in a second; default effort/5.")
     ] = None,
-    noise: Annotated[
-        Texts, Option(metavar="OUTPUT=A", help="Of LQG: deviation of an output's noise; default what the fit left.")
-    ] = None,
+    noise: Noise = None,
     measured: Annotated[Texts, Option(metavar="OUTPUT", help="Of LQG: an output it reads; default all.")] = None,
     band: Annotated[
         Text, Option(metavar="LOW:HIGH", help="Of LQG: where its poles stand for the model [rad/s].")
@@ -68,9 +67,8 @@ def control(
     """Design a controller on a model: margins, what its intervals leave of them, and what a machine runs, as a file."""
     given = dict(locals())
     check_free(out, plan, force=force, words=COMMAND)
-    for name, ending in ((out, ".json"), (plan, ".csv")):
-        if name is not None and Path(name).suffix.lower() != ending:
-            raise ModelError(f"{name} does not end in {ending}; name it so")
+    check_ending(out, ".json")
+    check_ending(plan, ".csv")
     if plan is not None and move is None:
         raise ModelError("--plan is of a move; give --move SIZE:SECONDS")
     if of is not None and move is None:
@@ -119,9 +117,7 @@ def control(
         return
     for line in (found, *([running] if design == "pid" else []), *([planned] if planned is not None else [])):
         print(in_options(str(line)))
-    for written in (out, plan):
-        if written is not None:
-            print(in_options(f"written: {written}"))
+    say_written(out, plan)
 
 
 @command
@@ -140,8 +136,7 @@ def shape(
 ) -> None:  # fmt: skip
     """Make an input shaper from the poles of a model: a reference split so that their vibrations cancel."""
     check_free(out, force=force, words=COMMAND)
-    if out is not None and Path(out).suffix.lower() != ".csv":
-        raise ModelError(f"{out} does not end in .csv; name it so")
+    check_ending(out, ".csv")
     made = designs.input_shaper(load_model(model), kind, modes_shaped=modes, coupling=coupling)
     taps = made.impulses(rate)
     if out is not None:
@@ -151,8 +146,7 @@ def shape(
         show_json(made.to_dict() | {"rate": rate, "samples": taps})
         return
     print(in_options(str(made)))
-    if out is not None:
-        print(in_options(f"written: {out}"))
+    say_written(out)
 
 
 def _written(planned: designs.PlannedMove, rate: float, path: str, *, force: bool) -> None:

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import io
-from pathlib import Path
 from typing import Annotated, Literal
 
 from typer import Option
 
 from ftlm.base.errors import ModelError
-from ftlm.base.output import COMMAND, check_free, write_atomically
+from ftlm.base.output import COMMAND, check_free
 from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show
-from ftlm.cli.options import Force, Json, Number, ReadingOptions, SavedModel, Text, Texts
-from ftlm.cli.words import in_options, numbers
+from ftlm.cli.options import Force, Json, Noise, Number, ReadingOptions, SavedModel, Text, Texts
+from ftlm.cli.words import numbers
+from ftlm.cli.written import check_ending, figure_kind, say_written, write_figure
 from ftlm.excitation import experiment
 from ftlm.model.model import load_model
 from ftlm.report import design_plots
@@ -42,9 +41,7 @@ def design_input(
     criterion: Annotated[
         Literal["D", "E"], Option(help="D: all their intervals together; E: the widest of them.")
     ] = "D",
-    noise: Annotated[
-        Texts, Option(metavar="OUTPUT=A", help="Deviation of an output's noise; default what the fit left.")
-    ] = None,
+    noise: Noise = None,
     period: Annotated[
         Number, Option(help="Of the square set beside it [s]; default a fifth of the duration.")
     ] = None,
@@ -57,11 +54,8 @@ def design_input(
 ) -> None:  # fmt: skip
     """Lay out the next experiment: the input that tells a model's numbers best within the limits of the machine."""
     check_free(out, picture, force=force, words=COMMAND)
-    if out is not None and Path(out).suffix.lower() != ".csv":
-        raise ModelError(f"{out} does not end in .csv, as a run for a rig does; name it so")
-    suffix = "" if picture is None else Path(picture).suffix.removeprefix(".").lower()
-    if picture is not None and suffix not in ("png", "pdf", "svg"):
-        raise ModelError(f"{picture} ends in {suffix or 'nothing'!r}; write .png, .pdf or .svg")
+    check_ending(out, ".csv", ", as a run for a rig does")
+    figure_kind(picture)
     loaded = load_model(model)
     run = None if like is None else reading.runs([like])[0]
     with Progress("designing", quiet=as_json) as progress:
@@ -74,14 +68,10 @@ def design_input(
     if out is not None:
         found.save(out, force=force)
     if picture is not None:
-        data = io.BytesIO()
-        design_plots.design(found).savefig(data, format=suffix, dpi=200)
-        write_atomically(picture, data.getvalue(), force=force)
+        write_figure(design_plots.design(found), picture, force=force)
     show(found, as_json=as_json)
     if not as_json:
-        for written in (out, picture):
-            if written is not None:
-                print(in_options(f"written: {written}"))
+        say_written(out, picture)
 
 
 def _sizes(option: str, given: list[str] | None) -> float | dict[str, float] | None:

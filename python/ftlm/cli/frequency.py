@@ -10,10 +10,24 @@ from typer import Argument, Option
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
 from ftlm.cli.command import command, show_json
-from ftlm.cli.options import Force, Json, Out, StructureText, Text, Texts, Verbose
+from ftlm.cli.options import (
+    Decimal,
+    Force,
+    HeaderLines,
+    Json,
+    Out,
+    Separator,
+    Sheet,
+    Skipped,
+    StructureText,
+    Text,
+    Texts,
+    Thousands,
+    Verbose,
+    layout_of,
+)
 from ftlm.cli.words import in_options, numbers, pairs, ranges
 from ftlm.data.response import FrequencyData
-from ftlm.files.layout import Layout
 from ftlm.files.response import load_frequency
 from ftlm.identification.frequency import identify_frequency as estimation
 
@@ -45,35 +59,20 @@ class ResponseOptions:
     ] = None
     output: Annotated[Text, Option("-y", "--output", metavar="NAME", help="What the response is of.")] = None
     input: Annotated[Text, Option("-u", "--input", metavar="NAME", help="What it is from.")] = None
-    separator: Annotated[
-        Literal["comma", "semicolon", "tab", "space"] | None,
-        Option(help="Between cells of text; default what is there."),
-    ] = None
-    decimal: Annotated[Literal["point", "comma"] | None, Option(help="Of numbers in text; default what is there.")] = (
-        None
-    )
-    thousands: Annotated[
-        Literal["none", "point", "comma", "space", "apostrophe"] | None,
-        Option(help="What groups thousands of numbers in text; default what is there."),
-    ] = None
-    skip: Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default what is no table.")] = None
-    header: Annotated[
-        int | None,
-        Option(metavar="0|1|2", help="Lines of header: none, names, names and units; default what is there."),
-    ] = None
-    sheet: Annotated[Text, Option(help="Sheet of a workbook that has several.")] = None
+    separator: Separator = None
+    decimal: Decimal = None
+    thousands: Thousands = None
+    skip: Skipped = None
+    header: HeaderLines = None
+    sheet: Sheet = None
 
     def load(self, file: str) -> FrequencyData:
         """The record of one file."""
-        layout = Layout(
-            separator=self.separator, decimal=self.decimal, thousands=self.thousands, skip=self.skip,
-            header=self.header, sheet=self.sheet,
-        )  # fmt: skip
         columns: dict[str, Any] | None = pairs("--column", self.columns) or None
         return load_frequency(
             file, columns=columns, frequency_unit=self.frequency_unit, magnitude_unit=self.magnitude_unit,
             phase_unit=self.phase_unit, negated=self.negated, output=self.output or "", input=self.input or "",
-            layout=layout,
+            layout=layout_of(self),
         )  # fmt: skip
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import sys
-from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
@@ -27,6 +25,7 @@ from ftlm.cli.options import (
     Texts,
 )  # fmt: skip
 from ftlm.cli.words import interval
+from ftlm.cli.written import figure_kind, write_figure
 from ftlm.model.model import load_model
 from ftlm.report import plots
 from ftlm.report.model_page import model_page
@@ -108,9 +107,7 @@ def plot(
 ) -> None:  # fmt: skip
     """Draw a saved model for a paper: its fit or residuals on runs, or its Bode plot, poles, step or impulse."""
     check_free(out, force=force, words=COMMAND)
-    suffix = Path(out).suffix.removeprefix(".").lower()
-    if suffix not in ("png", "pdf", "svg"):
-        raise ModelError(f"{out} ends in {suffix or 'nothing'!r}; write .png, .pdf or .svg")
+    figure_kind(out)
     loaded = load_model(model)
     runs = reading.runs(files)
     alone = {"bode": plots.bode, "poles": plots.poles, "step": plots.step, "impulse": plots.impulse}
@@ -124,9 +121,7 @@ def plot(
         figure = plots.residual_series(loaded.compare(runs))
     else:
         figure = plots.residuals(loaded.resid(runs))
-    data = io.BytesIO()
-    figure.savefig(data, format=suffix, dpi=200)
-    write_atomically(out, data.getvalue(), force=force)
+    write_figure(figure, out, force=force)
     tell(f"written: {out}", as_json=as_json, written=out)
 
 

@@ -13,11 +13,12 @@ from typer import Argument, Option
 from ftlm.arm.link import Law, flexible_link
 from ftlm.base.errors import DataError, ModelError
 from ftlm.cli.words import interval, numbers, pairs, ranges
+from ftlm.data.filters import SensorFilter
 from ftlm.data.language import equation
 from ftlm.data.lattice import Lattice, lattice
 from ftlm.data.run import Run
 from ftlm.data.settings import Criterion
-from ftlm.data.structures import START_WORDS, SensorFilter, Structure, check_initial
+from ftlm.data.structures import START_WORDS, Structure, check_initial
 from ftlm.files.layout import Layout
 from ftlm.files.load import load
 from ftlm.files.opened import OpenedFile, open_file
@@ -52,6 +53,28 @@ Page = Annotated[str, Option("-o", "--out", metavar="HTML", help="Page to write.
 Force = Annotated[bool, Option("--force", help="Overwrite files.")]
 Json = Annotated[bool, Option("--json", help="Results as JSON.")]
 Verbose = Annotated[bool, Option("-v", "--verbose", help="Also all that is known: both errors, searches, warnings.")]
+Noise = Annotated[Texts, Option(metavar="OUTPUT=A", help="Deviation of an output's noise; default what the fit left.")]
+#: How a file is laid out; `layout_of` a record that has some of them.
+Separator = Annotated[
+    Literal["comma", "semicolon", "tab", "space"] | None,
+    Option(help="Between cells of text; default what is there."),
+]
+Decimal = Annotated[Literal["point", "comma"] | None, Option(help="Of numbers in text; default what is there.")]
+Thousands = Annotated[
+    Literal["none", "point", "comma", "space", "apostrophe"] | None,
+    Option(help="What groups thousands of numbers in text; default what is there."),
+]
+Skipped = Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default what is no table.")]
+HeaderLines = Annotated[
+    int | None, Option(metavar="0|1|2", help="Lines of header: none, names, names and units; default what is there.")
+]
+Sheet = Annotated[Text, Option(help="Sheet of a workbook that has several.")]
+
+
+def layout_of(record: object) -> dict[str, Any]:
+    """What options say of how files are laid out; those that a record does not have are not given."""
+    said = {f.name: getattr(record, f.name, None) for f in fields(Layout)}
+    return {name: value for name, value in said.items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -83,26 +106,15 @@ class ReadingOptions:
         Option(help="weight: outputs that are not there weigh nothing; hold: inputs hold their last value besides."),
     ] = None
     encoding: Annotated[Text, Option(help="Encoding of text, such as cp1252; default what its bytes show.")] = None
-    separator: Annotated[
-        Literal["comma", "semicolon", "tab", "space"] | None,
-        Option(help="Between cells of text; default what is there."),
-    ] = None
-    decimal: Annotated[Literal["point", "comma"] | None, Option(help="Of numbers in text; default what is there.")] = (
-        None
-    )
-    thousands: Annotated[
-        Literal["none", "point", "comma", "space", "apostrophe"] | None,
-        Option(help="What groups thousands of numbers in text; default what is there."),
-    ] = None
-    skip: Annotated[int | None, Option(metavar="LINES", help="Lines above the table; default what is no table.")] = None
-    header: Annotated[
-        int | None,
-        Option(metavar="0|1|2", help="Lines of header: none, names, names and units; default what is there."),
-    ] = None
+    separator: Separator = None
+    decimal: Decimal = None
+    thousands: Thousands = None
+    skip: Skipped = None
+    header: HeaderLines = None
     dates: Annotated[
         Literal["ymd", "dmy", "mdy"] | None, Option(help="Order of day and month where dates leave it open.")
     ] = None
-    sheet: Annotated[Text, Option(help="Sheet of a workbook that has several.")] = None
+    sheet: Sheet = None
     detrend: Annotated[
         Literal["constant", "linear"] | None,
         Option(help="Subtract the mean or the straight line of every signal; --offset estimates it instead."),
@@ -119,7 +131,7 @@ class ReadingOptions:
             "time": self.time, "step": self.sampling, "inputs": pairs("-u", self.inputs),
             "outputs": pairs("-y", self.outputs), "units": pairs("--unit", self.units), "columns": self.columns,
             "time_unit": self.time_unit, "intersample": pairs("--intersample", self.between), "resample": self.resample,
-            "missing": self.missing, "layout": self.layout(),
+            "missing": self.missing, "layout": layout_of(self),
         }  # fmt: skip
         if not files:
             return []
@@ -136,10 +148,6 @@ class ReadingOptions:
                 return [run]
         return [load(f, **options) for f in files]
 
-    def layout(self) -> dict[str, Any]:
-        """What is said of how files are laid out."""
-        return {f.name: getattr(self, f.name) for f in fields(Layout) if getattr(self, f.name) is not None}
-
     def opened(self, file: str) -> OpenedFile:
         """What a file is, before it is a run."""
         if self.detrend is not None:
@@ -147,7 +155,7 @@ class ReadingOptions:
         return open_file(
             file, time=self.time, step=self.sampling, inputs=pairs("-u", self.inputs) or None,
             outputs=pairs("-y", self.outputs) or None, units=pairs("--unit", self.units), columns=self.columns,
-            time_unit=self.time_unit, intersample=pairs("--intersample", self.between), layout=self.layout(),
+            time_unit=self.time_unit, intersample=pairs("--intersample", self.between), layout=layout_of(self),
             slice=None if self.sliced is None else interval(self.sliced, "--slice", "1.1:19.5"),
             resample=self.resample, missing=self.missing,
         )  # fmt: skip

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import math
 import os
-import stat
-from pathlib import Path
 from typing import Literal, TypeAlias
 
 import msgspec
 import numpy as np
 
 from ftlm._core import __version__
+from ftlm.base.checks import words_of
 from ftlm.base.errors import DataError, FtlmError, ModelError
 from ftlm.base.output import write_atomically
+from ftlm.base.saved import Saved
 from ftlm.control.fractional import FractionalPid, Realised
 from ftlm.control.kalman import Observer
 from ftlm.control.quadratic import Lqg
 from ftlm.control.realisation import MOST, Realisation
 
-#: Largest file read: a controller of thirty states has a few tens of kilobytes.
-MAX_BYTES = 1 << 20
 SCHEMA = 1
 #: How to run either kind without ftlm.
 MEANING = {
@@ -104,6 +102,8 @@ class LqgFile(msgspec.Struct, forbid_unknown_fields=True, tag="lqg"):
                 raise ModelError(f"{name} is not finite")
         if not 0 < size <= MOST + 1:
             raise ModelError(f"{size} states are not 1 to {MOST + 1}")
+        if not 0 < len(self.poles) <= size:
+            raise ModelError(f"{len(self.poles)} poles are not those of {size} states")
         absent = [n for n in (*self.measured, self.tracked) if n not in self.outputs]
         if absent:
             raise ModelError(f"{absent[0]} is not one of its outputs")
@@ -131,6 +131,10 @@ class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
     model: str
     meaning: str
     controller: PidFile | LqgFile
+
+
+#: A controller of thirty states has a few tens of kilobytes.
+CONTROLLER = Saved("controller", "a file that ftlm control wrote", ControllerFile)
 
 
 def save_controller(
@@ -175,26 +179,12 @@ def load_controller(path: str | os.PathLike[str]) -> Realised | Lqg:
     DataError
         A file that cannot be read, or is no controller of this version.
     """
-    file = Path(path)
-    try:
-        state = file.stat()
-        if not stat.S_ISREG(state.st_mode):
-            raise DataError(f"{file} is no regular file; give a file that ftlm control wrote")
-        if state.st_size > MAX_BYTES:
-            raise DataError(f"{file} has {state.st_size} bytes, no controller is larger than {MAX_BYTES}")
-        read = msgspec.json.decode(file.read_bytes(), type=ControllerFile)
-    except OSError as error:
-        raise DataError(f"controller {file} cannot be read: {error.strerror or error}; check the path") from error
-    except DataError:
-        raise
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise DataError(f"{file} is no ftlm controller: {error}; give a file that ftlm control wrote") from error
-    if read.schema != SCHEMA:
-        raise DataError(f"{file} has schema {read.schema}, this version reads {SCHEMA}; upgrade ftlm")
+    read = CONTROLLER.read(path)
+    CONTROLLER.check_schema(path, read, SCHEMA)
     try:
         return read.controller.controller()
     except (FtlmError, ValueError) as error:
-        raise DataError(f"{file} is damaged: {error}; write it again") from error
+        raise DataError(f"{path} is damaged: {words_of(error)}; write it again") from error
 
 
 def _limit(value: float) -> float | None:

@@ -11,7 +11,7 @@ import numpy as np
 from ftlm.base.arrays import Complex, Floats
 from ftlm.base.checks import real_number, shown, whole_number
 from ftlm.base.errors import ModelError
-from ftlm.control.names import checked_rate
+from ftlm.control.names import checked_rate, largest
 from ftlm.solve.approximation import LARGEST_ORDER, oustaloup
 
 #: Poles reach this many times beyond the band on both sides.
@@ -120,9 +120,7 @@ class Realised:
             if given > 1:
                 raise ModelError(f"{name} = {given:g} cannot be realised; give a controller whose orders are at most 1")
         value = checked_rate(rate)
-        most = real_number("limit", limit)
-        if not most > 0:
-            raise ModelError(f"limit = {shown(limit)} is not a number above 0")
+        most = largest(limit)
         half = math.pi * value
         if band is None:
             band = (half / 1000.0, half / 8.0)

@@ -21,6 +21,11 @@ class HubLoops:
     first, second
         Of hub 1 and hub 2: a :class:`Realised`, called with reference less hub angle [rad], or an :class:`Lqg`, which
         reads the angles that it names; None leaves a hub without current.
+
+    Raises
+    ------
+    ModelError
+        What is neither, or a controller that reads what the arm does not measure.
     """
 
     def __init__(self, first: Realised | Lqg | None, second: Realised | Lqg | None = None) -> None:

@@ -10,14 +10,14 @@ import msgspec
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import nearest
+from ftlm.base.checks import nearest, shown
 from ftlm.base.errors import DataError, ModelError
 from ftlm.control.margins import Plant
 from ftlm.control.names import names_of, positive
 from ftlm.control.pid import plant_of
-from ftlm.control.realisation import Realisation, python_control, realised
+from ftlm.control.realisation import Realisation, python_control, realised, solving
 from ftlm.data.run import Run
-from ftlm.data.solved import Solved
+from ftlm.data.solved import Solved, check_solved
 
 #: What an observer calls the unknown part of its input.
 UNKNOWN = "unknown input"
@@ -157,6 +157,7 @@ def observer(
 
 def plants_of(model: Solved, driver: str | None, rate: float, coupling: str, *, sensor: bool) -> list[Plant]:
     """A stable model's outputs from one input; refuses the others."""
+    check_solved(model)
     plants = [plant_of(model, o, driver, rate, coupling, sensor=sensor) for o in model.outputs]
     plants[0].check_stable()
     reached = [p for p in plants if p.reached()]
@@ -175,14 +176,11 @@ def filtered(realisation: Realisation, measured: tuple[str, ...], noise: tuple[f
     inside[:-1, :-1] = b[:-1] @ b[:-1].T * drift**2
     inside[-1, -1] = drift**2 * step
     outside = np.diag(np.square(noise))
-    try:
+    with solving(f"no observer from {', '.join(measured)}", "measure more, or narrow the band"):
         _, spread, _ = python_control().dlqe(a, np.eye(len(a)), c, inside, outside)
         gain = np.linalg.solve(c @ spread @ c.T + outside, c @ spread).T
         left = spread - gain @ c @ spread
         good = bool(np.isfinite(gain).all())
-    except (np.linalg.LinAlgError, ValueError) as error:
-        words = f"no observer from {', '.join(measured)} ({error}); measure more, or narrow the band"
-        raise ModelError(words) from None
     if not good or np.max(np.abs(np.linalg.eigvals(a - a @ gain @ c))) >= 1.0:
         raise ModelError(
             f"no observer from {', '.join(measured)} comes to rest: they do not tell all states; measure more outputs"
@@ -195,10 +193,11 @@ def filtered(realisation: Realisation, measured: tuple[str, ...], noise: tuple[f
 def noises(model: Solved, measured: tuple[str, ...], given: Mapping[str, float] | None) -> tuple[float, ...]:
     """Deviation of the noise of each measured output."""
     if given is not None and not isinstance(given, Mapping):
-        raise ModelError(f"noise = {given!r} is no mapping from outputs to standard deviations")
+        raise ModelError(f"noise = {shown(given)} is no mapping from outputs to standard deviations")
     for name in given or {}:
         if name not in measured:
-            raise ModelError(f"noise of {name!r} is of nothing that is measured{nearest(name, measured)}")
+            near = nearest(name, measured) if isinstance(name, str) else ""
+            raise ModelError(f"noise of {shown(name)} is of nothing that is measured{near}")
     free = msgspec.UNSET if model.estimate is None else model.estimate.free
     left = {} if free is msgspec.UNSET else dict(free.noise)
     out = []

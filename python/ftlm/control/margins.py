@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -60,12 +59,43 @@ class Margins:
         )
 
 
-def margins_told(nominal: Margins, samples: Sequence[Margins]) -> dict[str, Any]:
-    """Margins at the values and over samples, for JSON."""
-    told = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (nominal, *samples)]
-    for one in told:
-        one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
-    return {"nominal": told[0], "samples": told[1:]}
+class JudgedLoop:
+    """What is told of a loop: its margins at the values of a model's numbers, and at samples of them."""
+
+    nominal: Margins
+    samples: tuple[Margins, ...]
+
+    @property
+    def kept(self) -> float:
+        """Share of the samples whose loop is stable; 1 where there are none."""
+        return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
+
+    def within(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
+        """Where 95 % of the samples have a margin."""
+        if not self.samples:
+            value = getattr(self.nominal, what)
+            return value, value
+        low, high = np.quantile([getattr(m, what) for m in self.samples], [0.025, 0.975])
+        return float(low), float(high)
+
+    def _margins(self) -> dict[str, Any]:
+        """Margins at the values and over samples, for JSON."""
+        told = [{f.name: getattr(m, f.name) for f in fields(m)} for m in (self.nominal, *self.samples)]
+        for one in told:
+            one |= {n: v if math.isfinite(v) else None for n, v in one.items()}
+        return {"nominal": told[0], "samples": told[1:]}
+
+    def _judged(self) -> list[str]:
+        """Lines that say so."""
+        lines = [f"at the values: {self.nominal}"]
+        if self.samples:
+            phase, gain, peak = (self.within(n) for n in ("phase", "gain", "sensitivity"))
+            lines.append(
+                f"over the intervals ({len(self.samples)} samples, {100 * self.kept:.0f} % stable), 95 % between: "
+                f"phase margin {phase[0]:.3g} and {phase[1]:.3g} degrees, gain margin {gain[0]:.3g} and {gain[1]:.3g}, "
+                f"largest sensitivity {peak[0]:.3g} and {peak[1]:.3g}"
+            )
+        return lines
 
 
 @dataclass(frozen=True)

@@ -9,11 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import nearest, real_number, shown, whole_number
+from ftlm.base.checks import nearest, real_number, shown
 from ftlm.base.errors import ModelError
 from ftlm.control.fractional import FractionalPid, Realised
-from ftlm.control.margins import Margins, Plant, grid, margins_of, margins_told
-from ftlm.control.names import checked_rate
+from ftlm.control.margins import JudgedLoop, Margins, Plant, grid, margins_of
+from ftlm.control.names import checked_rate, drawn_from
 from ftlm.data.solved import Solved, check_solved
 from ftlm.solve.frequency import check_unlimited, is_coupled, model_numbers, response_inputs
 from ftlm.solve.records import check_linear
@@ -38,7 +38,7 @@ FLAT = (0.7, 1.4)
 
 
 @dataclass(frozen=True)
-class PidDesign:
+class PidDesign(JudgedLoop):
     """A fractional PID with the margins of its loop.
 
     Parameters
@@ -69,33 +69,13 @@ class PidDesign:
         response = Realised(self.pid, self.rate).response(w)
         return (self.plants[0].output,), response[None], response
 
-    @property
-    def kept(self) -> float:
-        """Share of the samples whose loop is stable; 1 where there are none."""
-        return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
-
-    def within(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
-        """Where 95 % of the samples have a margin."""
-        if not self.samples:
-            value = getattr(self.nominal, what)
-            return value, value
-        low, high = np.quantile([getattr(m, what) for m in self.samples], [0.025, 0.975])
-        return float(low), float(high)
-
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         return {"design": "pid", "rate": self.rate, **self.pid.to_dict(), "phase_margin_at_gains": list(self.flat),
-                **margins_told(self.nominal, self.samples)}  # fmt: skip
+                **self._margins()}  # fmt: skip
 
     def __str__(self) -> str:
-        lines = [f"fractional PID: {self.pid}", f"at the values: {self.nominal}"]
-        if self.samples:
-            phase, gain, peak = (self.within(n) for n in ("phase", "gain", "sensitivity"))
-            lines.append(
-                f"over the intervals ({len(self.samples)} samples, {100 * self.kept:.0f} % stable), 95 % between: "
-                f"phase margin {phase[0]:.3g} and {phase[1]:.3g} degrees, gain margin {gain[0]:.3g} and {gain[1]:.3g}, "
-                f"largest sensitivity {peak[0]:.3g} and {peak[1]:.3g}"
-            )
+        lines = [f"fractional PID: {self.pid}", *self._judged()]
         lines.append("phase margin with {:g}, 1, {:g} of the plant's gain: ".format(*FLAT)
                      + ", ".join(f"{p:.3g}" for p in self.flat) + " degrees")  # fmt: skip
         return "\n".join(lines)
@@ -157,11 +137,7 @@ def fractional_pid(
     asked = real_number("phase_margin", phase_margin)
     if not 10 <= asked <= 80:
         raise ModelError(f"phase_margin = {shown(phase_margin)} degrees is outside [10, 80]")
-    count, start = whole_number(samples), whole_number(seed)
-    if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
-    if start is None or start < 0:
-        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
+    count, start = drawn_from(samples, seed)
     plant.check_stable()
     drawn = plant.samples(count, start)
     target = np.exp(1j * (math.radians(asked) - math.pi)) / plant.response(np.array([wc]))[0]

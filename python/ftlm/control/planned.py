@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import real_number, shown, whole_number
+from ftlm.base.checks import real_number, shown
 from ftlm.base.errors import DataError, ModelError
-from ftlm.control.margins import Plant
-from ftlm.control.names import positive, sums
+from ftlm.control.margins import JudgedLoop, Plant
+from ftlm.control.names import SIZES, drawn_from, largest, positive, sums
 from ftlm.control.pid import known_least
 from ftlm.data.solved import Solved
 
@@ -163,15 +163,11 @@ def inverse(
     In the frequency domain, where a tip that first moves backwards has a bounded inverse, which begins before the path
     does: Bayo (1987), doi:10.1002/rob.4620040406.
     """
+    if not isinstance(design, JudgedLoop):
+        raise ModelError(f"design is a {type(design).__name__}, no PidDesign or LqgDesign; design a loop first")
     rows = _path(path)
-    count, start = whole_number(samples), whole_number(seed)
-    if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
-    if start is None or start < 0:
-        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
-    most = real_number("limit", limit)
-    if not most > 0:
-        raise ModelError(f"limit = {shown(limit)} is not a number above 0")
+    count, start = drawn_from(samples, seed)
+    most = largest(limit)
     names = tuple(p.output for p in design.plants)
     row = sums("of", names[0] if of is None and len(names) == 1 else of, names)
     size = 1 << math.ceil(math.log2(LONGER * len(rows)))
@@ -249,7 +245,10 @@ def _path(path: ArrayLike) -> Floats:
     bad = np.flatnonzero(~np.isfinite(rows))
     if bad.size:
         raise DataError(f"path is not finite at row {bad[0]} ({bad.size} such rows in all)")
-    if np.ptp(rows) == 0:
+    large = np.flatnonzero(np.abs(rows) > SIZES[1])
+    if large.size:
+        raise DataError(f"path is beyond {SIZES[1]:g} at row {large[0]} ({large.size} such rows in all); scale it")
+    if np.ptp(rows) < SIZES[0]:
         raise DataError("path stands still: there is nothing to follow")
     for where, pair in (("begin", rows[:2]), ("end", rows[-2:])):
         if abs(pair[1] - pair[0]) > UNREST * np.ptp(rows):

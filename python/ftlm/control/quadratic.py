@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import real_number, shown, whole_number
+from ftlm.base.checks import shown
 from ftlm.base.errors import ModelError
 from ftlm.control.kalman import UNKNOWN, Observer, filtered, noises, plants_of
-from ftlm.control.margins import Margins, Plant, margins_of, margins_told
-from ftlm.control.names import names_of, positive, sums
+from ftlm.control.margins import JudgedLoop, Margins, Plant, margins_of
+from ftlm.control.names import drawn_from, largest, names_of, positive, sums
 from ftlm.control.pid import BROKEN, known_least
-from ftlm.control.realisation import Realisation, python_control, realised
+from ftlm.control.realisation import Realisation, python_control, realised, solving
 from ftlm.data.solved import Solved
 
 #: Largest sensitivity of a loop that is a design: a phase margin of 19 degrees and gain margins of 1.5 at least.
@@ -44,13 +44,16 @@ class Lqg:
         The output that follows the reference.
     limit
         Largest command.
+
+    Raises
+    ------
+    ModelError
+        Feedback of another shape or that is not finite, a limit that is not above 0, an output that cannot be held;
+        when it is called, a command that is no number.
     """
 
     def __init__(self, observer: Observer, feedback: ArrayLike, tracked: str, *, limit: float = math.inf) -> None:
-        most = real_number("limit", limit)
-        if not most > 0:
-            raise ModelError(f"limit = {shown(limit)} is not a number above 0")
-        self.observer, self.tracked, self.limit = observer, tracked, most
+        self.observer, self.tracked, self.limit = observer, tracked, largest(limit)
         realisation = observer.realisation
         self.rate = realisation.rate
         gains = np.array(feedback, dtype=np.float64).reshape(1, -1)
@@ -84,11 +87,16 @@ class Lqg:
     def __call__(self, measured: Sequence[float] | Floats, reference: float) -> float:
         """The command for what is measured at a sample, in the observer's order, and what is asked for."""
         y = np.asarray(measured, dtype=np.float64)
-        if self._states is None:
-            self._states = np.append(self.observer.rest(y), 0.0)
-        corrected = self._states + self.observer.gain @ (y - self._c @ self._states)
-        self._states = self._a @ corrected + self._b[:, 0] * self._applied
-        command = self.ahead * reference - float(self._gains[0] @ self._states)
+        with np.errstate(over="ignore", invalid="ignore"):
+            if self._states is None:
+                self._states = np.append(self.observer.rest(y), 0.0)
+            corrected = self._states + self.observer.gain @ (y - self._c @ self._states)
+            self._states = self._a @ corrected + self._b[:, 0] * self._applied
+            command = self.ahead * reference - float(self._gains[0] @ self._states)
+        if not math.isfinite(command):
+            raise ModelError(
+                f"the command is {command}, which no machine takes: what is measured, asked for or held is not finite"
+            )
         self._applied = min(max(command, -self.limit), self.limit)
         return self._applied
 
@@ -130,7 +138,7 @@ class Lqg:
 
 
 @dataclass(frozen=True)
-class LqgDesign:
+class LqgDesign(JudgedLoop):
     """A linear-quadratic controller with the margins of its loop on the exact model.
 
     Parameters
@@ -158,19 +166,6 @@ class LqgDesign:
         """Of the loop [Hz]."""
         return self.realisation.rate
 
-    @property
-    def kept(self) -> float:
-        """Share of the samples whose loop is stable; 1 where there are none."""
-        return sum(m.stable for m in self.samples) / len(self.samples) if self.samples else 1.0
-
-    def within(self, what: Literal["crossover", "phase", "gain", "sensitivity"]) -> tuple[float, float]:
-        """Where 95 % of the samples have a margin."""
-        if not self.samples:
-            value = getattr(self.nominal, what)
-            return value, value
-        low, high = np.quantile([getattr(m, what) for m in self.samples], [0.025, 0.975])
-        return float(low), float(high)
-
     def acting(self, w: Floats | Complex) -> tuple[tuple[str, ...], Complex, Complex]:
         """Outputs it reads, its response to each of them and to the reference, at frequencies [rad/s]."""
         heard, asked = self.controller.response(w)
@@ -187,18 +182,11 @@ class LqgDesign:
             "design": "lqg", "rate": self.rate, "input": made.input, "tracked": self.controller.tracked,
             "measured": list(self.controller.observer.measured), "states": made.states, "band": list(made.band),
             "gain_error_db": made.gain_error, "phase_error_degrees": made.phase_error,
-            **margins_told(self.nominal, self.samples),
+            **self._margins(),
         }  # fmt: skip
 
     def __str__(self) -> str:
-        lines = [str(self.controller), f"realised by {self.realisation}", f"at the values: {self.nominal}"]
-        if self.samples:
-            phase, gain, peak = (self.within(n) for n in ("phase", "gain", "sensitivity"))
-            lines.append(
-                f"over the intervals ({len(self.samples)} samples, {100 * self.kept:.0f} % stable), 95 % between: "
-                f"phase margin {phase[0]:.3g} and {phase[1]:.3g} degrees, gain margin {gain[0]:.3g} and {gain[1]:.3g}, "
-                f"largest sensitivity {peak[0]:.3g} and {peak[1]:.3g}"
-            )
+        lines = [str(self.controller), f"realised by {self.realisation}", *self._judged()]
         return "\n".join(lines)
 
 
@@ -249,11 +237,7 @@ def lqg(
     have no guaranteed margins: Doyle (1978), doi:10.1109/TAC.1978.1101812. So they are judged by the argument principle
     on the exact response.
     """
-    count, start = whole_number(samples), whole_number(seed)
-    if count is None or not 0 <= count <= 10_000:
-        raise ModelError(f"samples = {shown(samples)} is no whole number from 0 to 10000")
-    if start is None or start < 0:
-        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
+    count, start = drawn_from(samples, seed)
     dear = positive("effort", effort)
     walks = 0.2 * dear if drift is None else positive("drift", drift)
     plants = plants_of(model, input, rate, coupling, sensor=sensor)
@@ -266,10 +250,8 @@ def lqg(
     c = realisation.c
     cost = sum(np.outer(row @ c, row @ c) / size**2 for row, size in weights)
     no = "no state feedback brings the model to rest; allow for deviations of every output that integrates"
-    try:
+    with solving(*no.split("; ")):
         gains, _, own = python_control().dlqr(realisation.a, realisation.b, cost, np.eye(1) / dear**2)
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise ModelError(f"{no} ({error})") from None
     if np.max(np.abs(own)) >= 1.0 - AT_ONE:
         raise ModelError(no)
     controller = Lqg(seen, gains, tracked, limit=limit)
@@ -315,16 +297,16 @@ def _weights(allowed: Mapping[str, float], names: tuple[str, ...]) -> list[tuple
     """Rows of outputs that are summed up, and the deviations that are allowed for."""
     if not isinstance(allowed, Mapping) or not allowed:
         raise ModelError(
-            f"allowed = {allowed!r} is no mapping from outputs, or sums of them, to deviations; give such as "
+            f"allowed = {shown(allowed)} is no mapping from outputs, or sums of them, to deviations; give such as "
             f"{{{names[0]!r}: 0.01}}"
         )
-    return [(sums("allowed", text, names), positive(f"allowed[{text!r}]", size)) for text, size in allowed.items()]
+    return [(sums("allowed", text, names), positive(f"allowed[{shown(text)}]", size)) for text, size in allowed.items()]
 
 
 def _equilibrium(realisation: Realisation, tracked: str) -> Floats:
     """States and input at rest with the tracked output at 1."""
     if tracked not in realisation.outputs:
-        raise ModelError(f"tracked = {tracked!r} is not one of the outputs {', '.join(realisation.outputs)}")
+        raise ModelError(f"tracked = {shown(tracked)} is not one of the outputs {', '.join(realisation.outputs)}")
     size = realisation.states
     matrix = np.zeros((size + 1, size + 1))
     matrix[:size, :size] = realisation.a - np.eye(size)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ftlm.base.arrays import Complex, Floats
-from ftlm.base.checks import real_number, shown, whole_number
+from ftlm.base.checks import real_number, shown, whole_number, words_of
 from ftlm.base.errors import ModelError
 from ftlm.control.margins import Plant
 from ftlm.solve.modes import modes
@@ -90,7 +92,7 @@ def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: i
     plants
         Of one model, input and rate: one for each output.
     band
-        Frequencies (low, high) [rad/s]; default from a thousandth to a quarter of half the rate.
+        Frequencies (low, high) [rad/s]; default from a five-thousandth to an eighth of half the rate.
     poles
         Their number besides that of an integral; default as many as bring the error below 0.1 dB and 1 degree.
 
@@ -114,13 +116,15 @@ def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: i
         counts = [count]
     library = python_control()
     w = np.geomspace(low, high, FITTED)
-    exact = np.array([p.exact(w) for p in plants])
+    with solving(f"no response from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
+        exact = np.array([p.exact(w) for p in plants])
     own = [m.pole for m in modes(plants[0].model, coupling=plants[0].coupling) if m.swings and low < m.frequency < high]
     integrates = [p.integrates() > 0.5 for p in plants]
     best: Realisation | None = None
     for count in counts:
-        found = _fit(np.asarray(1j * w, dtype=np.complex128), exact, integrates, _begun(own, low, high, count))
-        made = _sampled(library, plants, (low, high), *found)
+        with solving(f"no {count} poles from {low:.3g} to {high:.3g} rad/s", "use a narrower band"):
+            found = _fit(np.asarray(1j * w, dtype=np.complex128), exact, integrates, _begun(own, low, high, count))
+            made = _sampled(library, plants, (low, high), *found)
         if best is None or _worst(made) < _worst(best):
             best = made
         if _worst(best) <= 1.0:
@@ -134,6 +138,20 @@ def realised(plants: Sequence[Plant], band: tuple[float, float] | None, poles: i
             + ("" if poles is None else ", or more poles")
         )
     return best
+
+
+@contextmanager
+def solving(what: str, way_out: str) -> Iterator[None]:
+    """Put into words what floating point does not carry: numbers beyond it, matrices that are singular in it."""
+    with np.errstate(over="raise", divide="raise", invalid="raise"), warnings.catch_warnings():
+        # SciPy warns of a matrix whose solution has no digits.
+        warnings.simplefilter("error", RuntimeWarning)
+        try:
+            yield
+        except ModelError:
+            raise
+        except (np.linalg.LinAlgError, ArithmeticError, ValueError, RuntimeWarning) as error:
+            raise ModelError(f"{what} ({words_of(error, 200)}); {way_out}") from None
 
 
 def python_control() -> Any:
@@ -151,7 +169,7 @@ def _band(band: tuple[float, float] | None, rate: float) -> tuple[float, float]:
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
-        raise ModelError(f"band = {band!r} is no pair of frequencies; give (low, high) in rad/s") from None
+        raise ModelError(f"band = {shown(band)} is no pair of frequencies; give (low, high) in rad/s") from None
     if not (math.isfinite(low) and 0 < low < high <= half / 2):
         raise ModelError(
             f"band = ({low:g}, {high:g}) rad/s is no interval up to a quarter of the rate, {half / 2:g} rad/s"

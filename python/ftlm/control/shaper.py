@@ -57,7 +57,15 @@ class Shaper:
         return self.times[-1]
 
     def residual(self, frequency: ArrayLike, damping: ArrayLike) -> Floats:
-        """Share of the vibration that is left of a step on a mode of this frequency [rad/s] and damping ratio."""
+        """Share of the vibration that is left of a step on a mode.
+
+        Parameters
+        ----------
+        frequency
+            Of the mode, undamped [rad/s].
+        damping
+            Its ratio.
+        """
         return left_over(np.array(self.times), np.array(self.amplitudes), frequency, damping)
 
     def impulses(self, rate: float) -> Floats:
@@ -94,6 +102,13 @@ class Shaper:
         """A reference, or an input, of one row a sample at a rate [Hz] through the shaper; it is as long as before.
 
         What was before the first row is the first row. Where it ends the shaper is `delay` behind: let it end at rest.
+
+        Parameters
+        ----------
+        reference
+            One row a sample.
+        rate
+            Samples per second.
 
         Raises
         ------

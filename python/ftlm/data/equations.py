@@ -204,6 +204,11 @@ class Equation:
     coulomb
         Friction of the output's own velocity, of Coulomb and near rest of Stribeck, if there is some; alpha then lies
         in (1, 2], and every order below alpha.
+
+    Raises
+    ------
+    ModelError
+        No term, a coefficient that stands twice, an order or a number out of its range.
     """
 
     output: str

@@ -13,9 +13,10 @@ from msgspec import UNSET
 from ftlm.base.checks import check_known, real_number
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation, Friction, Stribeck, Term
+from ftlm.data.filters import SensorFilter
 from ftlm.data.limits import SHORT, Limit, LimitLaw, Value, in_order
 from ftlm.data.orders import Order, Values
-from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial, check_offset
+from ftlm.data.structures import Offset, Structure, check_initial, check_offset
 
 NAME = r"[^\W\d]\w*"
 #: What words may say of an input.

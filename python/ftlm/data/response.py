@@ -125,7 +125,12 @@ class FrequencyData:
         return out
 
     def slice(self, low: float | None = None, high: float | None = None) -> FrequencyData:
-        """Only what was measured from one angular frequency to another [rad/s], both included.
+        """Only what was measured from one angular frequency to another, both included.
+
+        Parameters
+        ----------
+        low, high
+            Ends [rad/s]; by default the first and the last.
 
         Raises
         ------

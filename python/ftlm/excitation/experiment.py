@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import nearest, real_number, shown, whole_number
+from ftlm.base.checks import check_seed, nearest, real_number, shown
 from ftlm.base.errors import DataError, FtlmError, ModelError
 from ftlm.base.progress import Course
 from ftlm.base.statistics import NORMAL_95
@@ -241,8 +241,7 @@ def _wanted(
         raise ModelError(f"criterion = {shown(criterion)} is not known; use 'D' (all intervals) or 'E' (the widest)")
     # An order is of size 1 by itself; what else is known, is known as a share of itself.
     units = [1.0 if laid.names[i] in laid.problem.orders else abs(laid.values[i]) or 1.0 for i in at]
-    if whole_number(seed) is None or int(seed) < 0:
-        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
+    begun = check_seed(seed)
     every = round(_positive("period", length / PERIODS if period is None else period, "a time [s]") / time)
     if not 2 <= every <= 2 * rows:
         raise ModelError(f"period = {period:g} s is not between two steps and twice the run; give another one")
@@ -254,7 +253,7 @@ def _wanted(
         else ("predicted for white noise, and of the model it is said: " + colour,)
     )
     return Wanted(
-        laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, int(seed), words
+        laid, time, rows, bounds, Criterion("D" if criterion == "D" else "E", at, tuple(units)), every, begun, words
     )
 
 

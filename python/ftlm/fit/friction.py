@@ -62,13 +62,13 @@ def race_with_friction(
         for attempt in reached[:FINALISTS]:
             values = dict(zip(less.names, attempt.values.tolist(), strict=True))
             starts += falling(coarse, values, attempt.origin)
-        return raced(coarse, starts, threads)
+        return on_coarse_grids(coarse, starts, threads)
     if 1 < len(rubbing(structure)) < len(structure.equations):
         # What hangs on them is told from its own equation; that of a body, driven by all that hangs on it, may be
         # explained by what they tell of its motion.
         for orders in skeletons(problem):
             starts += carrying(problem, runs, hanging(alike, orders, floor, threads), together=False)
-        return raced(coarse, starts, threads)
+        return on_coarse_grids(coarse, starts, threads)
     # Driven by measured signals, each of several bodies is told from its own equation, whatever the others do.
     signed = FreeProblem.of(replace(with_measured_sign(structure), coupling="measured"))
     reached = race(replace(alike, problem=signed), floor, threads, progress)
@@ -78,7 +78,7 @@ def race_with_friction(
     if len(structure.equations) > 1 and reached:
         values = dict(zip(signed.names, reached[0].values.tolist(), strict=True))
         starts += carrying(problem, runs, {**values, **signed.named(reached[0].coefficients)})
-    return raced(coarse, starts, threads)
+    return on_coarse_grids(coarse, starts, threads)
 
 
 def rubbing(structure: Structure) -> list[tuple[Equation, Friction]]:
@@ -186,7 +186,7 @@ def reacting(structure: Structure, item: Equation, values: dict[str, float], sha
     return out
 
 
-def raced(coarse: Grid, starts: list[Attempt], threads: int) -> list[Attempt]:
+def on_coarse_grids(coarse: Grid, starts: list[Attempt], threads: int) -> list[Attempt]:
     """Where starts get on coarse grids, best first."""
     laps = Laps(len(starts), threads, None)
     ended = laps.run(coarse, starts, FIRST_LAP)

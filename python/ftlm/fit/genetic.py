@@ -55,6 +55,12 @@ class Genetic:
     bounds
         (low, high) of coefficients by name. By default ±2 times the value that the maker states, or else ±4 times the
         coefficient with which its term alone would be as large as the output, at the middle of the orders' intervals.
+
+    Raises
+    ------
+    ModelError
+        Seeds that are none, a population outside [8, 100000], evaluations of less than two generations, bounds that are
+        no interval.
     """
 
     seeds: Sequence[int] = (0, 1, 2)

@@ -9,11 +9,11 @@ from functools import partial
 import numpy as np
 
 from ftlm.base.errors import FtlmError
+from ftlm.base.progress import Course
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss
 from ftlm.data.structures import History, Initial, Structure
-from ftlm.fit.grid import Attempt
-from ftlm.fit.joint import JointFit, fit_output_error
+from ftlm.fit.joint import RACED, SWEEP, JointFit, Outset, Race, fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.motion import has_memory, history, misfit, needed, together
 from ftlm.solve.past import in_motion
@@ -32,7 +32,7 @@ def fit_any_start(
     history makes them much better. Which terms were fitted is in the result.
     """
 
-    def fitted(initial: Initial, *, refine: bool = True, raced: list[Attempt] | None = None) -> JointFit:
+    def fitted(initial: Initial, *, refine: bool = True, raced: Race | None = None) -> JointFit:
         asked = replace(structure, initial=initial)
         begun = partial(fit_output_error, start=known[0]) if alone else partial(fit_output_error, known=known)
         return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, raced=raced)
@@ -41,7 +41,8 @@ def fit_any_start(
     if not decided and isinstance(start, History):
         # Where few terms are enough on the first grid, finer ones are for them alone: what a coarse grid leaves asks
         # for more terms, not for fewer.
-        raced: list[Attempt] = []
+        outset = Outset.of(runs, replace(structure, initial=start))
+        raced = None if alone else outset.race(threads, Course(progress).until(RACED, SWEEP))
         many = fitted(start, refine=False, raced=raced)
         kept = _shorter(many, runs, structure, loss, refine=False)
         if kept.growth is None and many.growth is None:

@@ -11,6 +11,7 @@ import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -35,6 +36,8 @@ from ftlm.fit.twins import twin_words
 from ftlm.fit.uncertainty import covariance, deviation
 from ftlm.solve.instants import compared_values
 
+#: Share of a fit's course at whose end the race is, and of what is left of that what each of its sweeps takes.
+RACED, SWEEP = 0.5, 0.3
 #: Residual that costs 1 in a coarse fit, as a share of an output's size.
 COARSE_SHARE = 0.01
 #: Evaluations of each finalist on all samples, and of what is left then.
@@ -176,19 +179,70 @@ class JointFit:
         return scaled
 
 
+@dataclass(frozen=True)
+class Race:
+    """Where starts got on thinned samples, best first: fits of the same structure to the same runs go on from there."""
+
+    reached: Sequence[Attempt]
+
+
+@dataclass(frozen=True)
+class Outset:
+    """What is known before a first descent: the problem on its runs, and the size of each output."""
+
+    problem: FreeProblem
+    runs: Sequence[Run]
+    sizes: Sequence[float]
+
+    @classmethod
+    def of(cls, runs: Sequence[Run], structure: Structure) -> Outset:
+        """Of runs that tell the free numbers of a structure; the errors are those of :func:`fit_output_error`."""
+        problem, outputs = FreeProblem.of(structure), structure.outputs
+        samples = sum(max(read(compared_values(run, structure, o)).size - 2, 0) for run in runs for o in outputs)
+        if samples <= len(problem.names):
+            raise DataError(
+                f"{samples} samples between the first and the last do not tell {len(problem.names)} free numbers; use "
+                "longer runs, or fix orders or coefficients"
+            )
+        sizes = [math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in outputs]
+        return cls(problem, runs, sizes)
+
+    @cached_property
+    def noise(self) -> list[float]:
+        """A first guess of each output's."""
+        structure = self.problem.structure
+        outputs = zip(structure.outputs, self.sizes, strict=True)
+        return [first_noise(self.runs, structure, output, size) for output, size in outputs]
+
+    @property
+    def alike(self) -> Grid:
+        """Every output weighing alike: noise decides where the optimum is, not how to get near it."""
+        return Grid(self.problem, self.runs, [1.0 / (COARSE_SHARE * size) for size in self.sizes])
+
+    @property
+    def weighed(self) -> Grid:
+        """Every output weighed by its noise."""
+        return Grid(self.problem, self.runs, [1.0 / noise for noise in self.noise])
+
+    def race(self, threads: int, progress: Callable[[int, int], None] | None) -> Race:
+        """Where the starts of this problem get."""
+        shares = [noise / (COARSE_SHARE * size) for noise, size in zip(self.noise, self.sizes, strict=True)]
+        runners = race_with_friction if self.problem.structure.has_friction else race
+        return Race(runners(self.alike, float(np.mean([share**2 for share in shares])), threads, progress))
+
+
 def fit_output_error(
     runs: Sequence[Run], structure: Structure, *, threads: int = 1, start: Mapping[str, float] | None = None,
     refine: bool = True, progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
-    known: Sequence[Mapping[str, float]] = (), near: JointFit | None = None, raced: list[Attempt] | None = None,
+    known: Sequence[Mapping[str, float]] = (), near: JointFit | None = None, raced: Race | None = None,
 ) -> JointFit:  # fmt: skip
     """Fit all equations of a structure on all runs by output error, from an automatic start.
 
     A coefficient law that the structure states is imposed; its initial terms must be decided. A start gives values of
     everything free by name, and is the only one; known ones stand beside the automatic ones; `near` is a fit of the
-    same structure to nearly the same runs, to go on from on its grid and with its weights. What a race reached is put
-    into `raced`, and taken from there where the same fit is made again or gone on with. Without `refine` the grid is
-    not refined below the samples. Progress is told (starts done, starts in all). The loss decides between optima on
-    all samples, not between starts.
+    same structure to nearly the same runs, to go on from on its grid and with its weights; `raced` is the race of its
+    starts where that was run already. Without `refine` the grid is not refined below the samples. Progress is told
+    (starts done, starts in all). The loss decides between optima on all samples, not between starts.
 
     Raises
     ------
@@ -197,30 +251,16 @@ def fit_output_error(
     ConvergenceError
         No start has a finite free run.
     """
-    problem, outputs = FreeProblem.of(structure), structure.outputs
-    samples = sum(max(read(compared_values(run, structure, o)).size - 2, 0) for run in runs for o in outputs)
-    if samples <= len(problem.names):
-        raise DataError(
-            f"{samples} samples between the first and the last do not tell {len(problem.names)} free numbers; use "
-            "longer runs, or fix orders or coefficients"
-        )
-    sizes = {o: math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in outputs}
+    outset = Outset.of(runs, structure)
+    problem, outputs = outset.problem, structure.outputs
     if near is not None:
         attempt = given(problem, dict(zip(near.names, near.values.tolist(), strict=True)))
         grid = Grid(problem, runs, [1.0 / max(near.noise[o], 1e-300) for o in outputs], near.refinement)
-        return ended(*with_settled_weights(attempt, grid, loss), raced or [], loss, refine=refine)
-    noise = {o: first_noise(runs, structure, o, sizes[o]) for o in outputs}
-    # Starts are compared with every output weighing alike: noise decides where the optimum is, not how to get near it.
-    alike = Grid(problem, runs, [1.0 / (COARSE_SHARE * sizes[o]) for o in outputs])
-    weighed = Grid(problem, runs, [1.0 / noise[o] for o in outputs])
+        return ended(*with_settled_weights(attempt, grid, loss), raced.reached if raced else (), loss, refine=refine)
     course = Course(progress)
-    reached: list[Attempt] = []
+    reached: Sequence[Attempt] = ()
     if start is None:
-        floor = float(np.mean([(noise[o] / (COARSE_SHARE * sizes[o])) ** 2 for o in outputs]))
-        runners = race_with_friction if structure.has_friction else race
-        reached = raced or runners(alike, floor, threads, course.until(0.5, 0.3))
-        if raced is not None:
-            raced[:] = reached
+        reached = (raced or outset.race(threads, course.until(RACED, SWEEP))).reached
         contenders = finalists(reached) if reached else []
         contenders += [given(problem, values) for values in known]
     else:
@@ -228,11 +268,12 @@ def fit_output_error(
     if not contenders:
         why = twin_words(runs, structure) or "check the signs of the data and the bounds"
         raise ConvergenceError(f"no start of {', '.join(outputs)} has a finite free run; {why}")
-    course.at(0.5)
+    course.at(RACED)
+    weighed = outset.weighed
     # Where a step passes faster than the samples see, a grid as coarse as the samples has an optimum of its own.
     while weighed.every < FINEST and weighed.matters(contenders[0]):
         weighed = weighed.finer
-    best = winner(contenders, replace(alike, every=weighed.every))
+    best = winner(contenders, replace(outset.alike, every=weighed.every))
     if len(outputs) > 1:
         # Of one output the noise does not move the optimum.
         best = weighed.descend(best, LAST_LAP)

@@ -44,7 +44,7 @@ FINALISTS = 3
 CONTENDER = 3.0
 #: Two costs closer than this share are the same optimum.
 SAME_COST = 1e-3
-#: Starts whose numbers are all as near as this share are in the same place.
+#: Starts whose numbers are all as near as this share are in the same place, optima if their orders are as near as this.
 SAME_PLACE = 0.02
 
 
@@ -90,10 +90,10 @@ def race(alike: Grid, floor: float, threads: int, progress: Callable[[int, int],
     """Coarse fits from all starts, best first, every output weighing alike; noise alone leaves `floor` per residual."""
     if isinstance(alike.problem.structure.initial, History):
         return with_history(alike, floor, threads, progress)
-    return raced(alike, floor, threads, progress)[0]
+    return without_history(alike, floor, threads, progress)[0]
 
 
-def raced(
+def without_history(
     alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None
 ) -> tuple[list[Attempt], Grid]:
     """The race of a problem whose initial terms are few, and the grid on which it was."""
@@ -128,7 +128,7 @@ def raced(
             continue
         # At given orders most starts lead to one optimum.
         going = FINALISTS if isinstance(less, Whole) else FEWEST
-        runners = one_of_each(laps.run(coarse, runners, GLANCE, less.problem))[:going]
+        runners = distinct(laps.run(coarse, runners, GLANCE, less.problem), same_place)[:going]
         ended = laps.run(coarse, runners, FIRST_LAP, less.problem)
         ended = laps.run(coarse, finalists(ended), SECOND_LAP, less.problem)
         there = [less.embedded(a, problem) for a in ended[:1]]
@@ -139,7 +139,7 @@ def raced(
         # Nor is it to end above what it reaches with one order known: from where it is, and from whole orders.
         near = (*distinct(reached)[:FINALISTS], *distinct(first)[:FINALISTS], *wholes)
         runners = [one.without(a, problem, clock) for a in near]
-        runners = one_of_each(laps.run(coarse, runners, GLANCE, one.problem))[:FINALISTS]
+        runners = distinct(laps.run(coarse, runners, GLANCE, one.problem), same_place)[:FINALISTS]
         ended = laps.run(coarse, runners, FIRST_LAP, one.problem)
         there = [one.embedded(a, problem.orders[one.order]) for a in ended[:1]]
         reached = sorted(reached + laps.run(coarse, there, 1), key=lambda a: a.level)
@@ -171,7 +171,7 @@ def with_history(
     that of a lap with it.
     """
     few = FreeProblem.of(replace(alike.problem.structure, initial="caputo"))
-    reached, coarse = raced(replace(alike, problem=few), floor, threads, progress)
+    reached, coarse = without_history(replace(alike, problem=few), floor, threads, progress)
     reached, coarse = distinct(reached), replace(coarse, problem=alike.problem)
     laps = Laps(len(reached), threads, None)
     levels = [math.inf if a is None else a.level for a in laps.each(coarse, reached, 0)]
@@ -208,7 +208,7 @@ def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> tuple[Gr
     A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its
     own: all start anew on the grid on which those few no longer move.
     """
-    first, glanced = coarse, one_of_each(laps.run(coarse, starts, GLANCE))
+    first, glanced = coarse, distinct(laps.run(coarse, starts, GLANCE), same_place)
     if len(starts) <= PIONEERS:
         return coarse, glanced
     before, pioneers = list[tuple[Grid, Attempt]](), glanced[:PIONEERS]
@@ -217,8 +217,10 @@ def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> tuple[Gr
         if reached and not coarse.matters(reached[0]):
             break
         before += [(coarse, reached[0])] if reached else []
-        # Where none has a scheme, others may on half the step.
-        coarse, pioneers = coarse.finer, reached or one_of_each(laps.run(coarse.finer, starts, GLANCE))[:PIONEERS]
+        coarse, pioneers = coarse.finer, reached
+        if not pioneers:
+            # Where none has a scheme, others may on half the step.
+            pioneers = distinct(laps.run(coarse, starts, GLANCE), same_place)[:PIONEERS]
     else:
         reached = pioneers
     if coarse is first:
@@ -226,11 +228,11 @@ def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> tuple[Gr
     told = before if reached else []
     near = (grid for grid, best in told if np.allclose(best.values, reached[0].values, rtol=MOVED, atol=0.0))
     if (grid := next(near, None)) is not None:
-        glanced = one_of_each(laps.run(grid, starts, GLANCE))
+        glanced = distinct(laps.run(grid, starts, GLANCE), same_place)
         if sum(1 + len(a.alike) for a in glanced) == len(starts):
             # This coarser grid has the same optimum, a little moved: of those that come to one place there one goes on.
             starts = distinct(laps.run(grid, glanced, FIRST_LAP))
-    return coarse, one_of_each(laps.run(coarse, starts, GLANCE))
+    return coarse, distinct(laps.run(coarse, starts, GLANCE), same_place)
 
 
 def on_the_way(coarse: Grid, behind: Sequence[Attempt], laps: Laps) -> list[Attempt]:
@@ -244,19 +246,6 @@ def on_the_way(coarse: Grid, behind: Sequence[Attempt], laps: Laps) -> list[Atte
                 (further if at.level < (1.0 - ON_THE_WAY) * attempt.level else ended).append(at)
         going = further
     return ended + going
-
-
-def one_of_each(attempts: Sequence[Attempt]) -> list[Attempt]:
-    """Attempts, best first, without those that are where an earlier one is: several lattices have the same rows."""
-    kept: list[Attempt] = []
-    for attempt in attempts:
-        here = attempt.values
-        there = next((i for i, k in enumerate(kept) if np.allclose(here, k.values, rtol=SAME_PLACE, atol=0.0)), None)
-        if there is None:
-            kept.append(attempt)
-        else:
-            kept[there] = replace(kept[there], alike=(*kept[there].alike, attempt.origin, *attempt.alike))
-    return kept
 
 
 def without_vanished(problem: FreeProblem, start: Attempt, ended: Attempt) -> Attempt:
@@ -280,16 +269,24 @@ def in_reach(reached: Sequence[Attempt]) -> list[Attempt]:
     return [a for a in reached if a.level <= CONTENDER * reached[0].level]
 
 
-def distinct(reached: Sequence[Attempt]) -> list[Attempt]:
-    """Attempts, best first; those that ended in the optimum of an earlier one are alike to it."""
+def same_optimum(one: Attempt, other: Attempt) -> bool:
+    """Whether two that ended cost the same at orders that are as near."""
+    near = abs(one.level - other.level) <= SAME_COST * one.level
+    return near and np.allclose(np.array(other.orders), one.orders, atol=SAME_PLACE)
+
+
+def same_place(one: Attempt, other: Attempt) -> bool:
+    """Whether two are at the same numbers, each as near as a share of itself: several lattices have the same rows."""
+    return np.allclose(other.values, one.values, rtol=SAME_PLACE, atol=0.0)
+
+
+def distinct(
+    attempts: Sequence[Attempt], same: Callable[[Attempt, Attempt], bool] = same_optimum
+) -> list[Attempt]:  # fmt: skip
+    """Attempts, best first; those that are the same as an earlier one are alike to it."""
     kept: list[Attempt] = []
-    for attempt in reached:
-        values = np.array(attempt.orders)
-        same = (
-            i for i, k in enumerate(kept)
-            if abs(k.level - attempt.level) <= SAME_COST * k.level and np.allclose(values, k.orders, atol=0.02)
-        )  # fmt: skip
-        first = next(same, None)
+    for attempt in attempts:
+        first = next((i for i, k in enumerate(kept) if same(k, attempt)), None)
         if first is None:
             kept.append(attempt)
         else:

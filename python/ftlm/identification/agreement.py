@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +22,7 @@ from ftlm.identification.identify import identify
 from ftlm.identification.result import Identification
 from ftlm.judge.comparison import compare
 from ftlm.judge.metrics import finite
-from ftlm.paint.page import Section, write_page
+from ftlm.paint.page import Page, Reported, Section
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, unbounded
 
@@ -60,7 +58,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class Agreement:
+class Agreement(Reported):
     """Parts of a run, or runs, identified each by itself, and whether they are one model.
 
     Parameters
@@ -185,33 +183,14 @@ class Agreement:
         ]  # fmt: skip
         return Table("Fit of each part's model on each part, in %", ("model of", *self.names), rows)
 
-    def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the comparison as one HTML file that opens offline.
-
-        Parameters
-        ----------
-        path
-            File to write.
-        force
-            Overwrite an existing file.
-
-        Returns
-        -------
-        pathlib.Path
-            The file.
-
-        Raises
-        ------
-        DataError
-            The file exists and ``force`` is not set, or cannot be written.
-        """
+    def _page(self) -> Page:
         first = Section(
             "Whether it is one model", paragraphs=[f"{self.reason}."], warnings=list(self.warnings),
             tables=[self.numbers_table(), self.fits_table()],
         )  # fmt: skip
         sections = [Section(n, paragraphs=str(r).splitlines()) for n, r in zip(self.names, self.results, strict=True)]
         lead = {True: "the same model", False: "not the same model", None: "not told"}[self.same]
-        return write_page(path, title="Parts of a run", sections=[first, *sections], lead=lead, force=force)
+        return Page("Parts of a run", [first, *sections], lead)
 
     def to_frame(self) -> Any:
         """Numbers as a pandas frame by number and part."""

@@ -225,6 +225,11 @@ class Identification(Judged):
         Verdict
             Prints as one sentence; ``.reasons`` has all that speaks against the model, most serious first.
 
+        Raises
+        ------
+        ModelError
+            What is no answer of :meth:`validate`.
+
         Notes
         -----
         The first of these rules that applies gives the reason.

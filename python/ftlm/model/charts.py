@@ -89,6 +89,11 @@ def pole_charts(model: Solved) -> list[Figure]:
     """Poles in the plane of s^q, q the highest order over the next whole number, with the sector that is not stable.
 
     Empty for a model with friction, which has none, and for one without poles.
+
+    Parameters
+    ----------
+    model
+        Any.
     """
     q, points = pole_points(model)
     if not points.size:
@@ -190,7 +195,15 @@ def bode(model: Solved, w: ArrayLike | None = None) -> Bode:
 
 
 def response_charts(found: Response, *, units: Mapping[str, str] | None = None) -> list[Figure]:
-    """Answers to steps or impulses, a chart for every input that reaches an output, with 95 % bands."""
+    """Answers to steps or impulses, a chart for every input that reaches an output, with 95 % bands.
+
+    Parameters
+    ----------
+    found
+        The answers, at which instants, and their deviations.
+    units
+        Of signals, by name.
+    """
     figures = []
     for i, output in enumerate(found.outputs):
         for j, signal in enumerate(found.inputs):

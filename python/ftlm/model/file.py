@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Literal
@@ -11,16 +10,17 @@ from typing import Literal
 import msgspec
 from msgspec import UNSET, UnsetType
 
+from ftlm.base.checks import words_of
 from ftlm.base.errors import DataError, ModelError
 from ftlm.base.output import write_atomically
+from ftlm.base.saved import Saved
 from ftlm.data.equations import Equation, Friction, Stribeck, Term
+from ftlm.data.filters import SensorFilter
 from ftlm.data.limits import Limit, LimitLaw
 from ftlm.data.orders import Order
 from ftlm.data.solved import Estimate, Solved
-from ftlm.data.structures import Offset, SensorFilter, Structure, check_initial
+from ftlm.data.structures import Offset, Structure, check_initial
 
-#: Largest model file read: a model is a few kilobytes.
-MAX_MODEL_BYTES = 1 << 20
 #: Schema of a model that every version since the first reads, of one that has an offset, of one that has intervals by
 #: profile likelihood or whose sensor filter names what is no output, of one that has friction, of one whose inputs have
 #: limits, of one whose friction falls with speed, and of one that says what was free in its fit or what spoke against.
@@ -210,6 +210,10 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
         return Solved(structure, self.orders, self.units, self.m, self.about, self.estimate)
 
 
+#: A model is a few kilobytes.
+MODEL = Saved("model", "a file written by save()", ModelFile)
+
+
 def schema_of(
     equations: Sequence[EquationFile], limits: list[LimitFile] | UnsetType, offset: Offset | UnsetType,
     sensor: FilterFile | None, estimate: Estimate | None,
@@ -234,26 +238,10 @@ def write_model(model: Solved, path: str | os.PathLike[str], *, force: bool) -> 
 
 def read_model(path: str | os.PathLike[str]) -> Solved:
     """Read the record of a model; the errors are those of :func:`ftlm.load_model`."""
-    file = Path(path)
-    try:
-        state = file.stat()
-        if not stat.S_ISREG(state.st_mode):
-            raise DataError(f"{file} is no regular file; give a file written by save()")
-        if state.st_size > MAX_MODEL_BYTES:
-            raise DataError(
-                f"{file} has {state.st_size} bytes, no model is larger than {MAX_MODEL_BYTES}; give a model file"
-            )
-        read = msgspec.json.decode(file.read_bytes(), type=ModelFile)
-    except OSError as error:
-        raise DataError(f"model {file} cannot be read: {error.strerror or error}; check the path") from error
-    except DataError:
-        raise
-    except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise DataError(f"{file} is no ftlm model: {error}; give a file written by save()") from error
+    read = MODEL.read(path)
     latest = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)
-    if read.schema > latest or read.schema < 1:
-        raise DataError(f"{file} has schema {read.schema}, this version reads up to {latest}; upgrade ftlm")
+    MODEL.check_schema(path, read, latest)
     try:
         return read.solved()
     except ModelError as error:
-        raise DataError(f"{file} holds no usable model: {error}") from error
+        raise DataError(f"{path} holds no usable model: {words_of(error)}") from error

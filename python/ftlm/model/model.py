@@ -169,6 +169,13 @@ class Model(Solved):
     def save(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the model as JSON, atomically.
 
+        Parameters
+        ----------
+        path
+            File to write.
+        force
+            Overwrite an existing file.
+
         Raises
         ------
         DataError

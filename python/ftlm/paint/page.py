@@ -127,3 +127,42 @@ def write_page(
     )  # fmt: skip
     # A name may hold half a surrogate pair, which no file can.
     return write_atomically(path, page.encode("utf-8", "backslashreplace"), force=force)
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a page says: its title, its sections, and what a hurried reader should know."""
+
+    title: str
+    sections: Sequence[Section]
+    lead: str
+
+
+class Reported:
+    """A result that is its own page."""
+
+    def _page(self) -> Page:
+        raise NotImplementedError
+
+    def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
+        """Write the result as one HTML file that opens offline.
+
+        Parameters
+        ----------
+        path
+            File to write.
+        force
+            Overwrite an existing file.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        DataError
+            The file exists and ``force`` is not set, or cannot be written.
+        """
+        page = self._page()
+        return write_page(path, title=page.title, sections=page.sections, lead=page.lead, force=force)

@@ -215,7 +215,13 @@ def papers_record() -> tuple[Run, dict[str, float]]:
 
 
 def as_printed(outputs: Sequence[str] = printed.OUTPUTS) -> dict[str, AsPrinted]:
-    """Tables 4 and 5 by the reading that comes nearest to them, angle by angle."""
+    """Tables 4 and 5 by the reading that comes nearest to them, angle by angle.
+
+    Parameters
+    ----------
+    outputs
+        Angles; by default all four.
+    """
     run, scales = papers_record()
     found = {}
     for output in outputs:

@@ -103,7 +103,13 @@ def listed(numbers: Mapping[str, Iterable[float]], digits: int = 4) -> str:
 
 
 def printed_saturation(output: str) -> tuple[float, float, float]:
-    """Return x and c of x·p / (p + c) through the printed a of p = 1 and 7, and how far p = 3 and 5 are from it."""
+    """Return x and c of x·p / (p + c) through the printed a of p = 1 and 7, and how far p = 3 and 5 are from it.
+
+    Parameters
+    ----------
+    output
+        An angle of the paper's, such as ``"theta11"``.
+    """
     rows = printed.FRACTIONAL[output]
     first, last = printed.INNOVATION_LENGTHS[0], printed.INNOVATION_LENGTHS[-1]
     # 1/a = 1/x + (c/x)/p is a line in 1/p.

@@ -75,6 +75,13 @@ class Reproduction(Recomputed):
     def page(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write everything as one HTML file that opens offline.
 
+        Parameters
+        ----------
+        path
+            File to write.
+        force
+            Overwrite an existing file.
+
         Raises
         ------
         DataError
@@ -184,6 +191,8 @@ def reproduce(
     ------
     DataError
         Runs without the signals of any stage, or a sine run that lacks some.
+    ModelError
+        A sine run without a square run, arms that are not known, a step or records that are none.
     """
     simulated = square is None
     others, lattice = _others(arms, records), Lattice(step=step)

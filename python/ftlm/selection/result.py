@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from ftlm.base.frames import to_frame
@@ -13,7 +11,7 @@ from ftlm.identification.result import Identification
 from ftlm.judge.metrics import finite
 from ftlm.paint.figure import Figure
 from ftlm.paint.lines import line_chart
-from ftlm.paint.page import Section, write_page
+from ftlm.paint.page import Page, Reported, Section
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell
 from ftlm.selection.trial import LOST, Trial
@@ -25,7 +23,7 @@ GROWS = " (grows without bound)"
 
 
 @dataclass(frozen=True)
-class Selection:
+class Selection(Reported):
     """Candidates tried on runs, the chosen one, and the reason.
 
     Parameters
@@ -94,26 +92,7 @@ class Selection:
             caption=f"The best candidate with each number of estimates; chosen is one with {self.winner.numbers}.",
         )  # fmt: skip
 
-    def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
-        """Write the choice as one HTML file that opens offline.
-
-        Parameters
-        ----------
-        path
-            File to write.
-        force
-            Overwrite an existing file.
-
-        Returns
-        -------
-        pathlib.Path
-            The file.
-
-        Raises
-        ------
-        DataError
-            The file exists and ``force`` is not set, or cannot be written.
-        """
+    def _page(self) -> Page:
         sections = [
             Section(
                 "The choice",
@@ -123,7 +102,7 @@ class Selection:
             Section("Candidates", tables=[self.table()]),
             Section("The chosen structure on all runs", paragraphs=str(self.best).splitlines()),
         ]  # fmt: skip
-        return write_page(path, title="Selection of a structure", sections=sections, lead=self.winner.name, force=force)
+        return Page("Selection of a structure", sections, self.winner.name)
 
     def to_frame(self) -> Any:
         """Candidates as a pandas frame by rank."""

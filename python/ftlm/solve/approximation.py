@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import real_number, whole_number
+from ftlm.base.checks import real_number, shown, whole_number
 from ftlm.base.errors import ModelError
 from ftlm.data.solved import Solved
 from ftlm.solve.frequency import check_unlimited, frequency_response, response_inputs
@@ -220,12 +220,12 @@ def approximate(model: Solved, *, band: tuple[float, float], order: int = 5) -> 
     try:
         low, high = (real_number("band", b) for b in band)
     except (TypeError, ValueError):
-        raise ModelError(f"band = {band!r} is no pair of frequencies; give (low, high) in rad/s") from None
+        raise ModelError(f"band = {shown(band)} is no pair of frequencies; give (low, high) in rad/s") from None
     if not (math.isfinite(low) and math.isfinite(high) and 0 < low < high):
         raise ModelError(f"band = ({low:g}, {high:g}) rad/s is no interval; give 0 < low < high")
     count = whole_number(order)
     if count is None or not 1 <= count <= LARGEST_ORDER:
-        raise ModelError(f"order = {order!r} is no whole number from 1 to {LARGEST_ORDER}")
+        raise ModelError(f"order = {shown(order)} is no whole number from 1 to {LARGEST_ORDER}")
     check_linear(model.equations, "a linear system in state space")
     check_unlimited(model, "a linear system in state space")
     inputs, outputs = response_inputs(model, coupled=True), model.outputs

@@ -23,7 +23,18 @@ def _comment(text: str, mark: str) -> str:
 
 
 def json_text(model: Solved) -> str:
-    """The transfer functions of a model as JSON, exact in powers and coefficients."""
+    """The transfer functions of a model as JSON, exact in powers and coefficients.
+
+    Parameters
+    ----------
+    model
+        A linear model.
+
+    Raises
+    ------
+    ModelError
+        An input that saturates or has a dead zone, or friction: there is no transfer function.
+    """
     check_unlimited(model, "a transfer function")
     transfer = transfer_functions(model)
     document = {
@@ -46,7 +57,18 @@ def json_text(model: Solved) -> str:
 
 
 def matlab_text(model: Solved) -> str:
-    """A MATLAB script: the transfer functions as vectors, and as FOMCON's ``fotf`` objects where FOMCON is there."""
+    """A MATLAB script: the transfer functions as vectors, and as FOMCON's ``fotf`` objects where FOMCON is there.
+
+    Parameters
+    ----------
+    model
+        A linear model.
+
+    Raises
+    ------
+    ModelError
+        As :func:`json_text`.
+    """
     check_unlimited(model, "a transfer function")
     transfer = transfer_functions(model)
 
@@ -86,7 +108,22 @@ def matlab_text(model: Solved) -> str:
 
 
 def control_text(model: Solved, *, band: tuple[float, float], order: int = 5) -> str:
-    """A Python script that makes the python-control system, without ftlm."""
+    """A Python script that makes the python-control system, without ftlm.
+
+    Parameters
+    ----------
+    model
+        A linear model.
+    band
+        Frequencies (low, high) within which it is to hold [rad/s].
+    order
+        Of Oustaloup's filter, 1 to 50.
+
+    Raises
+    ------
+    ModelError
+        As :func:`to_control`, which it does not need installed.
+    """
     near = approximate(model, band=band, order=order)
 
     def matrix(values: Floats) -> str:

@@ -298,6 +298,11 @@ class SteadyState:
 def steady_states(model: Solved) -> tuple[SteadyState, ...]:
     """Steady state of every output under every input that reaches it, the equations together.
 
+    Parameters
+    ----------
+    model
+        A linear model.
+
     Raises
     ------
     ModelError

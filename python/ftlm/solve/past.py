@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,23 +29,40 @@ RARE = 0.01
 HALVES, POINTS, FOLLOWS, MISSES = 0.5, 0.01, 0.2, 3.0
 
 
+@dataclass(frozen=True)
+class Left:
+    """What a structure leaves over of a run from rest and with a history, a row an output.
+
+    ``terms`` are those of the history, ``sizes`` those of the outputs.
+    """
+
+    rest: Floats
+    past: Floats
+    terms: int
+    sizes: Floats
+
+
 def in_motion(structure: Structure, runs: Sequence[Run]) -> bool:
     """Whether what a solved structure leaves over of runs from rest, of all together, asks for a history."""
-    excess, terms, spread = 0.0, 0, 1.0
+    left = []
     for run in runs:
-        ends = _both(structure, run)
-        if ends is None:
+        if (one := _left(structure, run)) is None:
             return False
-        rest, past, more = ends
-        terms += more
-        excess += misfit([*rest], [*past], np.nanstd([run[o] for o in structure.outputs], axis=1).tolist())
-        spread = max([spread, *map(colour, map(read, past))])
+        left.append(one)
+    return _asks(left)
+
+
+def _asks(left: Sequence[Left]) -> bool:
+    """Whether all together ask for a history."""
+    terms = sum(one.terms for one in left)
+    excess = sum(misfit([*one.rest], [*one.past], one.sizes.tolist()) for one in left)
     # Noise that is coloured is followed by slow terms in any run.
+    spread = max([1.0, *(colour(read(past)) for one in left for past in one.past)])
     return terms > 0 and excess / spread > chi_squared(terms, RARE)
 
 
-def _both(structure: Structure, run: Run) -> tuple[Floats, Floats, int] | None:
-    """What is left over from rest and with a history, a row an output, and its terms; None without numbers."""
+def _left(structure: Structure, run: Run) -> Left | None:
+    """The free runs of both starts beside the measurement; None without numbers."""
     ends, terms = [], 0
     for start in ("rest", history(run, structure)):
         model = Solved(replace(structure, initial=start))
@@ -57,7 +74,7 @@ def _both(structure: Structure, run: Run) -> tuple[Floats, Floats, int] | None:
             return None
         ends.append(missed(measured_samples(model, run, FIRST_REFINEMENT), samples))
         terms = sum(map(len, found.values()))
-    return ends[0], ends[1], terms
+    return Left(ends[0], ends[1], terms, np.nanstd([run[o] for o in structure.outputs], axis=1))
 
 
 def looked_like_rest(model: Solved, runs: Sequence[Run]) -> list[str]:
@@ -65,17 +82,13 @@ def looked_like_rest(model: Solved, runs: Sequence[Run]) -> list[str]:
     structure = model.structure
     if structure.initial != "auto" or structure.has_friction or not has_memory(structure):
         return []
-    looked = [run for run in runs if decided(run, structure) == "rest"]
-    return [run.name for run in looked if _told_by(structure, run) and in_motion(structure, [run])]
+    looked = ((run.name, _left(structure, run)) for run in runs if decided(run, structure) == "rest")
+    return [name for name, left in looked if left is not None and _told_by(left) and _asks([left])]
 
 
-def _told_by(structure: Structure, run: Run) -> bool:
+def _told_by(left: Left) -> bool:
     """Whether a model follows a run with a history, and misses it from rest, by enough to be said."""
-    ends = _both(structure, run)
-    if ends is None:
-        return False
-    sizes = np.nanstd([run[o] for o in structure.outputs], axis=1)
-    rest, past = (np.sqrt(np.nanmean(end**2, axis=1)) / sizes for end in ends[:2])
+    rest, past = (np.sqrt(np.nanmean(end**2, axis=1)) / left.sizes for end in (left.rest, left.past))
     return bool(np.any(
         (past <= HALVES * rest) & (rest - past >= POINTS) & (past <= FOLLOWS) & (rest <= MISSES)
     ))  # fmt: skip

@@ -17,9 +17,10 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import ModelError
 from ftlm.data.equations import Equation
+from ftlm.data.filters import SensorFilter
 from ftlm.data.run import Run
 from ftlm.data.solved import Solved
-from ftlm.data.structures import History, Initial, Offset, SensorFilter, Structure, offset_exponents
+from ftlm.data.structures import History, Initial, Offset, Structure, offset_exponents
 from ftlm.solve.friction import begun, motion_with_friction
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
 from ftlm.solve.motion import decided, misfit, missed, needed

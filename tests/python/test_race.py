@@ -1,0 +1,190 @@
+"""The race of starts: who goes on, on which grid all compete, and who takes the place of one that a wall stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ftlm
+from ftlm.errors import ModelError
+from ftlm.fit import joint
+from ftlm.fit.grid import Attempt, Grid
+from ftlm.fit.problem import FreeProblem
+from ftlm.fit.race import PIONEERS, Laps, distinct, finalists, fine_enough, in_reach, same_place
+
+
+def ended(level: float, order: float = 1.0, coefficient: float = 1.0, origin: str = "") -> Attempt:
+    """An attempt of this cost per residual at an order and a coefficient."""
+    return Attempt([order], [coefficient], origin, {"cost": level, "residuals": np.zeros(2)})
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Who goes on
+
+
+def test_those_up_to_three_times_as_far_off_as_the_best_go_on() -> None:
+    assert [a.level for a in in_reach([ended(v) for v in (2.0, 2.1, 5.9, 6.1, 40.0)])] == [2.0, 2.1, 5.9]
+    assert [a.level for a in in_reach([ended(v) for v in (0.0, 0.0, 1e-9)])] == [0.0, 0.0]
+
+
+def test_finalists_are_three_different_optima_that_are_in_reach() -> None:
+    reached = [ended(1.0, 0.5), ended(1.0, 0.51), ended(1.1, 0.9), ended(1.2, 1.5), ended(1.3, 1.9)]
+    assert [a.orders for a in finalists(reached)] == [[0.5], [0.9], [1.5]]
+    assert [a.orders for a in finalists([reached[0], ended(3.1, 0.9)])] == [[0.5]]
+
+
+def test_starts_are_in_one_place_by_every_number_optima_by_cost_and_orders() -> None:
+    here, there = ended(1.0, 1.0, 100.0, "here"), ended(1.0, 1.0, 103.0, "there")
+    near, far = ended(1.5, 1.01, 101.0, "near"), ended(1.5, 1.01, 101.0, "far")
+    assert [(a.origin, a.alike) for a in distinct([here, there])] == [("here", ("there",))]
+    assert [(a.origin, a.alike) for a in distinct([here, there, near, far], same_place)] == [
+        ("here", ("near", "far")), ("there", ())
+    ]  # fmt: skip
+    assert [a.origin for a in distinct([here, near])] == ["here", "near"]
+    # A share of a number: of an order near 0 that is little.
+    assert len(distinct([ended(1.0, 0.01), ended(1.0, 0.02)], same_place)) == 2
+    assert len(distinct([ended(1.0, 0.01), ended(1.0, 0.02)])) == 1
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# On which grid all compete
+
+
+@dataclass(frozen=True)
+class Staged(Grid):
+    """A grid that matters until so many pulses a sample interval."""
+
+    enough: int = 1
+
+    def matters(self, attempt: Attempt) -> bool:
+        return self.every < self.enough
+
+
+@dataclass(frozen=True)
+class Told(Laps):
+    """Laps whose ends are told: where a start gets on a grid, or None."""
+
+    ends: Callable[[Grid, Attempt, int], Attempt | None] = lambda grid, attempt, evaluations: attempt
+    calls: list[tuple[int, int]] | None = None
+
+    def run(self, grid: Grid, runners: Sequence[Attempt], evaluations: int, problem: Any = None) -> list[Attempt]:
+        if self.calls is not None:
+            self.calls.append((grid.every, len(runners)))
+        there = [self.ends(grid, a, evaluations) for a in runners]
+        return sorted((a for a in there if a is not None), key=lambda a: a.level)
+
+
+#: Five starts, each in a place of its own.
+STARTS = [ended(1.0 + k, 0.3 * (k + 1), origin=str(k)) for k in range(5)]
+
+
+def staged(enough: int) -> Staged:
+    return Staged(FreeProblem.of(ftlm.equation("D y = -a y + b u", initial="rest")), [], [], enough=enough)
+
+
+def test_starts_compete_on_the_first_grid_where_it_tells_where_they_lead() -> None:
+    calls: list[tuple[int, int]] = []
+    grid, going = fine_enough(staged(1), STARTS, Told(5, 1, None, calls=calls))
+    assert (grid.every, [a.origin for a in going]) == (1, list("01234"))
+    # All glance, and a few run ahead.
+    assert calls == [(1, 5), (1, PIONEERS)]
+
+
+def test_few_starts_need_none_to_run_ahead() -> None:
+    calls: list[tuple[int, int]] = []
+    grid, going = fine_enough(staged(4), STARTS[:PIONEERS], Told(3, 1, None, calls=calls))
+    assert (grid.every, len(going), calls) == (1, PIONEERS, [(1, PIONEERS)])
+
+
+@pytest.mark.parametrize(("moved", "begin"), [(0.05, 2), (0.2, 5)])
+def test_starts_go_on_from_a_coarse_grid_only_if_a_finer_one_moves_its_optimum_little(moved: float, begin: int) -> None:
+    def ends(grid: Grid, attempt: Attempt, evaluations: int) -> Attempt:
+        # Two optima, the lower one at another coefficient on a finer grid.
+        if evaluations < 5:
+            return attempt
+        low = int(attempt.origin) < 3
+        return replace(
+            attempt, orders=[0.5 if low else 1.5], coefficients=[1.0 if grid.every == 1 else 1.0 + moved],
+            outcome={"cost": 1.0 if low else 2.0, "residuals": np.zeros(2)},
+        )  # fmt: skip
+
+    calls: list[tuple[int, int]] = []
+    grid, going = fine_enough(staged(2), STARTS, Told(5, 1, None, ends, calls))
+    assert grid.every == 2
+    # Where it tells, one for each optimum that it has; where it does not, all from where they started.
+    assert calls[-1] == (2, begin)
+    assert [a.orders[0] for a in going] == ([0.5, 1.5] if begin == 2 else [s.orders[0] for s in STARTS])
+    assert sum(1 + len(a.alike) for a in going) == len(STARTS)
+
+
+def test_a_start_that_a_coarse_grid_does_not_carry_begins_on_the_finer_one() -> None:
+    def ends(grid: Grid, attempt: Attempt, evaluations: int) -> Attempt | None:
+        return None if grid.every == 1 and attempt.origin == "4" else attempt
+
+    grid, going = fine_enough(staged(2), STARTS, Told(5, 1, None, ends))
+    assert (grid.every, [a.origin for a in going]) == (2, list("01234"))
+
+
+def test_where_no_start_has_a_scheme_the_step_is_halved_until_one_has() -> None:
+    def ends(grid: Grid, attempt: Attempt, evaluations: int) -> Attempt | None:
+        return None if grid.every < 4 else attempt
+
+    grid, going = fine_enough(staged(1), STARTS, Told(5, 1, None, ends))
+    assert (grid.every, len(going)) == (4, 5)
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Instead of one that a wall stopped
+
+
+@pytest.fixture(scope="module")
+def grid() -> Grid:
+    """First order, driven in exact steps, with a little noise."""
+    rng, y = np.random.default_rng(4), np.zeros(81)
+    u = np.repeat(rng.uniform(-1.0, 1.0, 10), 9)[:81]
+    for k in range(80):
+        y[k + 1] = np.exp(-0.2) * y[k] + (1.0 - np.exp(-0.2)) * u[k]
+    run = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": y + 0.01 * rng.normal(size=81)})
+    return Grid(FreeProblem.of(ftlm.equation("D y = -a y + b u", initial="caputo")), [run], [100.0])
+
+
+def test_another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less(grid: Grid) -> None:
+    stuck = grid.evaluated(Attempt([], [1.0, 1.0], "stuck", {}))
+    other = Attempt([], [3.0, 1.0], "other", {})
+    best, there = joint.freed(stuck, grid, [other], "squares")
+    assert best.origin == "other"
+    assert best.coefficients == pytest.approx([2.0, 2.0], rel=0.03)
+    # Its weights are settled: those of what it leaves.
+    assert there.levels(best)["y"] == pytest.approx(1.0, abs=joint.SETTLED)
+    assert there.weights != grid.weights
+    # Nobody else, or nobody better: the same one on the same grid.
+    assert joint.freed(stuck, grid, [], "squares") == (stuck, grid)
+    assert joint.freed(best, there, [replace(best, origin="again")], "squares")[0].origin == "other"
+
+
+def test_who_has_no_free_run_or_grows_where_that_may_not_be_takes_no_place(grid: Grid, monkeypatch) -> None:
+    stuck = grid.evaluated(Attempt([], [1.0, 1.0], "stuck", {}))
+
+    def settled(attempt: Attempt, grid: Grid, loss: str) -> tuple[Attempt, Grid]:
+        if attempt.origin == "none":
+            raise ModelError("its free run is not finite")
+        return grid.evaluated(attempt), grid
+
+    monkeypatch.setattr(joint, "with_settled_weights", settled)
+    growing = Attempt([], [-2.0, 1e-9], "growing", {})
+    good, none = Attempt([], [2.0, 2.0], "good", {}), Attempt([], [2.0, 2.0], "none", {})
+    assert joint.freed(stuck, grid, [none], "squares")[0] is stuck
+    assert joint.freed(stuck, grid, [none, good], "squares")[0].origin == "good"
+    # The best of all, not the last.
+    between = Attempt([], [1.5, 1.5], "between", {})
+    assert joint.freed(stuck, grid, [between], "squares")[0].origin == "between"
+    assert joint.freed(stuck, grid, [good, between], "squares")[0].origin == "good"
+    # It leaves more than one that grows.
+    worst = grid.evaluated(Attempt([], [-3.0, 1.0], "worst", {}))
+    assert joint.freed(worst, grid, [growing], "squares")[0].origin == "growing"
+    assert joint.freed(worst, replace(grid, steady=True), [growing], "squares")[0] is worst
+    assert joint.freed(worst, replace(grid, steady=True), [growing, good], "squares")[0].origin == "good"
