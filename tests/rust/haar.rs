@@ -176,6 +176,26 @@ fn gram_matrices_and_triangular_factors() {
     }
 }
 
+#[test]
+fn triangular_factors_of_any_size() {
+    let mut random = Random::new(25);
+    let columns: Vec<Vec<f64>> = (0..4).map(|_| random.signal(1500)).collect();
+    let plain = dense::triangular_factor(&columns);
+    // Where squares leave the numbers, norms are scaled.
+    for size in [1e-170, 1e160] {
+        let scaled: Vec<Vec<f64>> = columns.iter().map(|c| c.iter().map(|v| v * size).collect()).collect();
+        for (r, truth) in dense::triangular_factor(&scaled).iter().zip(&plain) {
+            assert!((r.abs() / size - truth.abs()).abs() < 1e-12 * plain[0].abs());
+        }
+    }
+    // Columns of nothing, and one that stands there twice.
+    let zero = vec![0.0; 1500];
+    let r = dense::triangular_factor(&[zero.clone(), columns[0].clone(), columns[0].clone(), zero]);
+    let size = plain[0].abs();
+    assert_eq!((r[0], r[15]), (0.0, 0.0));
+    assert!((r[5].hypot(r[1]) / size - 1.0).abs() < 1e-13 && r[10].abs() < 1e-12 * size);
+}
+
 proptest! {
     #![proptest_config(cases(64))]
 

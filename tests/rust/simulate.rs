@@ -1,6 +1,6 @@
 //! Free runs against dense oracles, the two errors of a model, explicit Euler, and the stability margin of the scheme.
 
-use ftlm::equation::{Equation, Initial, Structure, Term};
+use ftlm::equation::{Equation, Filter, Initial, Structure, Term};
 use ftlm::error::Error;
 use ftlm::estimate::least_squares;
 use ftlm::kernels::block_pulse_kernel;
@@ -13,7 +13,7 @@ use ftlm::simulate::{
 use proptest::prelude::*;
 
 use crate::common::{
-    bits, cases, check, dense_solve, distance, equation, largest, norm, record, relative_distance, structure, toeplitz,
+    bits, cases, check, check_between, dense_solve, distance, equation, largest, norm, record, relative_distance, structure, toeplitz,
     with_signal, Random,
 };
 
@@ -482,4 +482,35 @@ fn units_of_initial_terms_answer_as_free_runs_of_nothing_else() {
     let model = [equation(0, [-9.0, -1.0, 0.5, 1.0])];
     assert!(matches!(unit_responses(&model, &still, &[(1, 0.0)]), Err(Error::Structure { .. })));
     assert!(unit_responses(&model, &still, &[(0, f64::NAN)]).is_err());
+}
+
+#[test]
+fn singular_powers_drive_filtered_equations_to_second_order() {
+    // D^1.4 y = -2 y behind 1/(1 + s/2), driven by t^e: its double series of powers, integrated once more for a pulse mean.
+    let (alpha, rate) = (1.4, 2.0);
+    let plant = [equation(0, alpha, &[(0, 0.0, -2.0)])];
+    let lag = Filter { numerator: vec![(1.0, 0.0)], denominator: vec![(1.0 / rate, 1.0), (1.0, 0.0)] };
+    for exponent in [-0.9, -0.52, -0.2] {
+        let integral = |t: f64| {
+            let mut sum = 0.0;
+            for n in 0..30 {
+                for k in 0..40 {
+                    let power = exponent + f64::from(k) + 2.0 + alpha * f64::from(n);
+                    let size = (-2.0_f64).powi(n) * (-1.0_f64).powi(k) * rate.powi(k + 1);
+                    sum += size * t.powf(power) / libm::tgamma(power + 1.0);
+                }
+            }
+            sum * libm::tgamma(exponent + 1.0)
+        };
+        let missed = |m: usize| {
+            let step = 1.0 / m as f64;
+            let still = Record::new(step, vec![vec![0.0; m]], Some(lag.series(m, step).unwrap())).unwrap();
+            let found = unit_responses(&plant, &still, &[(0, exponent)]).unwrap();
+            let truth = (integral(1.0) - integral(1.0 - step)) / step;
+            assert!(truth.abs() > 0.01);
+            (found[0][0][m - 1] - truth).abs()
+        };
+        let order = 0.5 * (missed(512) / missed(2048)).log2();
+        check_between(&format!("order of the response to t^{exponent}"), order, 1.9, 2.4);
+    }
 }

@@ -128,7 +128,7 @@ impl Power {
 
     /// Their spectrum, for a product with one more series.
     pub(super) fn spectrum(&self) -> Rc<Kernel> {
-        let made = || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref()));
+        let made = || Rc::new(filtered_spectrum(&self.raw, self.filter.as_deref(), FACTORS * self.raw.len()));
         if self.raw.len() > KEPT_PULSES {
             return made();
         }
@@ -136,9 +136,9 @@ impl Power {
     }
 }
 
-/// The spectrum of a series that passes a filter, for a product with one more series.
-pub(super) fn filtered_spectrum(series: &[f64], filter: Option<&Filter>) -> Kernel {
-    let mut spectrum = Kernel::with_length(series, FACTORS * series.len());
+/// The spectrum of a series that passes a filter, for products of so many terms in all.
+pub(super) fn filtered_spectrum(series: &[f64], filter: Option<&Filter>, total: usize) -> Kernel {
+    let mut spectrum = Kernel::with_length(series, total);
     if let Some(filter) = filter {
         spectrum.multiply(&filter.spectrum);
     }

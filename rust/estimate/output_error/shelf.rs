@@ -201,7 +201,7 @@ impl Shelf {
 
     /// Its spectrum, for a product with one more series.
     pub(super) fn filtered_spectrum(&self, series: &[f64]) -> Rc<Kernel> {
-        Rc::new(filtered_spectrum(series, self.grid.borrow().filter.as_deref()))
+        Rc::new(filtered_spectrum(series, self.grid.borrow().filter.as_deref(), self.total))
     }
 
     /// Weighted samples of an impulse, or of a derivative of one, that only the filter of an output gets.
