@@ -2,8 +2,9 @@
 
 ``python benches/identify.py [five] [three] [long] [longest]``: theta22 of both laboratories' runs at 8 ms, five
 coefficients (promise P9), the same with three free orders, and one run of 50 000 samples, then of 500 000, with a free
-order (P10). Each in a process of its own, modules imported before (P8); the rival of the first is SciPy's least_squares on the two numbers of the
-link, all that is linear projected out by run (less than the five numbers that both runs share), from twenty starts.
+order (P10). Each in a process of its own, modules imported before (P8); the rival of the first is SciPy's least_squares
+on the two numbers of the link, all that is linear projected out by run (less than the five numbers that both runs
+share), from twenty starts.
 """
 
 from __future__ import annotations

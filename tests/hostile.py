@@ -188,6 +188,13 @@ class Sound:
         structure = self.structure()
         return self.runs(), structure, list(self.INPUTS), self.fixed(structure), self.terms()
 
+    def projected_errors(self):
+        runs, (output, alpha, _), inputs, _, terms = self.least_squares()
+        other = (1 - output, self.number(0.0, 0.4))
+        own = [alpha, self.number(0.0, 0.5)]
+        points = [[-self.number(1.0, 50.0), -self.number(0.1, 5.0)] for _ in range(self.one(1, 3))]
+        return runs, (output, alpha, [other]), inputs, [self.one(None, 0.7)], terms, own, points
+
     def multi_innovation(self):
         return (
             *self.least_squares(), self.one(1, 2, 7), self.one(1.0, 1e6), self.one(True, False), self.one(True, False)

@@ -161,9 +161,8 @@ def test_another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less
     # Its weights are settled: those of what it leaves.
     assert there.levels(best)["y"] == pytest.approx(1.0, abs=joint.SETTLED)
     assert there.weights != grid.weights
-    # Nobody else, or nobody better: the same one on the same grid.
+    # Nobody else: the same one on the same grid.
     assert joint.freed(stuck, grid, [], "squares") == (stuck, grid)
-    assert joint.freed(best, there, [replace(best, origin="again")], "squares")[0].origin == "other"
 
 
 def test_who_has_no_free_run_or_grows_where_that_may_not_be_takes_no_place(grid: Grid, monkeypatch) -> None:
@@ -183,6 +182,8 @@ def test_who_has_no_free_run_or_grows_where_that_may_not_be_takes_no_place(grid:
     between = Attempt([], [1.5, 1.5], "between", {})
     assert joint.freed(stuck, grid, [between], "squares")[0].origin == "between"
     assert joint.freed(stuck, grid, [good, between], "squares")[0].origin == "good"
+    ahead = grid.evaluated(good)
+    assert joint.freed(ahead, grid, [between], "squares")[0] is ahead
     # It leaves more than one that grows.
     worst = grid.evaluated(Attempt([], [-3.0, 1.0], "worst", {}))
     assert joint.freed(worst, grid, [growing], "squares")[0].origin == "growing"
