@@ -1,5 +1,7 @@
 //! Products of series mod z^m by real transforms, O(m log m), with spectra that are kept for many products.
 
+use std::cell::RefCell;
+
 use crate::fft::{self, Bin, Plan, Workspace};
 
 /// Below this length a product is formed directly: it is faster there and free of transform rounding.
@@ -28,8 +30,22 @@ pub fn multiply(a: &[f64], b: &[f64], m: usize) -> Vec<f64> {
     }
     let kernel = Kernel::with_length(a, a.len() + b.len());
     let mut out = vec![0.0; m];
-    kernel.apply(b, &mut out, &mut Buffers::default());
+    spare(kernel.plan.len(), |buffers| kernel.apply(b, &mut out, buffers));
     out
+}
+
+/// Points of a transform whose buffers a thread keeps for the next one.
+const SPARE: usize = 1 << 17;
+
+thread_local!(static BUFFERS: RefCell<Buffers> = RefCell::default());
+
+/// Work on buffers that this thread has used before, unless they would be long; it asks for none itself.
+fn spare<R>(points: usize, work: impl FnOnce(&mut Buffers) -> R) -> R {
+    if points <= SPARE {
+        BUFFERS.with_borrow_mut(work)
+    } else {
+        work(&mut Buffers::default())
+    }
 }
 
 /// Reusable memory of the transforms of one thread.
@@ -57,10 +73,13 @@ impl Kernel {
     #[must_use]
     pub fn with_length(series: &[f64], total: usize) -> Self {
         let plan = fft::plan(fft::fast_length(total));
-        let mut time = vec![0.0; plan.len()];
-        time[..series.len()].copy_from_slice(series);
         let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-        plan.forward(&mut time, &mut spectrum, &mut Workspace::new());
+        spare(plan.len(), |Buffers { time, workspace, .. }| {
+            time.clear();
+            time.extend_from_slice(series);
+            time.resize(plan.len(), 0.0);
+            plan.forward(time, &mut spectrum, workspace);
+        });
         Self { plan, spectrum }
     }
 

@@ -13,8 +13,8 @@ use ftlm::simulate::{
 use proptest::prelude::*;
 
 use crate::common::{
-    bits, cases, check, check_between, dense_solve, distance, equation, largest, norm, record, relative_distance, structure, toeplitz,
-    with_signal, Random,
+    bits, cases, check, check_between, dense_solve, distance, equation, largest, norm, record, relative_distance,
+    structure, toeplitz, with_signal, Random,
 };
 
 fn one(equation: &Equation) -> &[Equation] {

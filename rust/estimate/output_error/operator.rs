@@ -1,8 +1,8 @@
 //! The integral of a term and the power of t of an initial term, with spectra that are made when they are asked for.
 
-use crate::excess::{kernel, kernel_and_slope};
-use crate::kernels::{power_means, power_means_slope, power_pulses, power_pulses_slope};
-use crate::series::{multiply, Kernel, MAX_SUMS};
+use crate::excess::kernel;
+use crate::kernels::{kernel_with_derivative, power_means, power_means_slope, power_pulses, power_pulses_slope};
+use crate::series::{multiply, Buffers, Kernel, MAX_SUMS};
 use std::cell::OnceCell;
 use std::rc::Rc;
 
@@ -21,7 +21,7 @@ pub(super) struct Operator {
     free: bool,
     m: usize,
     step: f64,
-    /// Kernel and derivative, once they are asked for.
+    /// Kernel and, of an order above 0, its derivative, once they are asked for.
     series: OnceCell<(Vec<f64>, Vec<f64>)>,
     spectra: [OnceCell<Rc<Kernel>>; 2],
 }
@@ -33,10 +33,25 @@ impl Operator {
     }
 
     fn series(&self) -> &(Vec<f64>, Vec<f64>) {
-        self.series.get_or_init(|| match self.free {
-            true => kernel_and_slope(self.eta, self.m, self.step),
+        self.series.get_or_init(|| match self.free && self.eta >= 0.0 {
+            true => kernel_with_derivative(self.eta, self.m, self.step),
             false => (kernel(self.eta, self.m, self.step), Vec::new()),
         })
+    }
+
+    /// The spectrum of the kernel's derivative. Below order 0 that is a product of three, which no rejected step asks for.
+    fn slope(&self) -> Kernel {
+        let total = FACTORS * self.m;
+        if self.eta >= 0.0 || !self.free {
+            return Kernel::with_length(&self.series().1, total);
+        }
+        // d/dη of 1/F(−η) is F′(−η)/F(−η)².
+        let (_, turned) = kernel_with_derivative(-self.eta, self.m, self.step);
+        let (mut product, made) = (Kernel::with_length(&turned, total), self.spectrum(false));
+        product.multiply(&made);
+        let mut slope = vec![0.0; self.m];
+        product.times(&made, &mut slope, &mut Buffers::default());
+        Kernel::with_length(&slope, total)
     }
 
     /// The order of the integral.
@@ -64,10 +79,7 @@ impl Operator {
 
     /// The spectrum of the kernel, or of its derivative, for products of [`FACTORS`] series.
     pub(super) fn spectrum(&self, slope: bool) -> Rc<Kernel> {
-        let made = || {
-            let series = self.series();
-            Rc::new(Kernel::with_length(if slope { &series.1 } else { &series.0 }, FACTORS * self.m))
-        };
+        let made = || Rc::new(if slope { self.slope() } else { Kernel::with_length(self.kernel(), FACTORS * self.m) });
         if self.m > KEPT_PULSES {
             return made();
         }
