@@ -9,6 +9,11 @@ import numpy as np
 #: Length of the transform that is timed, for how long [s], and what one takes on the machine whose figures are known
 #: [s]: two cores of an x86-64 server, quiet.
 LENGTH, TIMED, KNOWN = 4096, 0.03, 1.5e-5
+#: Fits by output error took between these multiples of what their samples and numbers let expect: how many starts lead
+#: somewhere, and how far, is seen only then.
+FITS = (0.4, 6.0)
+#: Samples beyond which a fit takes longer by fewer laps over all of them alone.
+LONG = 10_000
 #: A second core takes this share of the work off the first.
 PARALLEL = 0.7
 
@@ -28,9 +33,15 @@ def expected(seconds: float, threads: int) -> float:
     return seconds * pace() / (1.0 + PARALLEL * (max(threads, 1) - 1))
 
 
-def by_output_error(samples: int, numbers: int) -> float:
-    """Seconds of one core that a fit by output error takes on the known machine, within a factor of about three.
+def between(seconds: float, came_to: tuple[float, float] = FITS) -> tuple[float, float]:
+    """Between which times work ends that came to these multiples of what was expected."""
+    return came_to[0] * seconds, came_to[1] * seconds
 
-    The race of starts grows with the numbers squared, what follows with the samples of all runs and outputs.
+
+def by_output_error(samples: int, numbers: int) -> float:
+    """Seconds of one core that a fit by output error takes on the known machine, within :data:`FITS` of it.
+
+    The race of starts grows with the numbers squared, what follows with the samples of all runs and outputs, of long
+    records more slowly: most of their fit is on a part of them.
     """
-    return 0.04 * numbers**2 + 3.5e-4 * samples
+    return 0.04 * numbers**2 + 3.5e-4 * min(samples, LONG) + 2e-5 * samples

@@ -17,6 +17,8 @@ from rich.progress import TaskID
 PATIENCE = 1.0
 #: Who waits longer than this [s] wants to know beforehand how long.
 WONDER = 2.0
+#: Columns that a bar and its label keep, and from which on a terminal has room for the count of all candidates.
+LEAST_BAR, LEAST_LABEL, ROOMY = 10, 12, 100
 
 
 class Parts(int):
@@ -34,6 +36,16 @@ def left_in_words(seconds: float) -> str:
     if seconds < 5400:
         return f"about {rounded(seconds / 60):g} min left"
     return f"about {rounded(seconds / 3600):g} h left"
+
+
+def expected_in_words(least: float, most: float) -> str:
+    """How long work takes [s] as far as is known beforehand: about so long, between two times, or up to one."""
+    low, high = left_in_words(least).split(" ")[1:3], left_in_words(most).split(" ")[1:3]
+    if low == high:
+        return f"about {' '.join(high)}"
+    if least < 1.0:
+        return f"up to {' '.join(high)}"
+    return f"{low[0]} to {' '.join(high)}" if low[1] == high[1] else f"{' '.join(low)} to {' '.join(high)}"
 
 
 def rounded(value: float) -> float:
@@ -89,8 +101,8 @@ class _Bars:
         self._lock = threading.Lock()
         self._shown: RichProgress | None = None
 
-    def start(self, label: str, total: int) -> TaskID:
-        """Add a bar."""
+    def start(self, total: int | None) -> TaskID:
+        """Add a bar, whose label comes with its first figures."""
         from rich.console import Console  # noqa: PLC0415 — only a terminal needs it
         from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
 
@@ -106,13 +118,23 @@ class _Bars:
                     transient=True,
                 )
                 self._shown.start()
-            return self._shown.add_task(label, total=total, counted="", pruned="", left="")
+            return self._shown.add_task("", total=total, counted="", pruned="", left="")
 
     def update(self, task: TaskID, **state: Any) -> None:
-        """Move a bar."""
+        """Move a bar; its label is cut where bar and figures need the line."""
         with self._lock:
             if self._shown is not None:
-                self._shown.update(task, **state)
+                figures = (str(state.get(name, "")) for name in ("counted", "pruned", "left"))
+                room = max(self._shown.console.width - sum(len(f) + 1 for f in figures) - LEAST_BAR, LEAST_LABEL)
+                label = str(state["description"])
+                label = label if len(label) <= room else f"{label[: room - 1].rstrip(' ,')}…"
+                self._shown.update(task, **state | {"description": label})
+
+    @property
+    def width(self) -> int:
+        """Columns of the terminal."""
+        with self._lock:
+            return 0 if self._shown is None else self._shown.console.width
 
     def drop(self, task: TaskID) -> None:
         """Remove a bar, and with the last one the display."""
@@ -153,13 +175,15 @@ class Progress:
         if self._quiet or time.monotonic() - self._start < PATIENCE or total == 0:
             return
         if self._task is None:
-            self._task = self._bars.start(self._label, total)
+            self._task = self._bars.start(total)
         passed = max(time.monotonic() - self._start, 1e-9)
-        counted = f"{done:,.0f}/{total:,.0f} {done / passed:,.0f}/s"
-        # Of work without a count of its own a person wants to know the share.
-        counted = f"{100 * done // total:.0f} %" if isinstance(total, Parts) else counted
+        counted = f"{100 * done // total:.0f} %"
+        # Of work without a count of its own a person wants to know the share alone.
+        if not isinstance(total, Parts):
+            counted += f" of {total:,.0f}" if self._bars.width >= ROOMY else ""
+            counted += f" {done / passed:,.0f}/s"
         share = "" if pruned is None else f"{100 * pruned / max(done, 1):.1f} % pruned"
-        left = left_in_words(passed * (total - done) / done) if done else ""
+        left = left_in_words(passed * (total - done) / done) if 0 < done < total else ""
         state = {"description": self._label, "counted": counted, "pruned": share, "left": left}
         self._bars.update(self._task, completed=done, total=total, **state)
         if done >= total:
@@ -172,11 +196,26 @@ class Progress:
         other._bars = self._bars
         return other
 
-    def expect(self, what: str, seconds: float) -> None:
-        """Say beforehand about how long it takes, where that is long enough to wonder."""
-        if not self._quiet and seconds >= WONDER:
-            about = left_in_words(seconds).removesuffix(" left")
-            print(f"{what} takes {about}; Ctrl-C ends it", file=sys.stderr)
+    def so_far(self, done: int, known: int) -> None:
+        """Show how much is done of work that grows as it is done: nobody knows its end, so none is shown."""
+        passed = time.monotonic() - self._start
+        if self._quiet or passed < PATIENCE:
+            return
+        if self._task is None:
+            self._task = self._bars.start(None)
+        state = {"description": self._label, "counted": f"{done} of {known} so far", "left": f"after {passed:.0f} s"}
+        self._bars.update(self._task, **state)
+
+    @property
+    def quiet(self) -> bool:
+        """Whether nobody sees it."""
+        return self._quiet
+
+    def expect(self, what: str, least: float, most: float | None = None) -> None:
+        """Say beforehand about how long it takes, or between which times [s], where that is long enough to wonder."""
+        most = least if most is None else most
+        if not self._quiet and most >= WONDER:
+            print(f"{what} takes {expected_in_words(least, most)}; Ctrl-C ends it", file=sys.stderr)
 
     def name(self, label: str) -> None:
         """Name what comes next on the bar alone."""

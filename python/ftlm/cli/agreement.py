@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from typer import Option
 
 from ftlm.base.output import COMMAND, check_free
+from ftlm.base.pace import between
 from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show
 from ftlm.cli.identify import fit_seconds
@@ -34,7 +35,7 @@ def agreement(
     wanted = shape.measured(structure, runs)
     with Progress("fitting parts", quiet=as_json) as progress:
         count = max(parts or 0, 2) if len(runs) == 1 else len(runs)
-        progress.expect("fitting all parts", fit_seconds(runs, wanted, threads, count))
+        progress.expect("fitting all parts", *between(fit_seconds(runs, wanted, threads, count)))
         found = parts_of_runs.agreement(runs, wanted, parts=parts, loss=loss, threads=threads, progress=progress)
     if report is not None:
         found.report(report, force=force)

@@ -9,6 +9,7 @@ from typer import Argument, Option
 
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
+from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show_json
 from ftlm.cli.options import (
     Decimal,
@@ -101,10 +102,11 @@ def identify_frequency(
     if structure.startswith(("flexible-link", "arm:")) or structure == "auto":
         raise ModelError(f"--structure {structure!r}: a frequency response takes an equation in words")
     records = [reading.load(file) for file in files]
-    result = estimation(
-        records, structure, weights=weights, orders=dict(pairs("--order", orders)), fixed=numbers("--fixed", fixed),
-        delay=ranges("--delay", delay), start=numbers("--start", start) or None,
-    )  # fmt: skip
+    with Progress("fitting", quiet=as_json) as progress:
+        result = estimation(
+            records, structure, weights=weights, orders=dict(pairs("--order", orders)), fixed=numbers("--fixed", fixed),
+            delay=ranges("--delay", delay), start=numbers("--start", start) or None, progress=progress,
+        )  # fmt: skip
     checked = None if validation is None else result.validate(reading.load(validation))
     if out is not None:
         result.model.save(out, force=force)

@@ -15,7 +15,7 @@ from typer import Argument, Option
 from ftlm.base.checks import check_threads
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
-from ftlm.base.pace import by_output_error, expected
+from ftlm.base.pace import between, by_output_error, expected
 from ftlm.base.progress import Progress
 from ftlm.cli.command import EXIT_INTERRUPTED, command, show_json
 from ftlm.cli.options import (
@@ -39,8 +39,9 @@ from ftlm.data.settings import check_used
 from ftlm.data.structures import Structure
 from ftlm.identification import identify as estimation
 from ftlm.model.model import load_model
+from ftlm.search.beforehand import announce
 from ftlm.search.job import run_job
-from ftlm.search.orders import make_job, resume_job, search_status
+from ftlm.search.orders import job_of, make_job, resume_job, search_status
 from ftlm.search.result import SearchResult
 from ftlm.search.store import Store
 
@@ -95,7 +96,7 @@ def identify(
     label = "fitting" if method == "output-error" else "searching orders"
     with resumable(store, "the same command"), Progress(label, quiet=as_json) as progress:
         if method == "output-error":
-            progress.expect("the fit", fit_seconds(runs, wanted, threads))
+            progress.expect("the fit", *between(fit_seconds(runs, wanted, threads)))
         result = estimation.identify(
             runs, wanted, method=method, lattice=search.lattice(), **search.settings(),
             genetic=genetic.settings(method), threads=threads, progress=progress, store=store,
@@ -150,6 +151,7 @@ def search(
         if store is not None:
             kept = stack.enter_context(Store(store, [job.request(name) for name, job in jobs.items()]))
             show_notes(kept)
+        announce(Progress("", quiet=as_json), list(jobs.values()), kept)
         for number, (name, job) in enumerate(jobs.items()):
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 results[name] = run_job(replace(job, progress=progress), store=kept, number=number)
@@ -207,6 +209,9 @@ def resume(
     results = {}
     with resumable(store), Store(store, salvage=salvage) as kept:
         show_notes(kept)
+        told = Progress("", quiet=as_json)
+        if not told.quiet:
+            announce(told, [job_of(kept, n, threads) for n in range(len(kept.contents.requests))], kept)
         for number, request in enumerate(kept.contents.requests):
             with Progress(f"searching orders of {request.name}", quiet=as_json) as progress:
                 results[request.name] = resume_job(kept, number, threads=threads, progress=progress)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
 import typer
@@ -24,12 +25,24 @@ from ftlm.cli.options import (
     Text,
     Texts,
 )  # fmt: skip
+from ftlm.cli.wait import expect_judging
 from ftlm.cli.words import interval
 from ftlm.cli.written import figure_kind, write_figure
-from ftlm.model.model import load_model
+from ftlm.data.run import Run
+from ftlm.model.model import Model, load_model
 from ftlm.report import plots
 from ftlm.report.model_page import model_page
 from ftlm.solve.exports import export_text
+
+
+def _with_runs(
+    model: str, reading: ReadingOptions, files: Sequence[str] | None, *, quiet: bool
+) -> tuple[Model, list[Run]]:
+    """A saved model and the runs that it is run over."""
+    loaded = load_model(model)
+    runs = reading.runs(files)
+    expect_judging(runs, len(loaded.outputs), quiet=quiet)
+    return loaded, runs
 
 
 @command
@@ -39,7 +52,8 @@ def compare(
     reading: ReadingOptions, m: BlockPulses = None, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Equation error and output error of a saved model on measured runs."""
-    comparison = load_model(model).compare(reading.runs(files), m=m)
+    loaded, runs = _with_runs(model, reading, files, quiet=as_json)
+    comparison = loaded.compare(runs, m=m)
     show(comparison, as_json=as_json)
     if min_fit is not None:
         # Negated so that a fit that is not a number is too low.
@@ -57,7 +71,8 @@ def resid(
     reading: ReadingOptions, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Test a saved model's residuals: are they white, and independent of the inputs? Exit with 4 unless they are."""
-    tests = load_model(model).resid(reading.runs(files), lags=lags)
+    loaded, runs = _with_runs(model, reading, files, quiet=as_json)
+    tests = loaded.resid(runs, lags=lags)
     show(tests, as_json=as_json)
     if not tests.passed:
         raise typer.Exit(EXIT_VALIDATION)
@@ -74,8 +89,8 @@ def simulate(
 ) -> None:  # fmt: skip
     """Free run of a saved model on a run's inputs, written as csv."""
     check_free(out, force=force, words=COMMAND)
-    loaded = load_model(model)
-    free = loaded.simulate(reading.runs([file])[0], tolerance=tolerance)
+    loaded, runs = _with_runs(model, reading, [file], quiet=as_json)
+    free = loaded.simulate(runs[0], tolerance=tolerance)
     free.to_csv(out, force=force)
     sentence = f"{free.length} rows of {', '.join(free.outputs)} written to {out}"
     tell(sentence, as_json=as_json, written=out, rows=free.length, outputs=list(free.outputs))
@@ -89,8 +104,8 @@ def report(
 ) -> None:  # fmt: skip
     """Write the report of a saved model, with validation runs: one page that opens offline."""
     check_free(out, force=force, words=COMMAND)
-    loaded = load_model(model)
-    page = model_page(loaded, out, validation=reading.runs(validation) or None, force=force)
+    loaded, runs = _with_runs(model, reading, validation, quiet=as_json)
+    page = model_page(loaded, out, validation=runs or None, force=force)
     tell(f"written: {page}", as_json=as_json, written=str(page))
 
 
@@ -108,8 +123,7 @@ def plot(
     """Draw a saved model for a paper: its fit or residuals on runs, or its Bode plot, poles, step or impulse."""
     check_free(out, force=force, words=COMMAND)
     figure_kind(out)
-    loaded = load_model(model)
-    runs = reading.runs(files)
+    loaded, runs = _with_runs(model, reading, files, quiet=as_json)
     alone = {"bode": plots.bode, "poles": plots.poles, "step": plots.step, "impulse": plots.impulse}
     if not runs and kind not in alone:
         raise ModelError(f"--kind {kind} needs at least one run; give files")

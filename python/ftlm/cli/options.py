@@ -12,6 +12,7 @@ from typer import Argument, Option
 
 from ftlm.arm.link import Law, flexible_link
 from ftlm.base.errors import DataError, ModelError
+from ftlm.cli.wait import expect_reading
 from ftlm.cli.words import interval, numbers, pairs, ranges
 from ftlm.data.filters import SensorFilter
 from ftlm.data.language import equation
@@ -135,6 +136,7 @@ class ReadingOptions:
         }  # fmt: skip
         if not files:
             return []
+        expect_reading(files)
         options = {name: value for name, value in given.items() if value not in (None, {}, "")}
         if self.sliced is not None:
             options["slice"] = interval(self.sliced, "--slice", "1.1:19.5")
@@ -152,6 +154,7 @@ class ReadingOptions:
         """What a file is, before it is a run."""
         if self.detrend is not None:
             raise ModelError("--detrend is not used with open; give it to the commands that open names")
+        expect_reading([file])
         return open_file(
             file, time=self.time, step=self.sampling, inputs=pairs("-u", self.inputs) or None,
             outputs=pairs("-y", self.outputs) or None, units=pairs("--unit", self.units), columns=self.columns,

@@ -9,12 +9,17 @@ from typer import Option
 
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
+from ftlm.base.pace import between
 from ftlm.base.progress import Progress
 from ftlm.cli.command import command, show
 from ftlm.cli.identify import fit_seconds, resumable
 from ftlm.cli.options import CandidateTexts, Files, Force, Json, Out, ReadingOptions, StructureOptions, Text, Threads
 from ftlm.data.structures import Structure
 from ftlm.selection import select as choice
+from ftlm.selection.automatic import automatic
+
+#: A choice from a list, and one inside structures, took between these multiples of what one fit of each of them takes.
+LISTED, GROWN = (1.0, 8.0), (1.5, 20.0)
 
 
 @command
@@ -55,13 +60,14 @@ def select(
     of_its_own = validation not in (None, "runs", "blocks")
     judges = replace(reading, sliced=None).runs([str(validation)]) if of_its_own else validation
     with resumable(store, "the same command"), Progress("fitting candidates", quiet=as_json) as progress:
-        tried = [candidates] if isinstance(candidates, (str, Structure)) else candidates
-        whole = max((fit_seconds(runs, one, threads) for one in tried if isinstance(one, Structure)), default=0.0)
-        # How many candidates come up turns with what earns its place; they are counted as they do.
-        progress.expect("the largest candidate alone", whole)
-        if candidates == "auto":
-            progress.say("candidates come up as others are fitted; --structure auto takes minutes, and Ctrl-C ends it")
-        found = choice.select(runs, candidates, validation=judges, threads=threads, progress=progress, store=store)
+        tried = [candidates] if isinstance(candidates, Structure) else candidates
+        grown = automatic(runs) if isinstance(tried, str) else tried
+        seconds = sum(fit_seconds(runs, one, threads) for one in grown)
+        listed = isinstance(candidates, list)
+        progress.expect("choosing", *between(seconds, LISTED if listed else GROWN))
+        # How many candidates come up turns with what earns its place.
+        told = progress if listed else progress.so_far
+        found = choice.select(runs, candidates, validation=judges, threads=threads, progress=told, store=store)
     if out is not None:
         found.best.model.save(out, force=force)
     if report is not None:

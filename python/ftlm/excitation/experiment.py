@@ -11,7 +11,8 @@ import numpy as np
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import check_seed, nearest, real_number, shown
 from ftlm.base.errors import DataError, FtlmError, ModelError
-from ftlm.base.progress import Course
+from ftlm.base.pace import between, expected
+from ftlm.base.progress import Course, Progress
 from ftlm.base.statistics import NORMAL_95
 from ftlm.base.threads import stop
 from ftlm.data.run import Run
@@ -35,6 +36,8 @@ from ftlm.solve.stability import stability
 FEWEST, MOST = 32, 50_000
 #: Holds of a run in a first search, and how many times finer ones become.
 HOLDS, FINER = 125, (1, 2, 4)
+#: Designs took between these multiples of what their rows and numbers let expect: how many exchanges pay turns out.
+CAME_TO = (0.4, 4.0)
 #: Inputs from which holds are exchanged.
 BEGUN = 4
 #: Periods of the square that a design is set beside: the paper's ten seconds have five.
@@ -118,6 +121,9 @@ def design_input(
         model, like, duration, step, peak, slew, limits, names, criterion, noise, period, seed,
     )  # fmt: skip
     laid, bounds, goal = wanted.laid, wanted.bounds, wanted.criterion
+    if isinstance(progress, Progress):
+        size = len(laid.names) * len(laid.outputs) * wanted.rows
+        progress.expect("the design", *between(expected(0.3 + 2e-5 * size, 1), CAME_TO))
     course = Course(progress)
     known = Sensitivities.of(laid, wanted.step, wanted.rows - 1, bounds.ramp(wanted.step))
     course.at(0.05)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -14,6 +15,7 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.checks import check_threads, whole_number
 from ftlm.base.errors import ModelError
+from ftlm.base.progress import Progress
 from ftlm.data.equations import Equation
 from ftlm.data.lattice import Lattice
 from ftlm.data.orders import Order
@@ -34,6 +36,8 @@ CROSSOVER_SPREAD, MUTATION_SPREAD, CROSSED = 15.0, 20.0, 0.9
 #: Copies of parents are not evaluated again, so it takes more generations to spend all evaluations: at most this
 #: many times as many.
 MOST_COPIES = 4
+#: Evaluations took between these multiples of what those of the first generation take: most are left sooner.
+FOLLOWED = (0.1, 1.5)
 #: Fitness of what diverges or has no chance of being a parent: PyGAD takes finite numbers only.
 HOPELESS = -1e300
 #: Most evaluations that are not asked for by number: the lattice of a stage under its law has millions.
@@ -271,6 +275,9 @@ def genetic_search(
         )
     wanted = max(wanted, 2 * settings.population)
     total = wanted * len(settings.seeds)
+    if isinstance(progress, Progress):
+        name = "the stage" if structure.has_order_law else structure.outputs[0]
+        progress.expect(f"the genetic algorithm on {name}", *_seconds(problem, settings.population, total))
     ends: dict[int, _Kept] = {}
     for number, seed in enumerate(settings.seeds):
 
@@ -285,6 +292,16 @@ def genetic_search(
     orders, coefficients = problem.named(best.genes)
     errors = {seed: kept.best for seed, kept in ends.items()}
     return GeneticRun(orders, coefficients, errors, {s: kept.count for s, kept in ends.items()}, problem.bounds)
+
+
+def _seconds(problem: Problem, population: int, evaluations: int) -> tuple[float, float]:
+    """Least and most time of so many evaluations [s], as the first generation tells: later ones are left sooner."""
+    low, high = np.array([problem.bounds[n] for n in problem.names]).T
+    genes = low + np.random.default_rng(0).random((population, low.size)) * (high - low)
+    begun = time.perf_counter()
+    problem.errors(genes, math.inf)
+    each = (time.perf_counter() - begun) / population
+    return FOLLOWED[0] * each * evaluations, FOLLOWED[1] * each * evaluations
 
 
 def _evolved(

@@ -32,6 +32,7 @@ from ftlm.identification.local import errors_with_orders
 from ftlm.identification.warnings import broken_law, irregular, uncertain
 from ftlm.judge.comparison import compare_means
 from ftlm.model.model import Model
+from ftlm.search.beforehand import announce
 from ftlm.search.job import run_job
 from ftlm.search.orders import make_job
 from ftlm.search.result import SearchResult
@@ -230,6 +231,7 @@ def searched(
     with contextlib.ExitStack() as stack:
         requests = [job.request(name) for name, job in jobs.items()]
         kept = None if store is None else stack.enter_context(Store(store, requests))
+        announce(progress, list(jobs.values()), kept)
         return {
             name: run_job(job, store=kept, number=number, executor=executor)
             for number, (name, job) in enumerate(jobs.items())

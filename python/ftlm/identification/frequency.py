@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from statistics import NormalDist
 from typing import Literal
@@ -15,6 +15,8 @@ from ftlm.base.arrays import Floats, as_floats
 from ftlm.base.checks import check_known
 from ftlm.base.errors import ConvergenceError, DataError, ModelError
 from ftlm.base.log import LOG
+from ftlm.base.pace import between, expected
+from ftlm.base.progress import Course, Progress
 from ftlm.base.statistics import ROUNDING, chi_squared_99, is_white
 from ftlm.data.language import equation
 from ftlm.data.orders import Values
@@ -35,6 +37,10 @@ SAME = 1e-6
 FLOOR = 1e-13
 #: Frequencies of a record on which starts race.
 RACING = 800
+#: Shares of the whole that are done once starts are found, and once they have raced.
+STARTED, RACED = 0.25, 0.85
+#: Fits took between these multiples of what their numbers and frequencies let expect.
+CAME_TO = (0.4, 4.0)
 #: Lags at which residuals are looked at, from one frequency to the next.
 LAGS = 8
 
@@ -43,6 +49,7 @@ def identify_frequency(
     data: FrequencyData | Sequence[FrequencyData], structure: Structure | str, *, weights: Weights | ArrayLike = "auto",
     orders: Mapping[str, Values] | None = None, fixed: Mapping[str, float] | None = None,
     delay: Mapping[str, float | tuple[float, float]] | None = None, start: Mapping[str, float] | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> FrequencyIdentification:  # fmt: skip
     """Identify orders, coefficients and delays of equations from a measured frequency response or impedance.
 
@@ -66,6 +73,8 @@ def identify_frequency(
         See :func:`ftlm.equation`: lattices of orders bound them, too; a delay (least, largest) is estimated.
     start
         Values of free numbers by name to start from besides; what it leaves out is 1, 0 of a delay.
+    progress
+        Called with parts done and parts in all.
 
     Returns
     -------
@@ -93,6 +102,9 @@ def identify_frequency(
             f"{count // 2} frequencies give {count} numbers, and {numbers} are free ({', '.join(problem.names)}); "
             "measure more frequencies, or fix numbers"
         )
+    if isinstance(progress, Progress):
+        progress.expect("the fit", *between(expected(0.007 * numbers**2 + 2e-6 * numbers * count, 1), CAME_TO))
+    course = Course(progress)
     rows, limits, words = problem.constraints()
     LOG.info("identifying %s from %s", ", ".join(problem.names), ", ".join(r.name for r in records))
     total = sum(float(np.sum(np.abs(r.response * w) ** 2)) for r, w in zip(records, weight, strict=True))
@@ -100,7 +112,11 @@ def identify_frequency(
     few, light = zip(*(_thinned(r, w) for r, w in zip(records, weight, strict=True)), strict=True)
     racing = problem if count <= 2 * RACING else ResponseProblem(wanted, few, light)
     begun = [*_begun(racing, start, *racing.constraints()[:2]), *starts(racing)]
-    fits = [_fit(racing, values, *racing.constraints()[:2], FLOOR**2 * total) for values in begun]
+    course.at(STARTED)
+    fits = []
+    for values in begun:
+        fits.append(_fit(racing, values, *racing.constraints()[:2], FLOOR**2 * total))
+        course.at(STARTED + (RACED - STARTED) * len(fits) / len(begun))
     fits = [f for f in fits if math.isfinite(f.cost)]
     if not fits:
         raise ConvergenceError(
@@ -112,6 +128,7 @@ def identify_frequency(
     best = _fit(problem, problem.scaled(racing.in_seconds(first.values)), rows, limits, FLOOR**2 * total)
     if racing is problem and first.cost < best.cost:
         best = first
+    course.at(1.0)
     held = [words[k] for k in best.held]
     result = _result(problem, records, best, kind, (reached, len(fits)), held, exact=best.cost <= ROUNDING**2 * total)
     LOG.info("identified: %s", result.verdict())

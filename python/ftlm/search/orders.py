@@ -6,6 +6,7 @@ import contextlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -223,11 +224,17 @@ def resume_job(
     executor: Executor | None = None,
 ) -> SearchResult:
     """Go on with one search of a store."""
-    threads = 1 if executor is not None and threads is None else check_threads(threads)
+    threads = 1 if executor is not None and threads is None else threads
+    job = replace(job_of(store, number, threads), progress=_told(progress))
+    with _usable(store.path, store.contents.requests[number]):
+        return run_job(job, store=store, number=number, executor=executor)
+
+
+def job_of(store: Store, number: int, threads: int | None) -> Job:
+    """One search of a store as what it works on."""
     request = store.contents.requests[number]
     with _usable(store.path, request):
-        job = Job.of(request, threads, _told(progress))
-        return run_job(job, store=store, number=number, executor=executor)
+        return Job.of(request, check_threads(threads), None)
 
 
 @contextlib.contextmanager
