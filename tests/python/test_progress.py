@@ -1,6 +1,7 @@
 """The progress bar on terminals of any width and colour, and nothing in a pipe."""
 
 import io
+import math
 import re
 import sys
 import threading
@@ -14,9 +15,15 @@ from typer.testing import CliRunner
 import ftlm
 from ftlm.base import progress
 from ftlm.base.pace import by_output_error, expected, pace
-from ftlm.base.progress import PARTS, Course, left_in_words
+from ftlm.base.progress import PARTS, Course, expected_in_words, left_in_words
+from ftlm.cli import wait
 from ftlm.cli.app import app
 from ftlm.progress import Progress, Stoppable
+from ftlm.search.beforehand import announce, expected_seconds
+from ftlm.search.job import run_job
+from ftlm.search.orders import make_job
+from ftlm.search.store import Store
+from ftlm.search.work import EquationWork
 
 
 class Terminal(io.StringIO):
@@ -167,26 +174,171 @@ def test_time_left_follows_what_is_behind(monkeypatch):
     assert re.search(r"about \d+ s left", written)
 
 
-@pytest.mark.parametrize(
-    ("command", "words"), [("agreement", "fitting all parts"), ("select", "the largest candidate alone")]
-)
-def test_commands_that_take_long_say_so_beforehand(tmp_path, monkeypatch, command, words):
-    told = []
-    monkeypatch.setattr(Progress, "expect", lambda self, what, seconds: told.append((what, seconds)))
+@pytest.fixture
+def told(monkeypatch):
+    """What commands say beforehand, as if somebody sat before them: what takes how long at least and at most."""
+    said = []
+
+    def expect(self, what, least, most=None):
+        said.append((what, least, least if most is None else most))
+
+    monkeypatch.setattr(Progress, "expect", expect)
+    monkeypatch.setattr(Progress, "quiet", property(lambda self: False))
+    return said
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run, a frequency response and a model."""
     t = np.arange(320) * 0.05
     u = np.sign(np.sin(2 * t))
     y = np.cumsum(u) * 0.05 + 0.01 * np.random.default_rng(1).standard_normal(t.size)
     lines = [f"{a:.2f},{b:g},{c:.5f}" for a, b, c in zip(t, u, y, strict=True)]
     (tmp_path / "run.csv").write_text("\n".join(["t,u,y", *lines]))
-    asked = [command, str(tmp_path / "run.csv"), "-u", "u", "-y", "y", "--structure", "D y = a0 y + b0 u"]
-    done = CliRunner().invoke(app, asked)
+    w = np.geomspace(0.1, 10, 12)
+    answers = 1 / ((1j * w) ** 0.8 + 1)
+    cells = [f"{a:.6g},{h.real:.8g},{h.imag:.8g}" for a, h in zip(w, answers, strict=True)]
+    (tmp_path / "bode.csv").write_text("\n".join(["w [rad/s],real,imag", *cells]))
+    run = ftlm.load(tmp_path / "run.csv", inputs={"u": "u"}, outputs={"y": "y"})
+    ftlm.identify(run, ftlm.equation("D y = a0 y + b0 u")).model.save(tmp_path / "model.json")
+    return tmp_path
+
+
+ASKED = {
+    "identify": ("the fit", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
+    "identify --method multi-innovation": (
+        "the search", "run.csv -u u -y y --step 0.1 --structure", "D^alpha y = a D^beta y + b0 u",
+    ),
+    "identify --method genetic --evaluations 400": (
+        "the genetic algorithm on y", "run.csv -u u -y y --step 0.1 --structure", "D^alpha y = a0 y + b0 u",
+    ),
+    "agreement": ("fitting all parts", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
+    "select": ("choosing", "run.csv -u u -y y --structure", "D y = a0 y + b0 u"),
+    "search": ("the search", "run.csv -u u -y y --step 0.1 --structure", "D^alpha y = a D^beta y + b0 u"),
+    "identify-frequency": ("the fit", "bode.csv -u u -y y --structure", "D^alpha y = a0 y + b0 u"),
+    "design-input": ("the design", "model.json --peak 1 --duration 5 --sampling", "0.05"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("command", ASKED)
+def test_commands_that_take_long_say_so_beforehand(folder, monkeypatch, told, command):
+    monkeypatch.chdir(folder)
+    what, asked, last = ASKED[command]
+    done = CliRunner().invoke(app, [*command.split(), *asked.split(), last])
     assert done.exit_code == 0, done.stderr
-    ((what, seconds),) = told
-    assert what == words
-    assert seconds > 0
+    ((words, least, most),) = told
+    assert words == what
+    assert 0 < least < most < math.inf
+
+
+def test_large_files_and_long_records_are_announced_and_small_ones_are_not(folder, monkeypatch, told):
+    monkeypatch.chdir(folder)
+    asked = ["compare", "model.json", "run.csv", "-u", "u", "-y", "y"]
+    assert CliRunner().invoke(app, asked).exit_code == 0
+    assert told == []
+    size = (folder / "run.csv").stat().st_size
+    monkeypatch.setattr(wait, "OF_BYTE", 1.0 / size)
+    monkeypatch.setattr(wait, "OF_SAMPLE", 1.0 / 320)
+    for command in (asked, ["resid", *asked[1:]], ["simulate", *asked[1:], "-o", "out.csv"],
+                    ["report", "model.json", "--validation", *asked[2:], "-o", "out.html"]):  # fmt: skip
+        told.clear()
+        assert CliRunner().invoke(app, command).exit_code in (0, 4)
+        assert [words for words, *_ in told] == ["reading", "running the model"], command
+        assert all(0 < least < most for _, least, most in told)
+    told.clear()
+    assert CliRunner().invoke(app, ["open", "run.csv"]).exit_code == 0
+    assert [words for words, *_ in told] == ["reading"]
+
+
+def job(step=0.1, **settings):
+    t = np.arange(129) * 0.05
+    u = np.sign(np.sin(2 * t))
+    run = ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": np.cumsum(u) * 0.05})
+    return make_job(
+        run, ftlm.equation("D^alpha y = a D^beta y + c D^mu y + b D^nu u"), ftlm.lattice(step=step), **settings
+    )
+
+
+def test_a_search_is_announced_by_what_coarse_lattices_of_it_take(monkeypatch):
+    """A core that takes a millisecond a candidate, so that the whole search is known: within what is said."""
+    asked = job(threads=1)
+    whole = asked.equation_work().plan()[0]
+    now, seen = [0.0], []
+
+    def search(self, progress):
+        seen.append(self.plan()[0])
+        now[0] += 1e-3 * seen[-1]
+
+    monkeypatch.setattr(EquationWork, "search", search)
+    least, most = expected_seconds(asked, clock=lambda: now[0])
+    assert least < 1e-3 * whole < most
+    assert seen == sorted(set(seen))
+    assert max(seen) <= whole / 12
+    # Twice as slow a machine takes twice as long.
+    monkeypatch.setattr(EquationWork, "search", lambda self, _: now.__setitem__(0, now[0] + 2e-3 * self.plan()[0]))
+    assert expected_seconds(asked, clock=lambda: now[0])[0] == pytest.approx(2 * least, rel=0.5)
+
+
+def test_of_a_store_only_what_is_left_is_announced(tmp_path, told):
+    asked = job(0.2)
+    path = tmp_path / "search.ftlm"
+    with Store(path, [asked.request("y")]) as kept:
+        announce(Progress(""), [asked], kept)
+        run_job(asked, store=kept)
+        announce(Progress(""), [asked], kept)
+    (_, least, most), (_, *nothing) = told
+    assert 0 < least < most
+    assert nothing == [0.0, 0.0]
+
+
+def test_nobody_waits_for_an_announcement_that_nobody_sees(monkeypatch):
+    monkeypatch.setattr(EquationWork, "plan", lambda *_: pytest.fail("measured for nobody"))
+    announce(Progress("", quiet=True), [job()])
+    announce(lambda done, total: None, [job()])
+
+
+@pytest.mark.parametrize(
+    ("least", "most", "words"),
+    [(12.0, 12.0, "about 10 s"), (0.4, 5.0, "up to 5 s"), (5.0, 18.0, "5 to 20 s"), (30.0, 200.0, "30 s to 3 min"),
+     (4e3, 1e5, "70 min to 30 h")],
+)  # fmt: skip
+def test_times_beforehand_are_told_as_what_they_are_known_to(least, most, words):
+    assert expected_in_words(least, most) == words
+
+
+def test_work_that_grows_is_counted_and_no_end_is_made_up(monkeypatch):
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    for name, value in {"COLUMNS": "80", "TERM": "xterm-256color"}.items():
+        monkeypatch.setenv(name, value)
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with Progress("fitting candidates") as bar:
+        for done in (3, 8, 8):
+            bar.so_far(done, 8)
+            time.sleep(0.12)
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    assert "fitting candidates" in plain
+    assert "8 of 8 so far" in plain
+    assert "left" not in plain
+
+
+@pytest.mark.parametrize("columns", [40, 80, 120])
+def test_a_long_label_leaves_bar_and_figures_their_room(monkeypatch, columns):
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    for name, value in {"COLUMNS": str(columns), "TERM": "xterm-256color"}.items():
+        monkeypatch.setenv(name, value)
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with Progress("stage 1: all orders and coefficients together by output error, from the current alone") as bar:
+        for done in (300, 400):
+            bar(done, PARTS)
+            time.sleep(0.12)
+    plain = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", terminal.getvalue())
+    assert re.search(r"━+.* 40 %.*about 1 s left", plain)
+    assert max(len(line) for line in re.split(r"[\r\n]", plain)) <= columns
 
 
 def test_expectation_is_a_number_of_this_machine():
     assert 0.1 <= pace() < 1e4
     assert expected(10.0, 4) < expected(10.0, 1)
-    assert by_output_error(4000, 5) > by_output_error(400, 5) > by_output_error(400, 2)
+    assert by_output_error(40_000, 5) > by_output_error(4000, 5) > by_output_error(400, 5) > by_output_error(400, 2)
