@@ -311,6 +311,22 @@ def test_more_files_than_there_may_be_are_refused(page):
     assert "20 files" in told(text)
 
 
+def test_a_file_that_is_being_read_is_not_yet_fitted_and_says_so(page):
+    page.loop(put_beside(page.desk, "large.csv", 1))
+    wanted = {"estimation": "large.csv", "structure": "D y = a y + b u"}
+    for path in ("models", "check"):
+        text = page.own("POST", path, wanted)[2]
+        assert "'large.csv' is still being read; wait until its columns are shown" in told(text)
+    # What was read before is no longer meant once it is read anew.
+    page.desk.files["large.csv"].told = {"problem": "", "options": {}}
+    page.desk.files["large.csv"].task = Task({}, page.desk.folder, lambda _: None)
+    assert "still being read" in told(page.own("POST", "models", wanted)[2])
+    page.desk.files["large.csv"].task = None
+    page.desk.files["large.csv"].told["problem"] = "no output is named"
+    assert "is no run yet: no output is named" in told(page.own("POST", "models", wanted)[2])
+    assert page.desk.models == {}
+
+
 def test_an_upload_that_is_cut_off_leaves_nothing(page):
     status, _, text = page.own("POST", "files", headers={"content-type": RAW}, query="name=cut.csv",
                                chunks=[b"t,u,y\n"], cut=True)  # fmt: skip

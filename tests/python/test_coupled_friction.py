@@ -254,6 +254,44 @@ def test_hubs_keep_their_friction_beside_the_other_stage(cross) -> None:
     assert structure.sticks == (0, 2)
 
 
+def test_friction_is_named() -> None:
+    named = ftlm.flexible_link(stage="both", coupling="simulated", friction="coulomb")
+    assert str(named) == str(ftlm.flexible_link(stage="both", coupling="simulated", friction=True))
+    near = ftlm.flexible_link(stage="both", coupling="simulated", friction="stribeck")
+    assert [f.names for e in near.equations if (f := e.friction) is not None] == [
+        ("fc1", "fs1", "vs1"), ("fc2", "fs2", "vs2"),
+    ]  # fmt: skip
+    # The hub holds at rest what it takes at speed and more, until 0.5 A push it away.
+    values = {"a1": 628.0, "b1": -62.0, "d1": 2.0, "g1": 140.0, "a2": -235.5, "d2": -0.75}
+    t = np.arange(201) * 0.005
+    run = ftlm.Run.from_arrays(
+        step=0.005, inputs={"I1": 0.5 * t}, outputs={"theta11": 0 * t, "theta12": 0 * t}, intersample={"I1": "foh"}
+    )
+    moved = []
+    for rubs in ({"fc1": 20.0}, {"fc1": 20.0, "fs1": 15.0, "vs1": 0.05}):
+        structure = ftlm.flexible_link(coupling="simulated", friction="coulomb" if len(rubs) == 1 else "stribeck")
+        orders = dict.fromkeys(structure.order_names, 1.0) | {"alpha1": 2.0, "beta2": 0.0}
+        model = ftlm.Model(structure.with_orders(orders).with_coefficients({**values, **rubs}), orders=orders)
+        moved.append(t[np.argmax(np.abs(model.simulate(run)["theta11"]) > 1e-6)])
+    assert moved == pytest.approx([20 / 140 / 0.5, 35 / 140 / 0.5], abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"friction": "colomb"}, "friction = 'colomb' is not known; use False, 'coulomb' or 'stribeck'"),
+        ({"friction": 2}, "friction = 2 is not known"),
+        ({"friction": "stribeck"}, "of the velocity that the model gives; use coupling='simulated'"),
+        ({"hub": "no"}, "hub = 'no' is neither True nor False"),
+        ({"cross_damping": 1}, "cross_damping = 1 is neither True nor False"),
+        ({"cross_sensitivity": "inertial"}, "cross_sensitivity = 'inertial' is neither True nor False"),
+    ],
+)  # fmt: skip
+def test_words_that_mean_nothing_are_refused_by_the_link(options, said: str) -> None:
+    with pytest.raises(ModelError, match=said):
+        ftlm.flexible_link(**options)
+
+
 def test_what_is_carried_does_not_turn_friction_round() -> None:
     words = "D^2 x = c D^2 y + u - fx*sign(D x); D^2 y = D^2 x - 9 y - 1 D y"
     t = np.arange(101) * 0.02

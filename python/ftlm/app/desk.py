@@ -243,7 +243,7 @@ class Desk:
         Raises
         ------
         DataError, ModelError
-            A file that is not there or no run yet; words that are not known; an equation that is none.
+            A file that is not there, being read or no run yet; words that are not known; an equation that is none.
         """
         other = str(told.get("validation") or "")
         share = real_number("share", told.get("share", 0))
@@ -268,6 +268,8 @@ class Desk:
         file = self.files.get(key)
         if file is None:
             raise DataError("no file is chosen; drop one first")
+        if file.task is not None or (file.told is None and not file.error):
+            raise DataError(f"{file.name!r} is still being read; wait until its columns are shown")
         if not file.is_run:
             raise DataError(f"{file.name!r} is no run yet: {file.told['problem'] if file.told else file.error}")
         return file.reading

@@ -13,9 +13,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, TypeAlias
 
+from msgspec import UNSET
+
 from ftlm.arm.parameters import INTEGER_ORDERS, PARAMETERS, LinkParameters
+from ftlm.base.checks import shown
 from ftlm.base.errors import ModelError
-from ftlm.data.equations import Equation, Friction, Term
+from ftlm.data.equations import Equation, Friction, Stribeck, Term
 from ftlm.data.filters import SensorFilter
 from ftlm.data.orders import Order
 from ftlm.data.structures import Hints, Structure, check_offset
@@ -34,6 +37,7 @@ ORDER_OF = {"a": "beta", "b": "gamma", "d": "mu"}
 Form: TypeAlias = Literal["lagrange", "published"]
 InputOrder: TypeAlias = Literal["published", "derived"]
 CrossStage: TypeAlias = Literal["torques", "inertial"] | bool
+Rubs: TypeAlias = Literal["coulomb", "stribeck"] | bool
 Law: TypeAlias = Literal["orders", "coefficients", "velocities"]
 #: What is known of the arm.
 LAWS = ("orders", "coefficients", "velocities")
@@ -125,8 +129,8 @@ def order_law(
 def flexible_link(
     *,
     stage: Literal[1, 2, "both"] = 1, form: Form | None = None, input_order: InputOrder | None = None,
-    coupling: Literal["simulated", "measured"] | None = None, cross_stage: CrossStage = False, friction: bool = False,
-    cross_sensitivity: bool = False, cross_damping: bool = False, hub: bool = True,
+    coupling: Literal["simulated", "measured"] | None = None, cross_stage: CrossStage = False,
+    friction: Rubs = False, cross_sensitivity: bool = False, cross_damping: bool = False, hub: bool = True,
     laws: Sequence[Law] = ("orders", "coefficients"),
     parameters: Literal["effective", "table-3"] = "effective",
     sensor_filter: SensorFilter | Literal["stock"] | None = None,
@@ -164,11 +168,13 @@ def flexible_link(
         in (8): theta_21 stands in the equation of theta_12 with alpha_2 - mu_2 + gamma_3, and so on. Of a stage alone
         these terms are of the order of their equation, alpha_2, alpha_3 or alpha_4.
     friction
-        Adds Coulomb friction to the hub's equation. With ``coupling="simulated"``, in the Lagrange form, it is
-        - fc_j * sign(D theta_j1) of the velocity that the model itself gives, set-valued at rest (:class:`Friction`),
-        by output error: hubs stick and slip while their links ring, with ``stage="both"`` and inertial coupling each of
-        them while the other's motion shakes it. With measured coupling it is a
-        linear term c * coulomb_theta_j1 of the sign of the measured velocity, in the published form of both equations.
+        ``"coulomb"`` (or True) adds Coulomb friction to the hub's equation. With ``coupling="simulated"``, in the
+        Lagrange form, it is - fc_j * sign(D theta_j1) of the velocity that the model gives, set-valued at rest
+        (:class:`Friction`), by output error: hubs stick and slip while their links ring, with ``stage="both"`` and
+        inertial coupling each of them while the other's motion shakes it. With measured coupling it is a linear term
+        c * coulomb_theta_j1 of the sign of the measured velocity, in the published form of both equations.
+        ``"stribeck"``, with simulated coupling, adds what hubs have more near rest, fs_j below the speed vs_j
+        (:class:`Stribeck`).
     cross_sensitivity
         Adds hub angles as they are (order 0) to the deflection's equation: strain gauges and cables make a measured
         deflection follow the hub's angle. e_2 theta_11 in that of theta_12, and with ``cross_stage="inertial"``
@@ -228,8 +234,19 @@ def flexible_link(
         raise ModelError("cross_stage='inertial' follows from the energies, as form='lagrange' does; use that form")
     if parameters not in PARAMETERS:
         raise ModelError(f"parameters = {parameters!r} is not known; use {' or '.join(map(repr, PARAMETERS))}")
+    if not (isinstance(friction, bool) or friction in ("coulomb", "stribeck")):
+        raise ModelError(f"friction = {shown(friction)} is not known; use False, 'coulomb' or 'stribeck'")
+    flags = {"cross_sensitivity": cross_sensitivity, "cross_damping": cross_damping, "hub": hub}
+    for name, flag in flags.items():
+        if not isinstance(flag, bool):
+            raise ModelError(f"{name} = {shown(flag)} is neither True nor False; use one of them")
     if coupling is None:
         coupling = "measured" if form == "lagrange" else "simulated"
+    if friction == "stribeck" and coupling != "simulated":
+        raise ModelError(
+            "friction='stribeck' is of the velocity that the model gives; use coupling='simulated', or "
+            "friction='coulomb'"
+        )
     if friction and coupling == "simulated" and form != "lagrange":
         raise ModelError(
             "friction=True with coupling='simulated' follows hubs of form='lagrange', where it does not enter the "
@@ -253,9 +270,10 @@ def flexible_link(
     for j in stages:
         named = input_order if form == "published" else None
         orders = order_law(j, form=form, input_order=named, velocities="velocities" in laws)
-        made = _stage(j, form, orders, laws, friction and coupling == "measured")
+        made = _stage(j, form, orders, laws, bool(friction) and coupling == "measured")
         if friction and coupling == "simulated":
-            made = (replace(made[0], coulomb=Friction(f"fc{j}", -1.0)), made[1])
+            near = Stribeck(f"fs{j}", f"vs{j}") if friction == "stribeck" else UNSET
+            made = (replace(made[0], coulomb=Friction(f"fc{j}", more=near)), made[1])
         if cross_stage:
             made = _pushed(made, j, laws, stage == "both") if cross_stage == "inertial" else _twisted(made, j)
         if cross_damping:
