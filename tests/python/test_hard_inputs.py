@@ -9,6 +9,7 @@ import pytest
 
 import ftlm
 from ftlm.identification.warnings import INSEPARABLE, VAGUE
+from ftlm.selection.trial import fit
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 TRUTH = {"alpha": 1.8, "nu": 0.8, "a1": -2.0, "a0": -25.0, "b0": 25.0}
@@ -156,3 +157,16 @@ def test_noise_beyond_the_instruments_is_a_typed_error_or_said():
     assert identified(run(square(), noise=1.0), "instrumental-variables").warnings
     with pytest.raises(ftlm.FtlmError, match="none of 35 candidates has a finite score; check the data"):
         identified(run(square(), noise=3.2), "instrumental-variables")
+
+
+def test_a_candidate_whose_squares_are_no_numbers_is_one_that_cannot_be_fitted():
+    """Of a first-order machine, fourth-order starts may all run away: a choice counts it as failed and goes on."""
+    t = np.arange(3000) * 0.01
+    u = np.sign(np.sin(1.7 * t) + 0.4 * np.sin(5.1 * t))
+    machine = ftlm.Model(ftlm.equation("D^1.2 y = -3 D^0.2 y - 2 y + 4 u"))
+    y = machine.simulate(ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": 0 * t}))["y"]
+    y = y + 0.02 * np.random.default_rng(2).standard_normal(t.size)
+    measured = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})
+    words = "D^4 y = a3 D^3 y + a2 D^2 y + a1 D y + a0 y + b1 u"
+    with pytest.raises(ftlm.ConvergenceError, match="free run of y ends beyond the range of numbers"):
+        fit([measured], ftlm.equation(words, offset="auto"), [], refine=False)

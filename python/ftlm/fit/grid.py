@@ -276,8 +276,9 @@ class Grid:
         ])  # fmt: skip
 
     def levels(self, attempt: Attempt) -> dict[str, float]:
-        """Root mean square of the weighted residuals by output, over all runs."""
-        return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled(attempt).items()}
+        """Root mean square of the weighted residuals by output, over all runs; infinite beyond the numbers."""
+        with np.errstate(over="ignore"):
+            return {o: float(np.sqrt(np.mean(e**2))) for o, e in self.pooled(attempt).items()}
 
     def pooled(self, attempt: Attempt) -> dict[str, Floats]:
         """Weighted residuals that are there by output, all runs one after another."""

@@ -249,7 +249,7 @@ def fit_output_error(
     DataError
         Fewer samples than free numbers.
     ConvergenceError
-        No start has a finite free run.
+        No start has a finite free run, or one whose squares are numbers.
     """
     outset = Outset.of(runs, structure)
     problem, outputs = outset.problem, structure.outputs
@@ -328,6 +328,12 @@ def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -
     for turn in range(last + 1):
         attempt = grid.descend(attempt, LAST_LAP, plain=True)
         levels = scales(grid, attempt) if loss == "huber" else grid.levels(attempt)
+        beyond = [o for o, level in levels.items() if not math.isfinite(level)]
+        if beyond:
+            raise ConvergenceError(
+                f"wherever it starts, the free run of {beyond[0]} ends beyond the range of numbers: it grows; leave out "
+                "the term that pushes, or bound its coefficient"
+            )
         settled = all(abs(v - 1.0) < SETTLED for v in levels.values())
         shares = huber_shares(grid, attempt, levels) if loss == "huber" else None
         if turn == last or (settled and same_shares(grid.shares, shares)):
