@@ -9,6 +9,8 @@ import pytest
 
 import ftlm
 from ftlm.identification.warnings import INSEPARABLE, VAGUE
+from ftlm.selection.automatic import automatic
+from ftlm.selection.candidates import Inside
 from ftlm.selection.trial import fit
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
@@ -167,6 +169,7 @@ def test_a_candidate_whose_squares_are_no_numbers_is_one_that_cannot_be_fitted()
     y = machine.simulate(ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": 0 * t}))["y"]
     y = y + 0.02 * np.random.default_rng(2).standard_normal(t.size)
     measured = ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})
-    words = "D^4 y = a3 D^3 y + a2 D^2 y + a1 D y + a0 y + b1 u"
+    inside = Inside(automatic([measured])[3])
+    structure = next(s for c in inside.skeletons() if "a3 D^3 y" in str(s := inside.build(c.variant)))
     with pytest.raises(ftlm.ConvergenceError, match="free run of y ends beyond the range of numbers"):
-        fit([measured], ftlm.equation(words, offset="auto"), [], refine=False)
+        fit([measured], structure, [], refine=False)

@@ -331,8 +331,8 @@ def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -
         beyond = [o for o, level in levels.items() if not math.isfinite(level)]
         if beyond:
             raise ConvergenceError(
-                f"wherever it starts, the free run of {beyond[0]} ends beyond the range of numbers: it grows; leave out "
-                "the term that pushes, or bound its coefficient"
+                f"wherever it starts, the free run of {beyond[0]} ends beyond the range of numbers: it grows; leave "
+                "out the term that pushes, or bound its coefficient"
             )
         settled = all(abs(v - 1.0) < SETTLED for v in levels.values())
         shares = huber_shares(grid, attempt, levels) if loss == "huber" else None
