@@ -7,6 +7,7 @@ import functools
 import inspect
 import json
 import os
+import re
 import sys
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
@@ -17,9 +18,12 @@ from typer.core import TyperCommand
 
 from ftlm.base.errors import FtlmError, InternalError, ModelError, RigFault
 from ftlm.cli.words import in_options
+from ftlm.paint.text import columns, wrapped
 
 #: Options that people take for others, from other programs or from the names of ftlm's functions.
 MEANT = {"--equation": "--structure"}
+#: So many gaps between its cells make a line the row of a table.
+ROW, _GAPS, _ENTRY = 3, re.compile(" {2,}"), re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )")
 EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
 
 
@@ -108,7 +112,27 @@ def show(result: Any, *, as_json: bool) -> None:
     if as_json:
         show_json(result.to_dict())
     else:
-        print(in_options(str(result)))
+        say(str(result))
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Print what people read, in lines that a terminal does not break within words.
+
+    Rows of tables and commands to be copied stay as they are.
+    """
+    text = in_options(text)
+    if sys.stdout.isatty():
+        text = "\n".join(broken for line in text.split("\n") for broken in _broken(line))
+    print(text, end=end)
+
+
+def _broken(line: str) -> list[str]:
+    lead = line[: len(line) - len(line.lstrip())]
+    if len(line) <= columns() or line.startswith("next: ") or len(_GAPS.findall(line.strip())) >= ROW:
+        return [line]
+    # An entry such as "  mode  of so much": what follows stands under its words.
+    entry = _ENTRY.match(line)
+    return wrapped(line.strip(), lead, " " * (entry.end() if entry else len(lead) + 2))
 
 
 def show_json(document: Any) -> None:

@@ -12,9 +12,9 @@ from typer import Option
 from ftlm import control as designs
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free, write_atomically
-from ftlm.cli.command import command, show_json
+from ftlm.cli.command import command, say, show_json
 from ftlm.cli.options import Force, Json, Noise, Number, SavedModel, Text, Texts
-from ftlm.cli.words import in_options, numbers, several
+from ftlm.cli.words import numbers, several
 from ftlm.cli.written import check_ending, say_written
 from ftlm.model.model import load_model
 
@@ -116,7 +116,7 @@ def control(
         show_json(found.to_dict() | {"planned": None if planned is None else planned.to_dict()})
         return
     for line in (found, *([running] if design == "pid" else []), *([planned] if planned is not None else [])):
-        print(in_options(str(line)))
+        say(str(line))
     say_written(out, plan)
 
 
@@ -145,7 +145,7 @@ def shape(
     if as_json:
         show_json(made.to_dict() | {"rate": rate, "samples": taps})
         return
-    print(in_options(str(made)))
+    say(str(made))
     say_written(out)
 
 

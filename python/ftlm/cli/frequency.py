@@ -10,7 +10,7 @@ from typer import Argument, Option
 from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
 from ftlm.base.progress import Progress
-from ftlm.cli.command import command, show_json
+from ftlm.cli.command import command, say, show_json
 from ftlm.cli.options import (
     Decimal,
     Force,
@@ -27,7 +27,7 @@ from ftlm.cli.options import (
     Verbose,
     layout_of,
 )
-from ftlm.cli.words import in_options, numbers, pairs, ranges
+from ftlm.cli.words import numbers, pairs, ranges
 from ftlm.data.response import FrequencyData
 from ftlm.files.response import load_frequency
 from ftlm.identification.frequency import identify_frequency as estimation
@@ -116,6 +116,6 @@ def identify_frequency(
         judged = {"verdict": result.verdict(checked).to_dict()}
         show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
-    print(in_options(result.summary(checked)).replace("result.warnings", "--verbose shows all"))
+    say(result.summary(checked).replace("result.warnings", "--verbose shows all"))
     if verbose:
-        print(in_options("\n".join(f"warning: {w}" for w in result.warnings)))
+        say("\n".join(f"warning: {w}" for w in result.warnings))

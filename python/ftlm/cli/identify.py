@@ -17,7 +17,7 @@ from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free
 from ftlm.base.pace import between, by_output_error, expected
 from ftlm.base.progress import Progress
-from ftlm.cli.command import EXIT_INTERRUPTED, command, show_json
+from ftlm.cli.command import EXIT_INTERRUPTED, command, say, show_json
 from ftlm.cli.options import (
     Files,
     Force,
@@ -32,7 +32,6 @@ from ftlm.cli.options import (
     Threads,
     Verbose,
 )  # fmt: skip
-from ftlm.cli.words import in_options
 from ftlm.data.lattice import Lattice
 from ftlm.data.run import Run
 from ftlm.data.settings import check_used
@@ -113,14 +112,14 @@ def identify(
         show_json({**judged, **result.to_dict(), "validation": None if checked is None else checked.to_dict()})
         return
     # What Python has as a method, the command line has as an option.
-    print(in_options(result.summary(checked)).replace("print(result.details())", "--verbose shows all"))
+    say(result.summary(checked).replace("print(result.details())", "--verbose shows all"))
     if verbose:
-        print(f"\n{in_options(result.details())}")
+        say(f"\n{result.details()}")
     if verbose and checked is not None:
-        print(f"\nvalidation on {', '.join(r.name for r in others)}\n{in_options(str(checked))}")
+        say(f"\nvalidation on {', '.join(r.name for r in others)}\n{checked}")
     elif checked is not None:
         print(f"validation on {', '.join(r.name for r in others)}")
-        print(in_options("\n".join(f"! {w}" for w in checked.warnings)), end="\n" if checked.warnings else "")
+        say("\n".join(f"! {w}" for w in checked.warnings), end="\n" if checked.warnings else "")
 
 
 @command
@@ -176,7 +175,7 @@ def show_searches(results: Mapping[str, SearchResult], *, as_json: bool) -> None
     if as_json:
         show_json({name: result.to_dict() for name, result in results.items()})
     else:
-        print(in_options("\n\n".join(f"{name}\n{result}" for name, result in results.items())))
+        say("\n\n".join(f"{name}\n{result}" for name, result in results.items()))
 
 
 @contextlib.contextmanager

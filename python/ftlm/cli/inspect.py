@@ -11,9 +11,8 @@ from typer import Argument
 
 from ftlm import _core
 from ftlm.base.checks import available_threads
-from ftlm.cli.command import command, show
+from ftlm.cli.command import command, say, show
 from ftlm.cli.options import Files, Json, ReadingOptions
-from ftlm.cli.words import in_options
 from ftlm.data.inspection import inspect_run
 from ftlm.rig.quanser import driver_state
 
@@ -41,7 +40,7 @@ def inspect(*, files: Files, reading: ReadingOptions, as_json: Json = False) -> 
         data = [{**figures.to_dict(), "advice": advice.to_dict()} for figures, advice in inspected]
         print(json.dumps(data, indent=1, ensure_ascii=False))
     else:
-        print(in_options("\n\n".join(f"{figures}\n{advice}" for figures, advice in inspected)))
+        say("\n\n".join(f"{figures}\n{advice}" for figures, advice in inspected))
 
 
 @command

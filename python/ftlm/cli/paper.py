@@ -12,7 +12,7 @@ from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_folder, check_free
 from ftlm.base.pace import expected
 from ftlm.base.progress import Progress
-from ftlm.cli.command import command, show_json
+from ftlm.cli.command import command, say, show_json
 from ftlm.cli.options import (
     Files,
     Force,
@@ -63,9 +63,9 @@ def demo(
         show_json(result.to_dict())
     else:
         if verbose:
-            print(f"{demo_details(result)}\n")
+            say(f"{demo_details(result)}\n")
         files = f"{Path(out) / 'demo.html'} (open it), and {len(result.files) - 1} runs and models"
-        print(f"{demo_text(result)}\nwritten: {files}")
+        say(f"{demo_text(result)}\nwritten: {files}")
 
 
 @command
@@ -103,7 +103,7 @@ def reproduce(
     if as_json:
         show_json({**result.to_dict(), "files": [str(f) for f in files]})
     else:
-        print(f"{reproduction_text(result)}\n\nwritten: {', '.join(str(f) for f in files)}")
+        say(f"{reproduction_text(result)}\n\nwritten: {', '.join(str(f) for f in files)}")
 
 
 @command
@@ -124,4 +124,4 @@ def orders(
     if as_json:
         show_json({**found.to_dict(), "files": [str(page)]})
     else:
-        print(f"{unseen_text(found)}\n\nwritten: {page}")
+        say(f"{unseen_text(found)}\n\nwritten: {page}")

@@ -18,7 +18,7 @@ from ftlm.base.errors import DataError, FtlmError
 from ftlm.data.response import FrequencyData, as_frequency_data
 from ftlm.identification.first import behaviour_figures, behaviour_tables, first_warnings, title_of, verdict_box
 from ftlm.identification.frequency_charts import bode_of, locus_of, misses_of
-from ftlm.identification.summary import behaviour_in_words, concerns_in_words, equations_in_words, wrapped
+from ftlm.identification.summary import behaviour_in_words, concerns_in_words, equations_in_words
 from ftlm.identification.verdict import TRUST, Verdict, verdict_html
 from ftlm.judge.concerns import BAD, CARE, concerns
 from ftlm.model.model import Model
@@ -26,7 +26,7 @@ from ftlm.model.typesetting import equation_html, parameter_table, units_of
 from ftlm.paint.figure import Figure
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
-from ftlm.paint.text import Cell, number, unbounded
+from ftlm.paint.text import Cell, number, unbounded, wrapped
 from ftlm.solve.frequency import frequency_response, response_inputs
 
 #: A model that misses more than this share of a response describes little of it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import textwrap
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -18,11 +17,10 @@ from ftlm.judge.comparison import Comparison, offsets_in_words
 from ftlm.judge.concerns import SHOWN, concerns, left_over
 from ftlm.model.model import Model
 from ftlm.model.typesetting import ORDER_DECIMALS, units_of
-from ftlm.paint.text import unbounded, with_error
+from ftlm.paint.text import unbounded, with_error, wrapped
 from ftlm.solve.modes import Mode, SteadyState, modes, steady_states
 
-#: Columns of a line in a terminal, and most modes that are listed.
-WIDTH = 110
+#: Most modes that are listed.
 MOST_MODES = 6
 
 
@@ -35,12 +33,6 @@ def summary(result: Judged, validation: Comparison | None = None) -> str:
     lines += [*fits_in_words(result, validation), *_residuals(result), *_starts(result)]
     lines += concerns_in_words(result.warnings)
     return "\n".join(lines)
-
-
-def wrapped(text: str, lead: str = "") -> list[str]:
-    """Lines no longer than a terminal, those after the first set in."""
-    return textwrap.wrap(text, WIDTH, initial_indent=lead, subsequent_indent=" " * (len(lead) or 2),
-                         break_long_words=False, break_on_hyphens=False)  # fmt: skip
 
 
 def equations_in_words(model: Model, comparison: Comparison | None = None) -> list[str]:
@@ -78,18 +70,14 @@ def numbers_in_words(result: Judged) -> list[str]:
     rows = []
     for name, value in values.items():
         spread = f"± {unbounded(errors[name])}" if name in errors else ""
-        tail = units.get(name, "")
-        if name in result.profiles:
-            tail = f"{tail}  [{result.profiles[name]}]".strip()
+        tail = f"[{result.profiles[name]}]" if name in result.profiles else ""
         if name in stated:
             tail = f"{tail}  (stated {stated[name]:.6g})".strip()
-        rows.append((name, f"{value:.6g}", spread, tail))
+        rows.append((name, f"{value:.6g}", spread, units.get(name, ""), tail))
     if not rows:
         return []
-    widths = [max(len(row[k]) for row in rows) for k in range(3)]
-    lines = [
-        f"  {n:<{widths[0]}}  {v:>{widths[1]}} {s:<{widths[2]}}  {tail}".rstrip() for n, v, s, tail in rows
-    ]  # fmt: skip
+    a, b, c, d = (max(len(row[k]) for row in rows) for k in range(4))
+    lines = [f"  {n:<{a}}  {v:>{b}} {s:<{c}}  {f'{u:<{d}}  ' if d else ''}{tail}".rstrip() for n, v, s, u, tail in rows]
     note = "± is one standard error; 95 % intervals are ± 1.96 of these"
     note += ", in brackets by profile likelihood" if result.profiles else ""
     return [*lines, f"  ({note})"] if errors else lines

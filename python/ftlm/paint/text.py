@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
+import textwrap
 from numbers import Integral
 
 from markupsafe import Markup
@@ -11,6 +13,9 @@ from markupsafe import Markup
 #: Significant digits of every estimated number: more than any estimate here deserves, enough to compare with the paper.
 DIGITS = 5
 DIVERGED = "diverged"
+#: Letters of a line, at most and at least: of a terminal that is narrower as many as it has.
+WIDTH, NARROW = 110, 40
+_EQUATION = re.compile(r"D\^?\S* \S+ = ")
 GREEK = {
     "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "theta": "θ", "mu": "μ", "tau": "τ", "phi": "φ",
     "omega": "ω",
@@ -78,3 +83,18 @@ def with_error(value: float, error: float | None) -> str:
     if abs(value) >= 1e6 or not 0 <= decimals <= 9:
         return f"{value:.5g} ± {error:.2g}"
     return f"{value:.{decimals}f} ± {error:.{decimals}f}"
+
+
+def columns() -> int:
+    """Letters of a line: those of the terminal, or of ``COLUMNS``, within bounds; the most where there is none."""
+    return min(max(shutil.get_terminal_size((WIDTH, 40)).columns, NARROW), WIDTH)
+
+
+def wrapped(text: str, lead: str = "", further: str | None = None) -> list[str]:
+    """Lines no longer than a terminal, those after the first set in, as far as `further` if that is given."""
+    # Equations break between their terms; what is ± something, or so many per cent, stays together.
+    bound = re.sub(" (?![+-] )" if _EQUATION.match(text) else " (?=[±%])|(?<=±) ", "\u00a0", text)
+    lines = textwrap.wrap(bound, columns(), initial_indent=lead,
+                          subsequent_indent=" " * (len(lead) or 2) if further is None else further,
+                          break_long_words=False, break_on_hyphens=False)  # fmt: skip
+    return [line.replace("\u00a0", " ") for line in lines]

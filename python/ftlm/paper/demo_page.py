@@ -11,14 +11,14 @@ from markupsafe import Markup
 
 from ftlm.identification.first import behaviour_tables, first_warnings, verdict_box
 from ftlm.identification.page import estimates_table, grouped_warnings
-from ftlm.identification.summary import behaviour_in_words, concerns_in_words, equations_in_words, wrapped
+from ftlm.identification.summary import behaviour_in_words, concerns_in_words, equations_in_words
 from ftlm.judge.charts import comparison_charts
 from ftlm.model.charts import pole_charts
 from ftlm.paint.bars import bar_chart
 from ftlm.paint.figure import SMALL
 from ftlm.paint.page import Section, write_page
 from ftlm.paint.table import Table
-from ftlm.paint.text import Cell, symbol
+from ftlm.paint.text import Cell, symbol, wrapped
 from ftlm.paper.demo import Demo
 from ftlm.paper.figures import convergence_chart, derivative_chart
 from ftlm.paper.page import fits_text, stage_section
@@ -64,8 +64,7 @@ def demo_text(demo: Demo) -> str:
     """What came out on one screen: both verdicts, both models, who predicts the run that nobody saw, three warnings."""
     square = demo.square
     lines = [
-        f"A simulated flexible two-link arm: {square.length} rows of a square current, checked on a sine that no model "
-        "saw.", "",
+        f"A simulated flexible arm: {square.length} rows of a square current, checked on a sine.", "",
     ]  # fmt: skip
     for stage, results in demo.results.items():
         best = results["output error"]
@@ -77,18 +76,18 @@ def demo_text(demo: Demo) -> str:
         lines += [line for line in behaviour_in_words(best.model) if "mode" in line or "integrates" in line][:3]
         lines += [f"  {near} of {len(estimates)} numbers within two standard errors of the arm's own", ""]
     outputs = [r.output for stage in demo.rows for r in demo.rows[stage] if r.label == SHOWN_MODELS[0]]
-    lines.append(f"{'Fit of the free run, %':<24}" + "".join(f"{o:>20}" for o in outputs))
-    lines.append(f"{'':<24}" + f"{'square':>12}{'sine':>8}" * len(outputs))
+    lines.append(f"{'free run, fit %':<16}" + "".join(f"{o:>16}" for o in outputs))
+    lines.append(f"{'':<16}" + f"{'square':>10}{'sine':>6}" * len(outputs))
     for label in SHOWN_MODELS:
         fits = [
             fit for stage in demo.rows for r in demo.rows[stage] if r.label == label
             for fit in (r.output_error.fit, r.validation.fit)
         ]  # fmt: skip
-        shown = [f"{fit:.1f}" if math.isfinite(fit) else "–" for fit in fits]
-        lines.append(f"{label:<24}" + "".join(f"{v:>{(12, 8)[k % 2]}}" for k, v in enumerate(shown)))
+        shown = [f"{round(fit, 1) + 0.0:.1f}" if math.isfinite(fit) else "–" for fit in fits]
+        lines.append(f"{label:<16}" + "".join(f"{v:>{(10, 6)[k % 2]}}" for k, v in enumerate(shown)))
     lines += [
         "",
-        "Fits of pulse means, as in the paper. p weighs the data against a prior near zero; least squares has none.",
+        "Fits of pulse means, as in the paper, whose p weighs a prior near zero as well.",
     ]
     said = [w for results in demo.results.values() for w in results["output error"].warnings]
     lines += concerns_in_words(said, how="-v")
