@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import pty
@@ -15,6 +16,7 @@ import numpy as np
 import pytest
 
 import ftlm
+from ftlm.cli.command import broken_line, say
 from measured import DATA, needs_data
 
 
@@ -372,3 +374,32 @@ def test_an_equation_is_a_structure(folder: Path) -> None:
         assert "No such option: --equation; --structure takes equations in words, too." in found.stderr
     # Where there is no structure, it is as unknown as any other.
     assert "No such option: --equation" in ftlm_command("doctor", "--equation", "x", cwd=folder).stderr
+
+
+LONG = {
+    "D^2.0001 theta11 = 628.554 theta12 - 62.9418 D^0.95 theta11 + 6.64195 D^0.7498 theta12 + 140.4 I1(t - 0.035 s)": [
+        "D^2.0001 theta11 = 628.554 theta12 - 62.9418 D^0.95 theta11",
+        "  + 6.64195 D^0.7498 theta12 + 140.4 I1(t - 0.035 s)",
+    ],
+    "  gain   theta11 from I1: none, it integrates: 2.2312 ± 0.0027 rad/A; order 0.95 ± 0.01": [
+        "  gain   theta11 from I1: none, it integrates:", "         2.2312 ± 0.0027 rad/A; order 0.95 ± 0.01",
+    ],
+    "! residuals of y are not white: the model leaves something out, of which nothing is known": [
+        "! residuals of y are not white: the model leaves something", "  out, of which nothing is known",
+    ],
+    "a row  of a table  with  many cells  stays as it is  whatever  its length may be in the end": None,
+    "next: ftlm identify a.csv -u u -y y --structure 'D^alpha y = a0 y + b0 u' --time t --time-unit ms": None,
+    "short": None,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("line", LONG)
+def test_lines_break_between_words_and_equations_between_terms(monkeypatch, line):
+    monkeypatch.setenv("COLUMNS", "60")
+    parts = broken_line(line)
+    assert parts == (LONG[line] or [line])
+    assert " ".join(p.strip() for p in parts) == line.strip()
+    # Who reads a pipe gets each line whole.
+    monkeypatch.setattr("sys.stdout", io.StringIO())
+    say(line)
+    assert sys.stdout.getvalue() == f"{line}\n"

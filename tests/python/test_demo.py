@@ -2,12 +2,13 @@
 
 import pytest
 
+from ftlm.cli.command import broken_line
 from ftlm.paper.demo import run_demo
 from ftlm.paper.demo_page import demo_details, demo_page, demo_text
 
 
 @pytest.mark.slow
-def test_the_demo_is_one_screen_and_its_page_leads_with_the_verdicts(tmp_path):
+def test_the_demo_is_one_screen_and_its_page_leads_with_the_verdicts(tmp_path, monkeypatch):
     told, named = [], []
     demo = run_demo(
         tmp_path, step=0.35, noise=1e-4, seed=1, threads=None, force=False, say=named.append,
@@ -19,6 +20,11 @@ def test_the_demo_is_one_screen_and_its_page_leads_with_the_verdicts(tmp_path):
     assert max(map(len, lines)) <= 120
     assert sum(": TRUST: " in line for line in lines) == 2
     assert not any(line.startswith("warning") for line in lines)
+    # The same on a terminal of 80 columns, as the command line breaks its lines.
+    monkeypatch.setenv("COLUMNS", "80")
+    broken = [part for line in demo_text(demo).splitlines() for part in broken_line(line)]
+    assert len(broken) + 4 <= 42
+    assert max(map(len, broken)) <= 80
     assert sum(line.startswith("! ") for line in lines) <= 3
     # Nothing is lost behind it.
     said = [w for results in demo.results.values() for r in results.values() for w in r.warnings]

@@ -414,7 +414,7 @@ def test_parameters_stand_beside_the_stated_ones(identified):
     stated = identified.model.structure.reference
     assert [row[2] for row in table.rows[-8:]] == [stated[n] for n in identified.coefficients]
     plain = report.parameter_table(ftlm.Model(ftlm.equation("D y = a y + b u").with_coefficients({"a": -1, "b": 2})))
-    assert plain.columns == ("parameter", "value", "what it is")
+    assert plain.columns == ("parameter", "value", "unit", "what it is")
     assert [row[1] for row in plain.rows] == [-1, 2]
 
 

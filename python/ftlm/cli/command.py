@@ -122,11 +122,12 @@ def say(text: str, end: str = "\n") -> None:
     """
     text = in_options(text)
     if sys.stdout.isatty():
-        text = "\n".join(broken for line in text.split("\n") for broken in _broken(line))
+        text = "\n".join(broken for line in text.split("\n") for broken in broken_line(line))
     print(text, end=end)
 
 
-def _broken(line: str) -> list[str]:
+def broken_line(line: str) -> list[str]:
+    """A line as a terminal takes it: itself, or several where it is longer."""
     lead = line[: len(line) - len(line.lstrip())]
     if len(line) <= columns() or line.startswith("next: ") or len(_GAPS.findall(line.strip())) >= ROW:
         return [line]

@@ -124,6 +124,11 @@ def _number_math(value: float | Exact) -> Markup:
     return Markup("{}<mo>×</mo><msup><mn>10</mn>{}</msup>").format(base, raised)
 
 
+def _short(value: float) -> Exact:
+    """A number of an input as equations in words have it: of one that was estimated no more digits than of others."""
+    return Exact(f"{value:.6g}")
+
+
 def _symbol_math(name: str) -> Markup:
     parts = SYMBOL.fullmatch(name)
     if not parts:
@@ -135,10 +140,10 @@ def _symbol_math(name: str) -> Markup:
 def _derivative_math(order: Order, signal: str, delay: float = 0.0, limits: Sequence[Limit] = ()) -> Markup:
     written = _symbol_math(signal)
     if delay > 0:
-        written += _LATE.format(_number_math(Exact(delay)), THIN)
+        written += _LATE.format(_number_math(_short(delay)), THIN)
     for limit in limits:
         if limit.signal == signal and not isinstance(limit.value, tuple):
-            written = _LIMITED.format(SHORT[limit.law], written, _number_math(Exact(float(limit.value))))
+            written = _LIMITED.format(SHORT[limit.law], written, _number_math(_short(float(limit.value))))
     if not order.names and round(order.constant, ORDER_DECIMALS) == 0:
         return written
     value = Markup("<mi>{}</mi>").format(str(order)) if order.names else _signed(order.constant)
@@ -172,7 +177,7 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
         Caption.
     """
     reference = model.structure.reference
-    units = units_of(model) if any(model.units.values()) else {}
+    units = units_of(model)
     errors: Mapping[str, float | None] = {}
     extra: Mapping[str, float] = {}
     profiles: Mapping[str, tuple[float, float]] = {}
@@ -217,7 +222,7 @@ def parameter_table(model: Solved, joint: JointFit | None = None, *, title: str 
                 shown.add(name)
                 place = Markup("{} in the equation of {}").format(of[name], symbol_html(item.output))
                 rows.append(row(name, value, reference.get(name), place))
-    inputs = {input_name("delay", n): (f"delay of {symbol(n)} in s", v) for n, v in model.structure.delay.items()}
+    inputs = {input_name("delay", n): (f"delay of {symbol(n)}", v) for n, v in model.structure.delay.items()}
     for limit in model.structure.limits:
         if not isinstance(limit.value, tuple):
             inputs[limit.name] = (f"{WORDS[limit.law]} of {symbol(limit.signal)}", limit.value)

@@ -17,7 +17,7 @@ DIVERGED = "diverged"
 WIDTH, NARROW = 110, 40
 _EQUATION = re.compile(r"D\^?\S* \S+ = ")
 GREEK = {
-    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "theta": "θ", "mu": "μ", "tau": "τ", "phi": "φ",
+    "alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "theta": "θ", "mu": "μ", "nu": "ν", "tau": "τ", "phi": "φ",
     "omega": "ω",
 }  # fmt: skip
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
