@@ -7,6 +7,7 @@ import zipfile
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy import special
 
 import ftlm
 
@@ -203,6 +204,28 @@ def columns():
     rows = (f"  {a / 60:.12f}   {b:8.4f}   {c:12.6f}\n" for a, b, c in zip(t, u, 1e3 * y, strict=True))
     return Stranger("bench.dat", (text + "".join(rows).replace(".", ",")).encode(),
                     ("-u", "u=force", "-y", "y=tip", "--unit", "y=mm"))  # fmt: skip
+
+
+#: What a heated rod is made of: conductance of its surface and strength of its heater, over what sqrt(k rho c) says.
+ROD = {"alpha": 0.5, "a": -0.08, "b": 0.35}
+
+
+def rod(changes, seed, rows=450):
+    """A long rod heated at its end, which loses heat there, from Carslaw and Jaeger: a German csv with a line of units.
+
+    Each step of the power P raises the end by P b/a (1 - exp(a^2 t) erfc(a sqrt(t))) (Conduction of Heat in Solids,
+    section 2.7), whose equation is D^0.5 T = -a T + b P above the room's temperature.
+    """
+    t, a, b = np.arange(rows) * 1.0, -ROD["a"], ROD["b"]
+    power, end = np.zeros(rows), np.full(rows, 21.4)
+    for at, change in changes:
+        late = np.maximum(t - at, 0.0)
+        power += np.where(t >= at, change, 0.0)
+        end += change * b / a * (1.0 - special.erfcx(a * np.sqrt(late)))
+    end += 0.05 * np.random.default_rng(seed).standard_normal(rows)
+    text = "Heizstab 2, Messung vom 3. Mai;;\n;;\nZeit;Heizleistung;Temperatur\ns;W;°C\n"
+    rows_of = "".join(f"{x:.1f};{p:.1f};{y:.2f}\n" for x, p, y in zip(t, power, end, strict=True))
+    return (text + rows_of.replace(".", ",")).replace("\n", "\r\n").encode("cp1252")
 
 
 #: How each is made; those that need a folder are given one.

@@ -42,6 +42,30 @@ def test_one_command_from_a_strangers_file_to_a_validated_model(files, name):
     assert found["validation"]["output_error"]["y"]["fit"] > 95
 
 
+def test_a_heated_rods_csv_becomes_a_model_of_half_an_order(tmp_path):
+    """From a file that physics wrote, and no equation of ours, to a model that predicts another one."""
+    (tmp_path / "other.csv").write_bytes(strangers.rod([(20, 5), (120, 8), (260, -13), (330, 10)], 9))
+    within = []
+    for seed in range(4):
+        (tmp_path / "rod.csv").write_bytes(strangers.rod([(10, 12), (150, -9), (230, 9), (290, -12), (350, 6)], seed))
+        done = command("identify", tmp_path / "rod.csv", "-u", "P=Heizleistung", "-y", "T=Temperatur", "--structure",
+                       "D^alpha T = a T + b P + c", "--intervals", "quadratic", "--validation", tmp_path / "other.csv",
+                       "--json")  # fmt: skip
+        assert done.exit_code == 0, done.output
+        found = json.loads(done.stdout)
+        for number, true in strangers.ROD.items():
+            low, high = found["intervals"][number]
+            assert high - low < 0.03 * abs(true), number
+            within.append(low < true < high)
+        assert found["verdict"]["level"] == "trust"
+        assert found["validation"]["output_error"]["T"]["fit"] > 98
+    # 95 % of twelve; of 24 seeds 70 of 72 lay within.
+    assert sum(within) >= 10
+    # What is above the table, its units, its commas and its letters were seen without a word.
+    opened = ftlm.open_file(tmp_path / "rod.csv")
+    assert [(c.role, c.unit) for c in opened.columns] == [("time", "s"), ("input", "W"), ("output", "°C")]
+
+
 @pytest.mark.parametrize("name", strangers.MAKERS)
 def test_the_record_is_the_one_that_was_written_and_open_says_all_that_was_assumed(files, name):
     folder, made = files

@@ -97,7 +97,7 @@ def units_of(model: Solved) -> dict[str, str]:
                 out[term.name] = unit
         if item.friction is not None:
             own = model.units.get(item.output, "")
-            force = f"{own} s^{-alpha:g}" if own else ""
+            force = f"s^{-alpha:g} {own}" if own else ""
             near = item.friction.stribeck
             named = [(item.friction.name, force)]
             if near is not None:
