@@ -6,6 +6,7 @@ import io
 import json
 import os
 import pty
+import re
 import signal
 import subprocess
 import sys
@@ -14,8 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import ftlm
+from ftlm.cli.app import app
 from ftlm.cli.command import broken_line, say
 from measured import DATA, needs_data
 
@@ -403,3 +406,18 @@ def test_lines_break_between_words_and_equations_between_terms(monkeypatch, line
     monkeypatch.setattr("sys.stdout", io.StringIO())
     say(line)
     assert sys.stdout.getvalue() == f"{line}\n"
+
+
+def test_the_list_of_commands_is_whole_sentences_and_no_help_names_a_type_of_python():
+    """At 80 columns; units in square brackets are there, and what people read has no angle brackets but choices."""
+    listed = CliRunner().invoke(app, ["-h"], env={"COLUMNS": "80"}).output
+    names = re.findall(r"^  ([a-z-]+)  +(\S.*)$", listed.partition("Commands:")[2], re.MULTILINE)
+    assert len(names) == 24
+    assert all(words.endswith(".") and not words.endswith("..") for _, words in names)
+    for name, _ in names:
+        told = CliRunner().invoke(app, [name, "-h"], env={"COLUMNS": "80"}).output
+        assert max(map(len, told.splitlines())) <= 95, name
+        assert not re.search(r"<(list|str|int|float|bool)", told), name
+        for line in re.findall(r"<[^>]*>", told):
+            assert "|" in line, (name, line)
+    assert "Sampling step [s] of files" in CliRunner().invoke(app, ["identify", "-h"], env={"COLUMNS": "120"}).output

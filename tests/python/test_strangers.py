@@ -46,7 +46,7 @@ def test_a_heated_rods_csv_becomes_a_model_of_half_an_order(tmp_path):
     """From a file that physics wrote, and no equation of ours, to a model that predicts another one."""
     (tmp_path / "other.csv").write_bytes(strangers.rod([(20, 5), (120, 8), (260, -13), (330, 10)], 9))
     within = []
-    for seed in range(4):
+    for seed in range(2):
         (tmp_path / "rod.csv").write_bytes(strangers.rod([(10, 12), (150, -9), (230, 9), (290, -12), (350, 6)], seed))
         done = command("identify", tmp_path / "rod.csv", "-u", "P=Heizleistung", "-y", "T=Temperatur", "--structure",
                        "D^alpha T = a T + b P + c", "--intervals", "quadratic", "--validation", tmp_path / "other.csv",
@@ -59,8 +59,8 @@ def test_a_heated_rods_csv_becomes_a_model_of_half_an_order(tmp_path):
             within.append(low < true < high)
         assert found["verdict"]["level"] == "trust"
         assert found["validation"]["output_error"]["T"]["fit"] > 98
-    # 95 % of twelve; of 24 seeds 70 of 72 lay within.
-    assert sum(within) >= 10
+    # 95 % of six; of 24 seeds 70 of 72 lay within.
+    assert sum(within) >= 5
     # What is above the table, its units, its commas and its letters were seen without a word.
     opened = ftlm.open_file(tmp_path / "rod.csv")
     assert [(c.role, c.unit) for c in opened.columns] == [("time", "s"), ("input", "W"), ("output", "°C")]

@@ -45,11 +45,36 @@ def version(
         raise typer.Exit
 
 
-for _command in (
-    demo, page, record, open_, inspect, identify, identify_frequency, select, agreement, search, resume, status,
-    compare, resid, simulate, design_input, control, shape, report, reproduce, orders, plot, export, doctor,
-):  # fmt: skip
-    app.command(_command.__name__.rstrip("_").replace("_", "-"), cls=Command)(_command)
+#: Commands as `ftlm -h` lists them; each has its whole sentence in its own help.
+COMMANDS = {
+    demo: "Identify a simulated arm, and draw what came out.",
+    page: "From a file to a model, in a browser.",
+    record: "Drive a rig, simulated by default, and record a run.",
+    open_: "Say what a file is, and what to type next.",
+    inspect: "Show ranges, noise and rest of a run, and advice.",
+    identify: "Identify a model from runs, with a verdict.",
+    identify_frequency: "The same from frequency responses, impedances.",
+    select: "Choose the structure that predicts.",
+    agreement: "Tell whether parts of runs are one model.",
+    search: "Rank all orders on a lattice.",
+    resume: "Go on with the searches of a store.",
+    status: "Show how far the searches of a store are.",
+    compare: "Judge a saved model on measured runs.",
+    resid: "Test what a saved model leaves over.",
+    simulate: "Run a saved model on a run's inputs.",
+    design_input: "Lay out the experiment that tells most.",
+    control: "Design a controller on a saved model.",
+    shape: "Make an input shaper of a saved model's poles.",
+    report: "Write the report of a saved model.",
+    reproduce: "Recompute the paper's tables and figures.",
+    orders: "Judge whole and fractional orders on a real arm.",
+    plot: "Draw a saved model for a paper.",
+    export: "Write a saved model for another tool.",
+    doctor: "Show versions, cores, and what is installed.",
+}
+for _command, _short in COMMANDS.items():
+    name = _command.__name__.rstrip("_").replace("_", "-")
+    app.command(name, cls=Command, short_help=_short)(_command)
 
 
 def main() -> None:

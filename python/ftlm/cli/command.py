@@ -24,11 +24,25 @@ from ftlm.paint.text import columns, wrapped
 MEANT = {"--equation": "--structure"}
 #: So many gaps between its cells make a line the row of a table.
 ROW, _GAPS, _ENTRY = 3, re.compile(" {2,}"), re.compile(r" *(?:[\w ]+\S {2,}|! |-> |\* |warning: |note: |assumed: )")
+#: Types as a person names them.
+KINDS = {
+    "<str>": "TEXT", "<list[str]>": "TEXT", "<float>": "NUMBER", "<int>": "N", "<int range>": "N", "<list[int]>": "N",
+    "<list[int range]>": "N",
+}  # fmt: skip
 EXIT_INTERNAL, EXIT_USAGE, EXIT_DATA, EXIT_VALIDATION, EXIT_RIG, EXIT_INTERRUPTED = 1, 2, 3, 4, 5, 130
 
 
 class Command(TyperCommand):
-    """A command that knows which of its options another name was meant for."""
+    """A command that knows which of its options another name was meant for, and names kinds of values in words."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        super().__init__(*given, **named)
+        for parameter in self.params:
+            # An argument is named by what it is of, and what no option names is a text or a number to a person.
+            told: Any = parameter
+            told.display_type_rich = functools.partial(
+                _kind, told.display_type_rich, argument=told.param_type_name == "argument"
+            )
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Options as usual; one that is another's name ends in a sentence."""
@@ -37,6 +51,11 @@ class Command(TyperCommand):
             if given not in known and MEANT.get(given) in known:
                 ctx.fail(f"No such option: {given}; {MEANT[given]} takes equations in words, too.")
         return super().parse_args(ctx, args)
+
+
+def _kind(kind: Callable[..., str], *, ctx: Any, argument: bool) -> str:
+    """What an option takes, in words."""
+    return "" if argument else KINDS.get(kind(ctx=ctx), kind(ctx=ctx))
 
 
 def command(work: Callable[..., None]) -> Callable[..., None]:

@@ -20,7 +20,6 @@ from ftlm.cli.options import (
     Separator,
     Sheet,
     Skipped,
-    StructureText,
     Text,
     Texts,
     Thousands,
@@ -80,7 +79,7 @@ class ResponseOptions:
 @command
 def identify_frequency(
     *, files: Annotated[list[str], Argument(metavar="FILE...", help="Frequency responses or impedance spectra.")],
-    structure: StructureText,
+    structure: Annotated[str, Option(metavar="EQUATION", help="Equation in words, such as D^alpha y = a0 y + b0 u.")],
     weights: Annotated[
         Literal["auto", "relative", "uniform", "deviation"],
         Option(help="relative to the size, uniform, or by stated deviations; auto: those where there are some."),
@@ -94,7 +93,7 @@ def identify_frequency(
     start: Annotated[Texts, Option(metavar="NAME=VALUE", help="Value of a free number to start from besides.")] = None,
     out: Out = None,
     report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
-    validation: Annotated[Text, Option(metavar="FILE", help="Another response.")] = None,
+    validation: Annotated[Text, Option(metavar="FILE", help="Another response, to judge the model on.")] = None,
     force: Force = False, verbose: Verbose = False, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Identify a model from a frequency response or an impedance: orders and coefficients with 95 % intervals."""

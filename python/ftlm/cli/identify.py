@@ -59,7 +59,7 @@ def fit_seconds(runs: Sequence[Run], structure: Structure, threads: int | None, 
 @command
 def identify(
     *, files: Files, structure: StructureText,
-    method: Annotated[Method, Option(help="Estimator.")] = "output-error",
+    method: Annotated[Method, Option(help="How numbers are estimated.")] = "output-error",
     reading: ReadingOptions, shape: StructureOptions, search: SearchOptions, genetic: GeneticOptions,
     loss: Annotated[
         Literal["squares", "huber"] | None,
@@ -81,7 +81,7 @@ def identify(
     ] = None,
     out: Out = None,
     report: Annotated[Text, Option(metavar="HTML", help="Page to write.")] = None,
-    validation: Annotated[Text, Option(metavar="FILE", help="Another run.")] = None,
+    validation: Annotated[Text, Option(metavar="FILE", help="Another run, to judge the model on.")] = None,
     force: Force = False, verbose: Verbose = False, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Identify a model: whether to trust it, its equations, numbers, gain and modes, its fit, and warnings in words."""
@@ -125,7 +125,7 @@ def identify(
 @command
 def search(
     *, files: Files, structure: StructureText,
-    coefficients: Annotated[Estimator, Option(help="Estimator of the coefficients.")] = "multi-innovation",
+    coefficients: Annotated[Estimator, Option(help="How coefficients are estimated.")] = "multi-innovation",
     reading: ReadingOptions, shape: StructureOptions, options: SearchOptions, threads: Threads = None,
     store: Annotated[Text, Option(metavar="FILE", help="Keep finished work there; go on with ftlm resume.")] = None,
     as_json: Json = False,

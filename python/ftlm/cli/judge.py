@@ -18,7 +18,6 @@ from ftlm.cli.options import (
     Force,
     Json,
     Number,
-    Out,
     Page,
     ReadingOptions,
     SavedModel,
@@ -148,7 +147,8 @@ def export(
     ],
     band: Annotated[Text, Option(metavar="LOW:HIGH", help="Frequencies [rad/s] that control needs.")] = None,
     order: Annotated[int, Option(help="Order of Oustaloup's filter, for control.")] = 5,
-    out: Out = None, force: Force = False, as_json: Json = False,
+    out: Annotated[Text, Option("-o", "--out", metavar="FILE", help="Where to write; default standard output.")] = None,
+    force: Force = False, as_json: Json = False,
 ) -> None:  # fmt: skip
     """Write a saved model for another tool, to a file or to standard output."""
     check_free(out, force=force, words=COMMAND)

@@ -49,18 +49,20 @@ CandidateTexts = Annotated[
 LatticeStep = Annotated[float, Option("--step", help="Step of the order lattice.")]
 BlockPulses = Annotated[int | None, Option("--m", help="Block pulses a run; default 2048, or what the runs carry.")]
 Threads = Annotated[int | None, Option("--threads", help="Threads; default FTLM_THREADS, or all cores.")]
-Out = Annotated[Text, Option("-o", "--out", metavar="FILE", help="Where to write.")]
+Out = Annotated[Text, Option("-o", "--out", metavar="FILE", help="Model to write, .json.")]
 Page = Annotated[str, Option("-o", "--out", metavar="HTML", help="Page to write.")]
 Force = Annotated[bool, Option("--force", help="Overwrite files.")]
 Json = Annotated[bool, Option("--json", help="Results as JSON.")]
-Verbose = Annotated[bool, Option("-v", "--verbose", help="Also all that is known: both errors, searches, warnings.")]
+Verbose = Annotated[bool, Option("-v", "--verbose", help="Also all else that is known, and all warnings.")]
 Noise = Annotated[Texts, Option(metavar="OUTPUT=A", help="Deviation of an output's noise; default what the fit left.")]
 #: How a file is laid out; `layout_of` a record that has some of them.
 Separator = Annotated[
     Literal["comma", "semicolon", "tab", "space"] | None,
     Option(help="Between cells of text; default what is there."),
 ]
-Decimal = Annotated[Literal["point", "comma"] | None, Option(help="Of numbers in text; default what is there.")]
+Decimal = Annotated[
+    Literal["point", "comma"] | None, Option(help="Mark of decimals in text; default what is there.")
+]
 Thousands = Annotated[
     Literal["none", "point", "comma", "space", "apostrophe"] | None,
     Option(help="What groups thousands of numbers in text; default what is there."),
@@ -82,14 +84,16 @@ def layout_of(record: object) -> dict[str, Any]:
 class ReadingOptions:
     """How files are read."""
 
-    time: Annotated[Text, Option(help="Column of time.")] = None
+    time: Annotated[Text, Option(help="Column of time; default by its name.")] = None
     time_unit: Annotated[
         Literal["s", "ms", "us", "min", "h"] | None,
         Option("--time-unit", help="Unit of that column; default what its header says, as in time [ms], or s."),
     ] = None
     sampling: Annotated[Number, Option(help="Sampling step [s] of files without a time column.")] = None
-    inputs: Annotated[Texts, Option("-u", "--input", metavar="NAME=COLUMN", help="An input.")] = None
-    outputs: Annotated[Texts, Option("-y", "--output", metavar="NAME=COLUMN", help="An output.")] = None
+    inputs: Annotated[
+        Texts, Option("-u", "--input", metavar="NAME=COLUMN", help="An input; NAME alone where it is its column's.")
+    ] = None
+    outputs: Annotated[Texts, Option("-y", "--output", metavar="NAME=COLUMN", help="An output, as -u.")] = None
     units: Annotated[Texts, Option("--unit", metavar="NAME=UNIT", help="Unit of a signal, such as deg.")] = None
     columns: Annotated[Text, Option(metavar="TOML", help="File that names columns and units.")] = None
     between: Annotated[
@@ -171,7 +175,7 @@ class StructureOptions:
     only: Annotated[Text, Option(metavar="OUTPUT", help="Only the equation of this output.")] = None
     coupling: Annotated[
         Literal["measured", "simulated"] | None,
-        Option(help="What drives free runs; default measured of a flexible link as (15), simulated of others."),
+        Option(help="Whose other outputs drive a free run; default measured of a flexible link, else simulated."),
     ] = None
     cross_stage: Annotated[bool, Option("--cross-stage", help="Add the other stage's angles and current.")] = False
     inertial: Annotated[
@@ -183,7 +187,7 @@ class StructureOptions:
     cross_damping: Annotated[
         bool, Option("--cross-damping", help="With --inertial: the rate of the other deflection, an observer's gain.")
     ] = False
-    friction: Annotated[bool, Option("--friction", help="Add a Coulomb term.")] = False
+    friction: Annotated[bool, Option("--friction", help="Add Coulomb friction of the hubs.")] = False
     laws: Annotated[
         Literal["none", "orders", "velocities"] | None,
         Option(
@@ -192,11 +196,11 @@ class StructureOptions:
     ] = None
     form: Annotated[
         Literal["lagrange", "published"] | None,
-        Option(help="Equation of the deflection: (15), or (23) as printed, see the manual; default lagrange."),
+        Option(help="Equation of the deflection: the paper's (15), or its (23) as printed; default lagrange."),
     ] = None
     input_order: Annotated[
         Literal["published", "derived"] | None,
-        Option(help="Order of the current in the published form, which it names; see the manual."),
+        Option(help="Order of the current in the published form, which it implies."),
     ] = None
     stock_filter: Annotated[bool, Option("--stock-filter", help="Deflections passed the stock 2 Hz low-pass.")] = False
     filtered: Annotated[
@@ -366,7 +370,10 @@ class SearchOptions:
     """How candidates are made, computed and ranked; None is an option that is not given."""
 
     criterion: Annotated[Criterion | None, Option(help="Error that ranks the candidates; default output-error.")] = None
-    norm: Annotated[Literal["l1", "l2"] | None, Option(help="l1 is (45), l2 is (46); default l1.")] = None
+    norm: Annotated[
+        Literal["l1", "l2"] | None,
+        Option(help="Of errors: l1 their sizes, the paper's (45), l2 their squares, (46); default l1."),
+    ] = None
     values: Annotated[
         Texts, Option("--lattice", metavar="NAME=LOW:HIGH:STEP", help="Values of an order; alpha means every alpha.")
     ] = None
@@ -375,7 +382,7 @@ class SearchOptions:
     k0: Annotated[Number, Option(help="Prior covariance of the coefficients, of multi-innovation; default 1.")] = None
     rows: Annotated[
         Literal["haar", "time"] | None,
-        Option(help="Coordinates of the rows of (44), of multi-innovation; default haar."),
+        Option(help="Rows of multi-innovation, the paper's (44), in Haar coordinates or in time; default haar."),
     ] = None
     m: BlockPulses = None
     keep: Annotated[int | None, Option(help="Rows of the ranked table; default 20.")] = None
