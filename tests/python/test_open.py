@@ -197,3 +197,10 @@ def test_what_is_opened_is_a_record(tmp_path):
     assert [(c.name, c.role, c.first) for c in opened.columns[:1]] == [("t", "time", 0.0)]
     assert json.loads(json.dumps(opened.to_dict()))["columns"][2]["high"] == pytest.approx(1.1)
     assert np.isfinite([c.high for c in opened.columns]).all()
+
+
+def test_several_inputs_drive_and_one_drives(tmp_path):
+    for header, verb in (("t,u,y", "'u' drives 'y'"), ("t,u1,u2,y", "'u1', 'u2' drive 'y'")):
+        cells = header.count(",")
+        (tmp_path / "run.csv").write_text(header + "\n" + "".join(f"{k}{f',{k % 3}' * cells}\n" for k in range(9)))
+        assert any(verb in a.words for a in ftlm.open_file(tmp_path / "run.csv").assumed)

@@ -1,6 +1,7 @@
 """Structures chosen by what they predict: the true one among those inside a richer one, and words where none can be."""
 
 import json
+import math
 import threading
 import time
 from dataclasses import replace
@@ -18,6 +19,7 @@ from ftlm.selection.automatic import automatic
 from ftlm.selection.candidates import Change, Inside, Variant, named
 from ftlm.selection.glance import contenders
 from ftlm.selection.growth import Fitted, Work, _judged, duration, listed
+from ftlm.selection.result import _percent
 from ftlm.selection.select import _as_good
 from ftlm.selection.trial import Folds, Trial, fit, judged, least_unseen, masked
 
@@ -465,3 +467,9 @@ def test_the_command(tmp_path):
     wrong = CliRunner().invoke(app, ["select", *files, *columns, "--structure", "auto", "--order", "alpha=1"])
     assert wrong.exit_code == 2
     assert "--order: of a structure that is given, not used with --structure auto" in wrong.output
+
+
+def test_a_fit_below_all_measure_keeps_its_column():
+    assert [_percent(v) for v in (99.123, -12.3, -1e15, -math.inf, math.nan)] == [
+        "99.12", "-12.30", "< -1000", "< -1000", "nan",
+    ]  # fmt: skip

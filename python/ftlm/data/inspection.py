@@ -77,7 +77,7 @@ class Inspection:
         return asdict(self)
 
     def __str__(self) -> str:
-        width = max(len(s.name) for s in self.signals) + 2
+        width = max(len(name) for name in ("signal", *(s.name for s in self.signals))) + 2
         heads = ("first", "low", "high", "mean", "sd", "noise", "quantum")
         lines = [
             f"run {self.run}: {self.rows} rows, step {self.step:g} s, {self.duration:g} s; "

@@ -296,7 +296,7 @@ class _Opening:
         said = []
         if guessed:
             inputs, outputs = listed(wanted.inputs.values(), 10), listed(wanted.outputs.values(), 10)
-            words = f"{inputs} drives {outputs}, by their names"
+            words = f"{inputs} {'drives' if len(wanted.inputs) == 1 else 'drive'} {outputs}, by their names"
             said.append(Assumption("inputs", inputs, words, "inputs={name: column}, outputs={name: column}"))
         left = ""
         if not wanted.outputs:

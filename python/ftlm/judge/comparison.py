@@ -124,12 +124,12 @@ class Comparison:
 
     def __str__(self) -> str:
         width = max(len(name) for name in self.output_error) + 2
-        lines = [f"{'output':<{max(width, 8)}}{'':<16}{'error':>12}{'RMSE':>12}{'NR':>10}{'fit %':>10}"]
+        lines = [f"{'output':<{max(width, 8)}}{'':<16}{'error':>12}{'RMSE':>12}{'NR':>10}{'fit %':>12}"]
         for name in self.output_error:
             both = (("equation error", self.equation_error[name]), ("output error", self.output_error[name]))
             for label, f in both:
                 lines.append(
-                    f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>10.4g}"
+                    f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>12.4g}"
                 )
         if self.sampled:
             count = max(sum(read(y).size for y in parts) for parts in self.measured.values())

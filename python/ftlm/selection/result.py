@@ -16,8 +16,8 @@ from ftlm.paint.table import Table
 from ftlm.paint.text import Cell
 from ftlm.selection.trial import LOST, Trial
 
-#: Rows that are printed.
-SHOWN = 12
+#: Rows that are printed, and a fit [%] below which one is as bad as another.
+SHOWN, HOPELESS = 12, -1000.0
 #: Said of a candidate whose free run grows.
 GROWS = " (grows without bound)"
 
@@ -147,11 +147,16 @@ class Selection(Reported):
                 lines.append(f"{mark}{'-':>9}{'-':>10}{trial.numbers:>9}  {trial.name}: {trial.failed}")
             else:
                 told = trial.name + (GROWS if trial.grows else "")
-                lines.append(f"{mark}{trial.unseen:>9.2f}{trial.seen:>10.2f}{trial.numbers:>9}  {told}")
+                lines.append(f"{mark}{_percent(trial.unseen):>9}{_percent(trial.seen):>10}{trial.numbers:>9}  {told}")
         if self.chosen >= SHOWN:
             trial = self.winner
-            lines.append(f"> {trial.unseen:>9.2f}{trial.seen:>10.2f}{trial.numbers:>9}  {trial.name}")
+            lines.append(f"> {_percent(trial.unseen):>9}{_percent(trial.seen):>10}{trial.numbers:>9}  {trial.name}")
         if len(self.trials) > SHOWN:
             lines.append(f"  … and {len(self.trials) - SHOWN} more")
         lines += [self.reason, *(f"warning: {w}" for w in self.warnings), "", str(self.best)]
         return "\n".join(lines)
+
+
+def _percent(fit: float) -> str:
+    """A fit as a table has it: how far below nothing one is that predicts nothing, nobody needs to know."""
+    return f"{fit:.2f}" if not fit < HOPELESS else f"< {HOPELESS:.0f}"
