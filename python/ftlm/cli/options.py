@@ -60,9 +60,7 @@ Separator = Annotated[
     Literal["comma", "semicolon", "tab", "space"] | None,
     Option(help="Between cells of text; default what is there."),
 ]
-Decimal = Annotated[
-    Literal["point", "comma"] | None, Option(help="Mark of decimals in text; default what is there.")
-]
+Decimal = Annotated[Literal["point", "comma"] | None, Option(help="Mark of decimals in text; default what is there.")]
 Thousands = Annotated[
     Literal["none", "point", "comma", "space", "apostrophe"] | None,
     Option(help="What groups thousands of numbers in text; default what is there."),
