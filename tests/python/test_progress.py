@@ -18,6 +18,7 @@ from ftlm.base.pace import by_output_error, expected, pace
 from ftlm.base.progress import PARTS, Course, expected_in_words, left_in_words
 from ftlm.cli import wait
 from ftlm.cli.app import app
+from ftlm.paper import unseen
 from ftlm.progress import Progress, Stoppable
 from ftlm.search.beforehand import announce, expected_seconds
 from ftlm.search.job import run_job
@@ -248,6 +249,18 @@ def test_large_files_and_long_records_are_announced_and_small_ones_are_not(folde
     told.clear()
     assert CliRunner().invoke(app, ["open", "run.csv"]).exit_code == 0
     assert [words for words, *_ in told] == ["reading"]
+
+
+def test_orders_on_unseen_runs_say_how_long_all_of_their_fits_take(monkeypatch, told):
+    signals = {f"theta{n}{k}": np.zeros(300) for n in (1, 2) for k in (1, 2)}
+    runs = [ftlm.Run.from_arrays(step=0.01, inputs={"I1": np.ones(300)}, outputs=signals, name=n) for n in "ab"]
+    monkeypatch.setattr(unseen, "_deflection", lambda *_: sys.exit("begun"))
+    with pytest.raises(SystemExit, match="begun"):
+        unseen.orders_on_unseen_runs(runs, threads=1, progress=Progress(""))
+    ((words, least, most),) = told
+    assert words == "all of it"
+    # Thirty-two fits of some ten numbers.
+    assert 0.4 < least < most < math.inf
 
 
 def job(step=0.1, **settings):

@@ -9,8 +9,10 @@ from statistics import median
 from typing import Any
 
 from ftlm.arm.link import flexible_link
-from ftlm.base.checks import listed
+from ftlm.base.checks import check_threads, listed
 from ftlm.base.errors import DataError, FtlmError, ModelError
+from ftlm.base.pace import between, by_output_error, expected
+from ftlm.base.progress import Progress
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.identification.identify import identify
@@ -334,6 +336,15 @@ def orders_on_unseen_runs(
         used.append(thinned(run, every) if every > 1 else run)
     deflections = {}
     both = len(stages) == 2
+    if isinstance(progress, Progress):
+        structures = [link_structure(stage, both=both, filtered=filtered) for stage in stages]
+        each = sum(
+            by_output_error(run.length, len(s.order_names) + len(s.coefficient_names))
+            for s in structures
+            for run in used
+        )
+        fits = len(KINDS) * (2 if both else 1) * each
+        progress.expect("all of it", *between(expected(fits, check_threads(threads))))
     for stage in stages:
         found = _deflection(link_structure(stage, both=both, filtered=filtered), "", used, threads, say, progress)
         if both:
