@@ -2,6 +2,7 @@
 
 use crate::lanes::{self, WIDTH};
 use crate::search::bound::adapted::Weighted;
+use crate::search::bound::tangents::Held;
 use crate::search::candidate::columns::{part_of, Columns};
 use crate::search::candidate::normal::Solve;
 use crate::search::candidate::problem::Problem;
@@ -110,6 +111,9 @@ pub(crate) struct Screen<const L: usize> {
     last: usize,
     /// What is left of a stretch.
     left: Vec<usize>,
+    /// What is remembered of the test vectors that follow coefficients, and the path that excluded one last.
+    held: Held,
+    path: usize,
 }
 
 impl<const L: usize> Screen<L> {
@@ -125,6 +129,8 @@ impl<const L: usize> Screen<L> {
             own: Vec::new(),
             last: 0,
             left: Vec::new(),
+            held: Held::default(),
+            path: 0,
         }
     }
 
@@ -208,7 +214,7 @@ impl<const L: usize> Screen<L> {
         limit: f64,
         (open, singular): &mut (Vec<Open>, Vec<u64>),
     ) {
-        let Self { solve, positions, initial, columns, coefficients, weights, own, last, .. } = self;
+        let Self { solve, positions, initial, columns, coefficients, weights, own, last, held, path, .. } = self;
         let failed = catalogue.problem.equations.solve(positions, initial, solve);
         #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
         let squares = match &catalogue.problem.squares {
@@ -244,6 +250,16 @@ impl<const L: usize> Screen<L> {
             }
             if let Some(adapted) = &catalogue.problem.adapted {
                 if adapted.exclude(columns, coefficients, limit, own, last) {
+                    continue;
+                }
+            }
+            if let (Some(tangents), true) = (&catalogue.problem.tangents, limit < f64::INFINITY) {
+                if tangents.exclude(columns, coefficients, limit, held) {
+                    continue;
+                }
+            }
+            if let (Some(roots), true) = (&catalogue.problem.roots, limit < f64::INFINITY) {
+                if roots.exclude(columns, coefficients, limit, path) {
                     continue;
                 }
             }

@@ -9,6 +9,7 @@ use rayon::prelude::*;
 use crate::dense;
 use crate::lanes::WIDTH;
 use crate::regressors::Bank;
+use crate::search::bound::losses::Losses;
 use crate::search::bound::probes::NONE;
 use crate::search::options::Norm;
 use crate::series::{divide, Buffers, Kernel};
@@ -34,16 +35,9 @@ pub(crate) struct Fitted {
 
 /// Some of them, and what rounding may do to all.
 pub(crate) struct Adapted {
-    norm: Norm,
+    losses: Losses,
     /// Row of an own column; [`NONE`] of another.
     rows: Vec<usize>,
-    /// What rounding may add to |⟨t, w⟩| per unit of a column's coefficient, and for the target.
-    rounding: Vec<f64>,
-    target_rounding: f64,
-    /// Sum of the moduli of an own column's kernel, times √M where the dual norm is that of squares; 0 of another.
-    lengths: Vec<f64>,
-    /// What rounding may add to a sum of as many terms as there are samples, per unit.
-    unit: f64,
     pub(crate) each: Vec<Fitted>,
 }
 
@@ -56,31 +50,12 @@ impl Adapted {
     }
 
     /// None yet, for these records.
-    #[allow(clippy::cast_precision_loss)]
     pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm) -> Self {
-        let width = banks.first().map_or(0, Bank::len);
-        let all: usize = targets.iter().map(Vec::len).sum();
-        let unit = 16.0 * f64::EPSILON * all as f64;
-        let sum = |x: &[f64]| x.iter().map(|v| v.abs()).sum::<f64>();
-        let (mut rounding, mut lengths) = (vec![0.0; width], vec![0.0_f64; width]);
-        let mut rows = vec![NONE; width];
+        let mut rows = vec![NONE; banks.first().map_or(0, Bank::len)];
         if let Some(bank) = banks.first() {
             own(bank).into_iter().enumerate().for_each(|(row, p)| rows[p] = row);
         }
-        let size = match norm {
-            Norm::L1 => 1.0,
-            Norm::L2 => (all as f64).sqrt(),
-        };
-        for (bank, target) in banks.iter().zip(targets) {
-            let target = sum(target);
-            for p in 0..width {
-                let length = sum(bank.kernel(p));
-                rounding[p] += unit * (sum(bank.column(p)) + length * target);
-                lengths[p] = lengths[p].max(length * size);
-            }
-        }
-        let target_rounding = 2.0 * unit * targets.iter().map(|y| sum(y)).sum::<f64>();
-        Self { norm, rows, rounding, target_rounding, lengths, unit, each: Vec::new() }
+        Self { losses: Losses::new(banks, targets, norm), rows, each: Vec::new() }
     }
 
     /// The test vector of the candidate with these columns and coefficients; none where its run or the vector leaves the
@@ -100,7 +75,7 @@ impl Adapted {
                 }
             }
             let error: Vec<f64> = divide(&driven, &divisor).ok()?.iter().zip(target).map(|(v, y)| y - v).collect();
-            let wanted: Vec<f64> = match self.norm {
+            let wanted: Vec<f64> = match self.losses.norm {
                 Norm::L1 => error.iter().map(|e| if *e < 0.0 { -1.0 } else { 1.0 }).collect(),
                 Norm::L2 => error,
             };
@@ -148,12 +123,12 @@ impl Adapted {
         own: &mut Vec<Weighted>,
         last: &mut usize,
     ) -> bool {
-        let limit = self.limit(limit);
-        let (mut rounding, mut length) = (self.target_rounding, self.size());
+        let limit = self.losses.limit(limit);
+        let (mut rounding, mut length) = (self.losses.target_rounding, self.size());
         own.clear();
         for (&p, &c) in terms.iter().zip(coefficients) {
-            rounding += c.abs() * self.rounding[p];
-            length += c.abs() * self.lengths[p];
+            rounding += c.abs() * self.losses.rounding[p];
+            length += c.abs() * self.losses.lengths[p];
             if self.rows[p] != NONE {
                 own.push((self.rows[p], c));
             }
@@ -162,7 +137,7 @@ impl Adapted {
             let which = (*last + turn) % self.each.len();
             let fitted = &self.each[which];
             let seen = terms.iter().zip(coefficients).fold(fitted.target, |sum, (&p, c)| sum - c * fitted.products[p]);
-            let allowed = (seen.abs() - rounding) / limit - self.unit * length;
+            let allowed = (seen.abs() - rounding) / limit - self.losses.unit * length;
             if self.within(fitted, own, allowed) {
                 *last = which;
                 return true;
@@ -171,21 +146,11 @@ impl Adapted {
         false
     }
 
-    /// What a norm must exceed for a raw score to exceed this limit; a hair more, for the rounding of the score itself.
-    #[inline(always)]
-    fn limit(&self, raw: f64) -> f64 {
-        (1.0 + self.unit)
-            * match self.norm {
-                Norm::L1 => raw,
-                Norm::L2 => raw.sqrt(),
-            }
-    }
-
     /// Largest ‖t‖ in the dual norm.
     #[inline(always)]
     #[allow(clippy::cast_precision_loss)]
     fn size(&self) -> f64 {
-        match (self.norm, self.each.first()) {
+        match (self.losses.norm, self.each.first()) {
             (Norm::L2, Some(fitted)) => (fitted.vector.len() as f64).sqrt(),
             _ => 1.0,
         }
@@ -212,14 +177,14 @@ impl Adapted {
             }
             for part in sums.chunks_exact(WIDTH) {
                 for n in 0..WIDTH {
-                    all[n] = match self.norm {
+                    all[n] = match self.losses.norm {
                         Norm::L1 if part[n].abs() > all[n] => part[n].abs(),
                         Norm::L1 => all[n],
                         Norm::L2 => all[n] + part[n] * part[n],
                     };
                 }
             }
-            let beyond = match self.norm {
+            let beyond = match self.losses.norm {
                 Norm::L1 => all.iter().any(|v| *v > most),
                 Norm::L2 => all.iter().sum::<f64>() > squares,
             };

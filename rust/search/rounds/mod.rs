@@ -1,5 +1,6 @@
 //! A search over a lattice, round by round.
 
+mod along;
 mod hunt;
 mod nearby;
 mod plan;

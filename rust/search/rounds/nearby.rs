@@ -34,16 +34,23 @@ impl Hunt<'_> {
     /// vectors made for candidates that the others do not exclude, and the bytes of each. None where there is no memory
     /// for them, or no use.
     pub(super) fn nearby(&mut self, kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<Option<(Adapted, u64)>> {
-        self.neighbours(kept, tried)?;
-        let hard = self.hard(kept)?;
-        let anew: Vec<Open> = hard.iter().filter(|open| tried.insert(open.index)).copied().collect();
-        self.follow(&anew, kept, Place::start(0), false)?;
-        self.neighbours(kept, tried)?;
+        let hard = self.better(kept, tried)?;
         // Of equation errors in squares the Gram matrix says all.
         if self.catalogue.problem.squares.is_some() {
             return Ok(None);
         }
         self.adapted(kept, hard)
+    }
+
+    /// Goes down from the best rows, and from what is found all over the lattice by the limit that they give, which it
+    /// returns.
+    pub(super) fn better(&mut self, kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<Vec<Open>> {
+        self.neighbours(kept, tried)?;
+        let hard = self.hard(kept)?;
+        let anew: Vec<Open> = hard.iter().filter(|open| tried.insert(open.index)).copied().collect();
+        self.follow(&anew, kept, Place::start(0), false)?;
+        self.neighbours(kept, tried)?;
+        Ok(hard)
     }
 
     /// Follows neighbours of the best rows, far ones first, until none is better.

@@ -5,6 +5,7 @@
 //! score kept: what is left out cannot be among the kept ones, so the table is that of brute force, ties by index.
 
 use std::borrow::Cow;
+use std::collections::HashSet;
 use std::sync::atomic::Ordering;
 
 use crate::error::Result;
@@ -95,7 +96,7 @@ impl<'a> Search<'a> {
             return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
         }
         let pay = count >= BOXED && Boxes::pay(&catalogue);
-        let Scouted { limit, which, adapted } = Hunt::new(&catalogue, None, pool, control).scout(pay)?;
+        let Scouted { mut kept, hard, which, adapted } = Hunt::new(&catalogue, None, pool, control).scout(pay)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
             problem.bound = problem.bound.take().map(|bound| bound.chosen(&which));
@@ -104,6 +105,20 @@ impl<'a> Search<'a> {
             catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(adapted.each.len() as u64));
             catalogue.problem.adapted = Some(adapted);
         }
+        if hard && algorithm(count, options) >= 4 {
+            let spare = catalogue.spare;
+            catalogue.spare -= pool.install(|| catalogue.problem.with_roots(spare));
+            let mut hunt = Hunt::new(&catalogue, None, pool, control);
+            if !pay {
+                let mut tried: HashSet<u64> = kept.rows.iter().map(|row| row.index).collect();
+                hunt.better(&mut kept, &mut tried)?;
+            }
+            if let Some(along) = hunt.along(kept.limit)? {
+                catalogue.spare = catalogue.spare.saturating_sub(along.held());
+                catalogue.problem.tangents = Some(along);
+            }
+        }
+        let limit = kept.limit;
         let boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
         control.check_stop()?;
         Ok(Self { catalogue, boxes, limit })

@@ -23,10 +23,15 @@ const VECTORS: usize = 16;
 /// part of the lattice excludes most of it.
 const GUESSED: u64 = 1 << 18;
 
+/// Where test vectors leave fewer than one of so many scouts open, nothing else pays.
+const EASY: usize = 8;
+
 /// What scouts came to.
 pub(super) struct Scouted {
-    /// A first limit.
-    pub(super) limit: f64,
+    /// The rows that give a first limit.
+    pub(super) kept: Kept,
+    /// Whether test vectors leave so many of them open that candidates are to be proved closely.
+    pub(super) hard: bool,
     /// The test vectors to work with, the best first.
     pub(super) which: Option<Vec<usize>>,
     /// Those made for candidates, and the bytes of each.
@@ -92,12 +97,14 @@ impl Hunt<'_> {
             made = self.nearby(&mut kept, &mut tried)?;
         }
         let limit = kept.limit;
+        let waiting = found.iter().filter(|(_, each)| !each.iter().any(|bound| *bound > limit)).count();
+        let hard = waiting * EASY >= found.len();
         // Where no coefficients are known yet all test vectors count.
         let which = problem.bound.as_ref().filter(|_| !refined).map(|bound| {
             let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
             choose(&each, VECTORS.min(bound.len()), limit)
         });
-        Ok(Scouted { limit, which, adapted: made })
+        Ok(Scouted { kept, hard, which, adapted: made })
     }
 }
 
