@@ -2,6 +2,7 @@
 
 mod along;
 mod hunt;
+mod made;
 mod nearby;
 mod plan;
 mod ready;

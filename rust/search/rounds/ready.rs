@@ -5,7 +5,6 @@
 //! score kept: what is left out cannot be among the kept ones, so the table is that of brute force, ties by index.
 
 use std::borrow::Cow;
-use std::collections::HashSet;
 use std::sync::atomic::Ordering;
 
 use crate::error::Result;
@@ -17,6 +16,7 @@ use crate::search::lattice::independent::Lattice;
 use crate::search::options::Options;
 use crate::search::outcome::{Counts, Kept, Outcome, Part, Row};
 use crate::search::rounds::hunt::Hunt;
+use crate::search::rounds::made::TIMES;
 use crate::search::rounds::plan::{algorithm, round_length, rounds, waves, BOXED, FEW};
 use crate::search::rounds::scouts::Scouted;
 use crate::search::spread::visit;
@@ -96,29 +96,36 @@ impl<'a> Search<'a> {
             return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
         }
         let pay = count >= BOXED && Boxes::pay(&catalogue);
-        let Scouted { mut kept, hard, which, adapted } = Hunt::new(&catalogue, None, pool, control).scout(pay)?;
+        let closely = algorithm(count, options) >= 4;
+        let Scouted { limit, hard, which, best } = Hunt::new(&catalogue, None, pool, control).scout(pay, closely)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
             problem.bound = problem.bound.take().map(|bound| bound.chosen(&which));
         }
-        if let Some((adapted, bytes)) = adapted {
-            catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(adapted.each.len() as u64));
+        // Of equation errors in squares the Gram matrix says all.
+        if pay && catalogue.problem.squares.is_none() && limit < f64::INFINITY {
+            let (adapted, bytes) = catalogue.problem.no_adapted();
             catalogue.problem.adapted = Some(adapted);
+            for time in 0..TIMES {
+                let made = Hunt::new(&catalogue, None, pool, control).made(limit, time, best)?;
+                if made.is_empty() {
+                    break;
+                }
+                catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(made.len() as u64));
+                if let Some(adapted) = &mut catalogue.problem.adapted {
+                    adapted.each.extend(made);
+                }
+            }
         }
-        if hard && algorithm(count, options) >= 4 {
+        if hard {
             let spare = catalogue.spare;
             catalogue.spare -= pool.install(|| catalogue.problem.with_roots(spare));
-            let mut hunt = Hunt::new(&catalogue, None, pool, control);
-            if !pay {
-                let mut tried: HashSet<u64> = kept.rows.iter().map(|row| row.index).collect();
-                hunt.better(&mut kept, &mut tried)?;
-            }
-            if let Some(along) = hunt.along(kept.limit)? {
+            let along = Hunt::new(&catalogue, None, pool, control).along(limit)?;
+            if let Some(along) = along {
                 catalogue.spare = catalogue.spare.saturating_sub(along.held());
                 catalogue.problem.tangents = Some(along);
             }
         }
-        let limit = kept.limit;
         let boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
         control.check_stop()?;
         Ok(Self { catalogue, boxes, limit })
