@@ -2,7 +2,7 @@
 
 use ftlm::equation::{Equation, Initial};
 use ftlm::regressors::Record;
-use ftlm::search::bound::{excluded_along, explodes};
+use ftlm::search::bound::{excluded_along, excluded_by, excluded_in_turn, explodes};
 use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis};
 use ftlm::search::options::{Norm, Options};
@@ -126,6 +126,45 @@ fn no_test_vector_that_follows_coefficients_proves_more_than_is_true() {
     }
     println!("{close} of {asked} within 1 %, {closer} within 0.01 %");
     assert!(asked > 600 && close > 150 && closer > 60, "{close}, {closer} of {asked}");
+}
+
+#[test]
+fn what_a_vector_came_to_for_one_candidate_proves_nothing_wrong_of_the_next() {
+    let mut random = Random::new(79);
+    let (mut asked, mut told, mut close) = (0, 0, 0);
+    for case in 0..120 {
+        let m = 60 + random.below(200);
+        let record = unruly(&mut random, m);
+        let norm = if case % 3 == 0 { Norm::L2 } else { Norm::L1 };
+        let own = 1 + random.below(3);
+        let made_for = random_equation(&mut random, own, -1.0);
+        let size = 10.0_f64.powf(random.uniform(-4.0, -0.5));
+        // Two tuples of orders in turn, so that what is remembered of one outlives the other.
+        let mut others = vec![made_for.clone(), made_for.clone()];
+        others[1].structure.terms[0].order *= 0.97;
+        let equations: Vec<Equation> = (0..24)
+            .map(|i| {
+                let mut other = others[usize::from(i % 5 == 4)].clone();
+                other.coefficients.iter_mut().for_each(|c| *c *= 1.0 + size * random.normal());
+                other
+            })
+            .collect();
+        let exact: Vec<f64> = equations.iter().map(|equation| score(&record, equation, norm)).collect();
+        for limit in exact.iter().filter(|exact| exact.is_finite()).step_by(4) {
+            let limit = limit * (1.0 + 1e-9);
+            let excluded = excluded_in_turn(&record, &made_for, &equations, norm, limit).unwrap();
+            for ((equation, &exact), &excluded) in equations.iter().zip(&exact).zip(&excluded) {
+                assert!(!(excluded && exact <= limit), "case {case}: {exact:e} at {limit:e}");
+                asked += 1;
+                told += usize::from(excluded);
+                close += usize::from(excluded && exact < 1.1 * limit);
+                // What is remembered only saves work.
+                assert!(excluded || !excluded_by(&record, &made_for, equation, norm, limit).unwrap(), "case {case}");
+            }
+        }
+    }
+    println!("{told} of {asked} excluded, {close} of them within 10 %");
+    assert!(told > 1000 && close > 300, "{told}, {close} of {asked}");
 }
 
 #[test]

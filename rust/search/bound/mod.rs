@@ -9,6 +9,6 @@ pub(crate) mod roots;
 pub(crate) mod tangents;
 mod vectors;
 
-pub use lower::{excluded_by, lower_bounds, out_of_reach};
+pub use lower::{excluded_by, excluded_in_turn, lower_bounds, out_of_reach};
 pub use roots::explodes;
 pub use tangents::excluded_along;

@@ -6,7 +6,7 @@ use crate::estimate::multi_innovation::Rows;
 use crate::haar;
 use crate::lanes::{self, WIDTH};
 use crate::regressors::{Bank, Index, Key, Record};
-use crate::search::bound::adapted::{Adapted, Fitted, Weighted};
+use crate::search::bound::adapted::{Adapted, Fitted, Memory};
 use crate::search::bound::lower::Bound;
 use crate::search::bound::reach::Reach;
 use crate::search::bound::roots::Roots;
@@ -95,7 +95,7 @@ struct Adapting<'a> {
     limit: f64,
     terms: &'a [usize],
     coefficients: &'a [f64],
-    own: &'a mut Vec<Weighted>,
+    memory: &'a mut Memory,
 }
 
 impl lanes::Kernel for Adapting<'_> {
@@ -103,7 +103,7 @@ impl lanes::Kernel for Adapting<'_> {
 
     #[inline(always)]
     fn run(self) -> bool {
-        self.adapted.exclude(self.terms, self.coefficients, self.limit, self.own, &mut 0)
+        self.adapted.exclude(self.terms, self.coefficients, self.limit, self.memory)
     }
 }
 
@@ -127,7 +127,7 @@ impl lanes::Kernel for Following<'_> {
 
 /// Memory of one thread.
 pub(crate) struct Scratch {
-    own: Vec<Weighted>,
+    memory: Memory,
     held: Held,
     reach: Reach,
     start: Vec<f64>,
@@ -144,7 +144,7 @@ pub(crate) struct Scratch {
 impl Default for Scratch {
     fn default() -> Self {
         Self {
-            own: Vec::new(),
+            memory: Memory::default(),
             held: Held::default(),
             reach: Reach::default(),
             start: Vec::new(),
@@ -289,8 +289,8 @@ impl Problem {
     /// Whether these test vectors exclude that candidate.
     pub(crate) fn excluded_by(&self, adapted: &Adapted, positions: &[usize], limit: f64) -> bool {
         let Some(coefficients) = self.alone(positions) else { return false };
-        let mut own = Vec::new();
-        lanes::widest(Adapting { adapted, limit, terms: positions, coefficients: &coefficients, own: &mut own })
+        let mut memory = Memory::default();
+        lanes::widest(Adapting { adapted, limit, terms: positions, coefficients: &coefficients, memory: &mut memory })
     }
 
     /// No test vectors that follow coefficients yet.
@@ -368,7 +368,7 @@ impl Problem {
         control: &Control,
     ) -> Verdict {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
-        let Scratch { own, held, reach, start, one, march, coefficients, weights, .. } = scratch;
+        let Scratch { memory, held, reach, start, one, march, coefficients, weights, .. } = scratch;
         let [singular] = self.equations.solve(&sources, initial, one);
         if singular {
             return Verdict::Failed(Failure::Singular);
@@ -402,7 +402,7 @@ impl Problem {
             }
         }
         if let (Some(adapted), true) = (&self.adapted, limit < f64::INFINITY) {
-            if lanes::widest(Adapting { adapted, limit, terms: positions, coefficients, own }) {
+            if lanes::widest(Adapting { adapted, limit, terms: positions, coefficients, memory }) {
                 return Verdict::Bounded(limit);
             }
         }

@@ -57,9 +57,10 @@ impl Hunt<'_> {
         Ok((open, each))
     }
 
-    /// Test vectors that together exclude most of what is open at this limit, each of them much: the first time for the
-    /// best row too, for what is near it. None where they would not pay, or where there is no memory for them.
-    pub(super) fn made(&self, limit: f64, time: u64, best: Option<u64>) -> Result<Vec<Fitted>> {
+    /// Test vectors that together exclude most of what is open at this limit, each of them much, and what they leave: the
+    /// first time for the best row too, for what is near it. None where they would not pay, or where there is no memory
+    /// for them.
+    pub(super) fn made(&self, limit: f64, time: u64, best: Option<u64>) -> Result<(Vec<Fitted>, Vec<Open>)> {
         let catalogue = self.catalogue;
         let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
         let (mut one, bytes) = problem.no_adapted();
@@ -67,14 +68,14 @@ impl Hunt<'_> {
         let room = catalogue.spare.min(MOST.saturating_sub(known * bytes)) / bytes.max(1);
         let room = usize::try_from(room).unwrap_or(TRIED).min(TRIED);
         if room == 0 {
-            return Ok(Vec::new());
+            return Ok(Default::default());
         }
         let (open, each) = self.waiting(limit, time)?;
         #[allow(clippy::cast_precision_loss)]
         let all = |count: usize| count as f64 * each;
         let best = best.filter(|_| time == 0);
         if best.is_none() && all(open.len()) < WORTH {
-            return Ok(Vec::new());
+            return Ok((Vec::new(), open));
         }
         let columns = |index: u64| {
             let mut positions = vec![0; lattice.width()];
@@ -107,7 +108,8 @@ impl Hunt<'_> {
             made.push(vector);
             left.iter_mut().zip(&out).for_each(|(left, out)| *left &= !out);
         }
-        Ok(made)
+        let open = open.into_iter().zip(left).filter_map(|(open, left)| left.then_some(open)).collect();
+        Ok((made, open))
     }
 }
 

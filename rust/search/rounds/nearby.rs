@@ -29,7 +29,12 @@ impl Hunt<'_> {
     pub(super) fn nearby(&mut self, kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<()> {
         self.neighbours(kept, tried)?;
         let hard = self.hard(kept)?;
-        let anew: Vec<Open> = hard.iter().filter(|open| tried.insert(open.index)).copied().collect();
+        self.on_from(&hard, kept, tried)
+    }
+
+    /// Follows these and goes down from the best.
+    pub(super) fn on_from(&mut self, open: &[Open], kept: &mut Kept, tried: &mut HashSet<u64>) -> Result<()> {
+        let anew: Vec<Open> = open.iter().filter(|open| tried.insert(open.index)).copied().collect();
         self.follow(&anew, kept, Place::start(0), false)?;
         self.neighbours(kept, tried)
     }

@@ -97,26 +97,32 @@ impl<'a> Search<'a> {
         }
         let pay = count >= BOXED && Boxes::pay(&catalogue);
         let closely = algorithm(count, options) >= 4;
-        let Scouted { limit, hard, which, best } = Hunt::new(&catalogue, None, pool, control).scout(pay, closely)?;
+        let Scouted { mut kept, mut tried, hard, which } =
+            Hunt::new(&catalogue, None, pool, control).scout(pay, closely)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
             problem.bound = problem.bound.take().map(|bound| bound.chosen(&which));
         }
         // Of equation errors in squares the Gram matrix says all.
-        if pay && catalogue.problem.squares.is_none() && limit < f64::INFINITY {
+        if pay && catalogue.problem.squares.is_none() && kept.limit < f64::INFINITY {
             let (adapted, bytes) = catalogue.problem.no_adapted();
             catalogue.problem.adapted = Some(adapted);
             for time in 0..TIMES {
-                let made = Hunt::new(&catalogue, None, pool, control).made(limit, time, best)?;
-                if made.is_empty() {
-                    break;
-                }
+                let best = kept.rows.first().map(|row| row.index);
+                let (made, left) = Hunt::new(&catalogue, None, pool, control).made(kept.limit, time, best)?;
+                let last = made.is_empty();
                 catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(made.len() as u64));
                 if let Some(adapted) = &mut catalogue.problem.adapted {
                     adapted.each.extend(made);
                 }
+                // What no vector excludes is likely to be good.
+                Hunt::new(&catalogue, None, pool, control).on_from(&left, &mut kept, &mut tried)?;
+                if last {
+                    break;
+                }
             }
         }
+        let limit = kept.limit;
         if hard {
             let spare = catalogue.spare;
             catalogue.spare -= pool.install(|| catalogue.problem.with_roots(spare));

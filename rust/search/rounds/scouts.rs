@@ -29,14 +29,13 @@ const EASY: usize = 8;
 
 /// What scouts came to.
 pub(super) struct Scouted {
-    /// A first limit.
-    pub(super) limit: f64,
+    /// The rows that give a first limit, and what else has been followed.
+    pub(super) kept: Kept,
+    pub(super) tried: HashSet<u64>,
     /// Whether test vectors leave so many open at it that candidates are to be proved closely.
     pub(super) hard: bool,
     /// The test vectors to work with, the best first.
     pub(super) which: Option<Vec<usize>>,
-    /// The best candidate.
-    pub(super) best: Option<u64>,
 }
 
 impl Hunt<'_> {
@@ -111,7 +110,7 @@ impl Hunt<'_> {
             let each: Vec<Vec<f64>> = found.into_iter().map(|(_, each)| each).collect();
             choose(&each, VECTORS.min(bound.len()), limit)
         });
-        Ok(Scouted { limit, hard, which, best: kept.rows.first().map(|row| row.index) })
+        Ok(Scouted { kept, tried, hard, which })
     }
 }
 
