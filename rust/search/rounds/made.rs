@@ -12,7 +12,7 @@ use crate::search::spread::visit;
 /// Candidates among which open ones are looked for, in stretches of so many (those of one stretch are open together or
 /// not at all): of a small lattice, and the share of a large one, of which few are open, that it takes to see enough.
 const SAMPLED: u64 = 1 << 17;
-const SHARE: u64 = 256;
+const SHARE: u64 = 512;
 const STRETCH: u64 = 16;
 const BATCH: u64 = 1 << 11;
 /// Enough of them, and as many as are followed or as test vectors are held against.
@@ -21,13 +21,24 @@ const HARD: usize = 512;
 const TRIED: usize = 32;
 const MADE: usize = 12;
 /// Most times.
-pub(super) const TIMES: u64 = 4;
+const TIMES: u64 = 4;
 /// Candidates that must be left open in all for another time to pay, and that a vector must exclude: trying some takes as
 /// long as running so many.
 const WORTH: f64 = 16_384.0;
 const ENOUGH: f64 = 512.0;
+const BIASED: usize = 4;
 /// Most bytes of test vectors, tried ones too.
 const MOST: u64 = 256 << 20;
+
+/// What came of making some.
+#[derive(Default)]
+pub(super) struct Made {
+    pub(super) vectors: Vec<Fitted>,
+    /// What is open to them in the sample.
+    pub(super) left: Vec<Open>,
+    /// Whether another time may pay.
+    pub(super) again: bool,
+}
 
 impl Hunt<'_> {
     /// Some candidates all over the lattice that no bound excludes at this limit, the most likely first, and how many of
@@ -60,7 +71,7 @@ impl Hunt<'_> {
     /// Test vectors that together exclude most of what is open at this limit, each of them much, and what they leave: the
     /// first time for the best row too, for what is near it. None where they would not pay, or where there is no memory
     /// for them.
-    pub(super) fn made(&self, limit: f64, time: u64, best: Option<u64>) -> Result<(Vec<Fitted>, Vec<Open>)> {
+    pub(super) fn made(&self, limit: f64, time: u64, best: Option<u64>) -> Result<Made> {
         let catalogue = self.catalogue;
         let (lattice, problem) = (&*catalogue.lattice, &catalogue.problem);
         let (mut one, bytes) = problem.no_adapted();
@@ -68,14 +79,14 @@ impl Hunt<'_> {
         let room = catalogue.spare.min(MOST.saturating_sub(known * bytes)) / bytes.max(1);
         let room = usize::try_from(room).unwrap_or(TRIED).min(TRIED);
         if room == 0 {
-            return Ok(Default::default());
+            return Ok(Made::default());
         }
         let (open, each) = self.waiting(limit, time)?;
         #[allow(clippy::cast_precision_loss)]
         let all = |count: usize| count as f64 * each;
         let best = best.filter(|_| time == 0);
         if best.is_none() && all(open.len()) < WORTH {
-            return Ok((Vec::new(), open));
+            return Ok(Made { left: open, ..Made::default() });
         }
         let columns = |index: u64| {
             let mut positions = vec![0; lattice.width()];
@@ -108,8 +119,10 @@ impl Hunt<'_> {
             made.push(vector);
             left.iter_mut().zip(&out).for_each(|(left, out)| *left &= !out);
         }
-        let open = open.into_iter().zip(left).filter_map(|(open, left)| left.then_some(open)).collect();
-        Ok((made, open))
+        let left: Vec<Open> = open.into_iter().zip(left).filter_map(|(open, left)| left.then_some(open)).collect();
+        // They were chosen to exclude these very candidates: of others they leave more.
+        let again = time + 1 < TIMES && !made.is_empty() && all(BIASED * left.len()) >= WORTH;
+        Ok(Made { vectors: made, left, again })
     }
 }
 

@@ -16,7 +16,7 @@ use crate::search::lattice::independent::Lattice;
 use crate::search::options::Options;
 use crate::search::outcome::{Counts, Kept, Outcome, Part, Row};
 use crate::search::rounds::hunt::Hunt;
-use crate::search::rounds::made::TIMES;
+use crate::search::rounds::made::Made;
 use crate::search::rounds::plan::{algorithm, round_length, rounds, waves, BOXED, FEW};
 use crate::search::rounds::scouts::Scouted;
 use crate::search::spread::visit;
@@ -107,17 +107,17 @@ impl<'a> Search<'a> {
         if pay && catalogue.problem.squares.is_none() && kept.limit < f64::INFINITY {
             let (adapted, bytes) = catalogue.problem.no_adapted();
             catalogue.problem.adapted = Some(adapted);
-            for time in 0..TIMES {
+            for time in 0.. {
                 let best = kept.rows.first().map(|row| row.index);
-                let (made, left) = Hunt::new(&catalogue, None, pool, control).made(kept.limit, time, best)?;
-                let last = made.is_empty();
-                catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(made.len() as u64));
+                let Made { vectors, left, again } =
+                    Hunt::new(&catalogue, None, pool, control).made(kept.limit, time, best)?;
+                catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(vectors.len() as u64));
                 if let Some(adapted) = &mut catalogue.problem.adapted {
-                    adapted.each.extend(made);
+                    adapted.each.extend(vectors);
                 }
                 // What no vector excludes is likely to be good.
                 Hunt::new(&catalogue, None, pool, control).on_from(&left, &mut kept, &mut tried)?;
-                if last {
+                if !again {
                     break;
                 }
             }
