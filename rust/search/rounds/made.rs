@@ -10,7 +10,7 @@ use crate::search::screen::{by_guess, screen, Open};
 use crate::search::spread::visit;
 
 /// Candidates among which open ones are looked for, in stretches of so many (those of one stretch are open together or
-/// not at all): of a small lattice, and the share of a large one, of which few are open, that it takes to see enough.
+/// not at all): at first, and the share of a large lattice later on, when few are open and it takes many to see enough.
 const SAMPLED: u64 = 1 << 17;
 const SHARE: u64 = 512;
 const STRETCH: u64 = 16;
@@ -47,7 +47,8 @@ impl Hunt<'_> {
         let catalogue = self.catalogue;
         let count = catalogue.lattice.count();
         let stretches = count.div_ceil(STRETCH);
-        let most = SAMPLED.max(count / SHARE).div_ceil(STRETCH).min(stretches);
+        let share = if time == 0 { 0 } else { count / SHARE };
+        let most = SAMPLED.max(share).div_ceil(STRETCH).min(stretches);
         let order = visit(stretches);
         let (mut open, mut seen, mut candidates) = (Vec::new(), 0, 0);
         while seen < most && open.len() < HARD {
