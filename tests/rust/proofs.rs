@@ -132,7 +132,7 @@ fn no_test_vector_that_follows_coefficients_proves_more_than_is_true() {
 fn what_a_vector_came_to_for_one_candidate_proves_nothing_wrong_of_the_next() {
     let mut random = Random::new(79);
     let (mut asked, mut told, mut close) = (0, 0, 0);
-    for case in 0..120 {
+    for case in 0..60 {
         let m = 60 + random.below(200);
         let record = unruly(&mut random, m);
         let norm = if case % 3 == 0 { Norm::L2 } else { Norm::L1 };
@@ -150,7 +150,7 @@ fn what_a_vector_came_to_for_one_candidate_proves_nothing_wrong_of_the_next() {
             })
             .collect();
         let exact: Vec<f64> = equations.iter().map(|equation| score(&record, equation, norm)).collect();
-        for limit in exact.iter().filter(|exact| exact.is_finite()).step_by(4) {
+        for limit in exact.iter().filter(|exact| exact.is_finite()).step_by(8) {
             let limit = limit * (1.0 + 1e-9);
             let excluded = excluded_in_turn(&record, &made_for, &equations, norm, limit).unwrap();
             for ((equation, &exact), &excluded) in equations.iter().zip(&exact).zip(&excluded) {
@@ -164,7 +164,7 @@ fn what_a_vector_came_to_for_one_candidate_proves_nothing_wrong_of_the_next() {
         }
     }
     println!("{told} of {asked} excluded, {close} of them within 10 %");
-    assert!(told > 1000 && close > 300, "{told}, {close} of {asked}");
+    assert!(told > 500 && close > 100, "{told}, {close} of {asked}");
 }
 
 #[test]
