@@ -140,7 +140,7 @@ fn what_a_vector_came_to_for_one_candidate_proves_nothing_wrong_of_the_next() {
         let made_for = random_equation(&mut random, own, -1.0);
         let size = 10.0_f64.powf(random.uniform(-4.0, -0.5));
         // Two tuples of orders in turn, so that what is remembered of one outlives the other.
-        let mut others = vec![made_for.clone(), made_for.clone()];
+        let mut others = [made_for.clone(), made_for.clone()];
         others[1].structure.terms[0].order *= 0.97;
         let equations: Vec<Equation> = (0..24)
             .map(|i| {
