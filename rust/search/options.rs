@@ -152,6 +152,14 @@ impl Options {
         }
     }
 
+    /// Whether candidates are ranked by free runs at rest with coefficients by least squares.
+    pub(crate) fn scored_by_free_runs(&self) -> bool {
+        self.early_stopping
+            && self.estimator == Estimator::LeastSquares
+            && self.criterion == Criterion::OutputError
+            && self.initial == Initial::Rest
+    }
+
     /// Whether a candidate's score follows from the Gram matrix alone: the squared equation error at rest.
     pub(crate) fn scored_by_products(&self) -> bool {
         self.early_stopping

@@ -1,7 +1,8 @@
 //! Screening: coefficients of candidates side by side, and those left open that no proved lower bound excludes.
 
 use crate::lanes::{self, WIDTH};
-use crate::search::bound::adapted::Weighted;
+use crate::search::bound::adapted::Memory;
+use crate::search::bound::tangents::Held;
 use crate::search::candidate::columns::{part_of, Columns};
 use crate::search::candidate::normal::Solve;
 use crate::search::candidate::problem::Problem;
@@ -105,11 +106,13 @@ pub(crate) struct Screen<const L: usize> {
     columns: Vec<usize>,
     coefficients: Vec<f64>,
     weights: Vec<f64>,
-    own: Vec<Weighted>,
-    /// The test vector made for a candidate that excluded one last.
-    last: usize,
+    /// What is remembered of the test vectors made for candidates.
+    memory: Memory,
     /// What is left of a stretch.
     left: Vec<usize>,
+    /// What is remembered of the test vectors that follow coefficients, and the path that excluded one last.
+    held: Held,
+    path: usize,
 }
 
 impl<const L: usize> Screen<L> {
@@ -122,9 +125,10 @@ impl<const L: usize> Screen<L> {
             columns: vec![0; width],
             coefficients: vec![0.0; width],
             weights: Vec::new(),
-            own: Vec::new(),
-            last: 0,
+            memory: Memory::of_neighbours(),
             left: Vec::new(),
+            held: Held::default(),
+            path: 0,
         }
     }
 
@@ -208,7 +212,7 @@ impl<const L: usize> Screen<L> {
         limit: f64,
         (open, singular): &mut (Vec<Open>, Vec<u64>),
     ) {
-        let Self { solve, positions, initial, columns, coefficients, weights, own, last, .. } = self;
+        let Self { solve, positions, initial, columns, coefficients, weights, memory, held, path, .. } = self;
         let failed = catalogue.problem.equations.solve(positions, initial, solve);
         #[allow(clippy::manual_map)] // a closure would be compiled for the oldest machine
         let squares = match &catalogue.problem.squares {
@@ -243,7 +247,17 @@ impl<const L: usize> Screen<L> {
                 continue;
             }
             if let Some(adapted) = &catalogue.problem.adapted {
-                if adapted.exclude(columns, coefficients, limit, own, last) {
+                if adapted.exclude(columns, coefficients, limit, memory) {
+                    continue;
+                }
+            }
+            if let (Some(tangents), true) = (&catalogue.problem.tangents, limit < f64::INFINITY) {
+                if tangents.exclude(columns, coefficients, limit, held) {
+                    continue;
+                }
+            }
+            if let (Some(roots), true) = (&catalogue.problem.roots, limit < f64::INFINITY) {
+                if roots.exclude(columns, coefficients, limit, path) {
                     continue;
                 }
             }

@@ -22,6 +22,7 @@ mod metrics;
 mod output_error;
 mod plants;
 mod points;
+mod proofs;
 mod readings;
 mod refusals;
 mod rig;

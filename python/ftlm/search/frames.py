@@ -18,11 +18,11 @@ MAGIC = b"ftlm search store 1\n"
 HEAD = struct.Struct("<II")
 DIGEST = 16
 #: Number of the algorithm that rounds follow; rounds of different ones must not be joined.
-ALGORITHM = 3
+ALGORITHM = 4
 #: Earlier ones whose half-finished stores go on where the rounds of a search have not changed since: 2 screens lattices
-#: of 2²⁵ candidates and more in boxes and in longer rounds, 3 in sharper boxes and by squared equation errors too; both
-#: leave all others as they were.
-CONTINUED = (1, 2)
+#: of 2²⁵ candidates and more in boxes and in longer rounds, 3 in sharper boxes and by squared equation errors too, 4
+#: proves free runs of 2¹⁸ candidates and more closely; all leave the others as they were.
+CONTINUED = (1, 2, 3)
 #: Largest payload: a table of 100 000 rows of many coefficients is far below.
 MAX_PAYLOAD = 1 << 30
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]

@@ -11,7 +11,7 @@ use crate::equation::{Equation, Structure};
 use crate::error::{check_length, Result};
 use crate::lanes::WIDTH;
 use crate::regressors::{Bank, Index, Key, Record};
-use crate::search::bound::adapted::Adapted;
+use crate::search::bound::adapted::{Adapted, Memory};
 use crate::search::bound::probes::Probes;
 use crate::search::bound::reach::Reach;
 use crate::search::bound::vectors::POOL;
@@ -103,20 +103,37 @@ pub fn out_of_reach(
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
 pub fn excluded_by(record: &Record, made_for: &Equation, equation: &Equation, norm: Norm, limit: f64) -> Result<bool> {
+    Ok(excluded_in_turn(record, made_for, std::slice::from_ref(equation), norm, limit)? == [true])
+}
+
+/// [`excluded_by`] of several equations of the same output, one after the other as a search asks them: what the
+/// vector came to for one is remembered for the next.
+///
+/// # Errors
+/// Orders or signals that make no equation, coefficients that are not one a term.
+pub fn excluded_in_turn(
+    record: &Record,
+    made_for: &Equation,
+    equations: &[Equation],
+    norm: Norm,
+    limit: f64,
+) -> Result<Vec<bool>> {
     let mut index = Index::default();
     let mut positions = Vec::new();
-    for Equation { structure, coefficients } in [made_for, equation] {
+    for Equation { structure, coefficients } in std::iter::once(made_for).chain(equations) {
         structure.check(record.len(), |_| true)?;
         check_length("coefficients", structure.terms.len(), coefficients.len())?;
         let keys = (0..structure.terms.len())
             .map(|k| index.insert(Key::integral(structure.terms[k].signal, structure.integration(k))));
         positions.push(keys.collect::<Vec<_>>());
     }
-    let bank = Bank::new(&index, record, equation.structure.output)?;
-    let (banks, targets) = ([bank], [record.signal(equation.structure.output).to_vec()]);
+    let bank = Bank::new(&index, record, made_for.structure.output)?;
+    let (banks, targets) = ([bank], [record.signal(made_for.structure.output).to_vec()]);
     let mut adapted = Adapted::new(&banks, &targets, norm);
     adapted.each.extend(adapted.fit(&banks, &targets, &positions[0], &made_for.coefficients));
-    Ok(adapted.exclude(&positions[1], &equation.coefficients, limit, &mut Vec::new(), &mut 0))
+    let mut memory = Memory::of_neighbours();
+    let asked = positions[1..].iter().zip(equations);
+    Ok(asked.map(|(terms, asked)| adapted.exclude(terms, &asked.coefficients, limit, &mut memory)).collect())
 }
 
 /// The whole pool on one record, and the columns of a structure's terms.

@@ -6,9 +6,11 @@ use crate::estimate::multi_innovation::Rows;
 use crate::haar;
 use crate::lanes::{self, WIDTH};
 use crate::regressors::{Bank, Index, Key, Record};
-use crate::search::bound::adapted::{Adapted, Fitted, Weighted};
+use crate::search::bound::adapted::{Adapted, Fitted, Memory};
 use crate::search::bound::lower::Bound;
 use crate::search::bound::reach::Reach;
+use crate::search::bound::roots::Roots;
+use crate::search::bound::tangents::{Held, Tangent, Tangents};
 use crate::search::candidate::columns::Columns;
 use crate::search::candidate::instruments::{start_bank, Refiner};
 use crate::search::candidate::march::March;
@@ -23,6 +25,9 @@ const TRANSFORMS: u64 = 6;
 /// The same where coefficients are refined: a few steps of a division and a dozen transforms each.
 const REFINING: u64 = 100;
 
+/// Columns and coefficients of a candidate.
+pub(crate) type Known = (Vec<usize>, Vec<f64>);
+
 /// Everything the candidates of one equation share.
 pub(crate) struct Problem {
     index: Index,
@@ -34,6 +39,10 @@ pub(crate) struct Problem {
     pub(crate) bound: Option<Bound>,
     /// Test vectors made for candidates of the search, where these pay.
     pub(crate) adapted: Option<Adapted>,
+    /// What proves that free runs explode, and test vectors that follow coefficients, where candidates are to be proved
+    /// closely.
+    pub(crate) roots: Option<Roots>,
+    pub(crate) tangents: Option<Tangents>,
     refiner: Option<Refiner>,
     /// Where coefficients are refined: the banks that the bound speaks of, until it is made.
     bound_banks: Vec<Bank>,
@@ -86,7 +95,7 @@ struct Adapting<'a> {
     limit: f64,
     terms: &'a [usize],
     coefficients: &'a [f64],
-    own: &'a mut Vec<Weighted>,
+    memory: &'a mut Memory,
 }
 
 impl lanes::Kernel for Adapting<'_> {
@@ -94,13 +103,32 @@ impl lanes::Kernel for Adapting<'_> {
 
     #[inline(always)]
     fn run(self) -> bool {
-        self.adapted.exclude(self.terms, self.coefficients, self.limit, self.own, &mut 0)
+        self.adapted.exclude(self.terms, self.coefficients, self.limit, self.memory)
+    }
+}
+
+/// [`Tangents::exclude`] as a kernel.
+struct Following<'a> {
+    tangents: &'a Tangents,
+    limit: f64,
+    terms: &'a [usize],
+    coefficients: &'a [f64],
+    held: &'a mut Held,
+}
+
+impl lanes::Kernel for Following<'_> {
+    type Output = bool;
+
+    #[inline(always)]
+    fn run(self) -> bool {
+        self.tangents.exclude(self.terms, self.coefficients, self.limit, self.held)
     }
 }
 
 /// Memory of one thread.
 pub(crate) struct Scratch {
-    own: Vec<Weighted>,
+    memory: Memory,
+    held: Held,
     reach: Reach,
     start: Vec<f64>,
     one: Solve<1>,
@@ -116,7 +144,8 @@ pub(crate) struct Scratch {
 impl Default for Scratch {
     fn default() -> Self {
         Self {
-            own: Vec::new(),
+            memory: Memory::default(),
+            held: Held::default(),
             reach: Reach::default(),
             start: Vec::new(),
             one: Solve::new(),
@@ -208,6 +237,8 @@ impl Problem {
                 .then(|| Squares::new(unweighted, width, samples, fixed.len(), options.weights())),
             bound: None,
             adapted: None,
+            roots: None,
+            tangents: None,
             refiner,
             bound_banks,
             options: options.clone(),
@@ -258,12 +289,38 @@ impl Problem {
     /// Whether these test vectors exclude that candidate.
     pub(crate) fn excluded_by(&self, adapted: &Adapted, positions: &[usize], limit: f64) -> bool {
         let Some(coefficients) = self.alone(positions) else { return false };
-        let mut own = Vec::new();
-        lanes::widest(Adapting { adapted, limit, terms: positions, coefficients: &coefficients, own: &mut own })
+        let mut memory = Memory::default();
+        lanes::widest(Adapting { adapted, limit, terms: positions, coefficients: &coefficients, memory: &mut memory })
+    }
+
+    /// No test vectors that follow coefficients yet.
+    pub(crate) fn no_tangents(&self) -> Tangents {
+        Tangents::new(&self.banks, &self.targets, self.options.norm)
+    }
+
+    /// The one of the candidate with these columns and coefficients, at rest.
+    pub(crate) fn tangent(&self, tangents: &Tangents, terms: &[usize], c: &[f64], limit: f64) -> Option<Tangent> {
+        tangents.fit((&self.banks, &self.targets), terms, c, limit)
+    }
+
+    /// Those of some candidates, by columns and coefficients, that it does not exclude.
+    pub(crate) fn left_by(&self, tangents: &Tangents, made: &Tangent, all: &[Known], limit: f64) -> Vec<Known> {
+        all.iter().filter(|(terms, c)| !tangents.excludes(made, terms, c, limit)).cloned().collect()
+    }
+
+    /// Makes what proves that free runs explode, where its tables fit into so many bytes: how many they take. Runs on the
+    /// current thread pool.
+    pub(crate) fn with_roots(&mut self, spare: u64) -> u64 {
+        let bytes = Roots::bytes(&self.banks);
+        if bytes > spare || !Roots::pay(&self.targets) {
+            return 0;
+        }
+        self.roots = Some(Roots::new(&self.banks, &self.targets, self.options.norm));
+        bytes
     }
 
     /// Least-squares coefficients of the candidate with these columns, at rest; none where it is singular.
-    fn alone(&self, positions: &[usize]) -> Option<Vec<f64>> {
+    pub(crate) fn alone(&self, positions: &[usize]) -> Option<Vec<f64>> {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
         let mut one = Solve::new();
         let [singular] = self.equations.solve(&sources, &[], &mut one);
@@ -311,7 +368,7 @@ impl Problem {
         control: &Control,
     ) -> Verdict {
         let sources: Vec<Columns<1>> = positions.iter().map(|&p| Columns::new([p])).collect();
-        let Scratch { own, reach, start, one, march, coefficients, weights, .. } = scratch;
+        let Scratch { memory, held, reach, start, one, march, coefficients, weights, .. } = scratch;
         let [singular] = self.equations.solve(&sources, initial, one);
         if singular {
             return Verdict::Failed(Failure::Singular);
@@ -345,7 +402,12 @@ impl Problem {
             }
         }
         if let (Some(adapted), true) = (&self.adapted, limit < f64::INFINITY) {
-            if lanes::widest(Adapting { adapted, limit, terms: positions, coefficients, own }) {
+            if lanes::widest(Adapting { adapted, limit, terms: positions, coefficients, memory }) {
+                return Verdict::Bounded(limit);
+            }
+        }
+        if let (Some(tangents), true) = (&self.tangents, limit < f64::INFINITY) {
+            if lanes::widest(Following { tangents, limit, terms: positions, coefficients, held }) {
                 return Verdict::Bounded(limit);
             }
         }

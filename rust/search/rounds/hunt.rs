@@ -49,6 +49,10 @@ impl<'a> Hunt<'a> {
         Self { catalogue, boxes, pool, control, scratches: PerThread::new(pool), part: Part::default(), anew: true }
     }
 
+    pub(super) fn stopped(&self) -> bool {
+        self.control.stopped()
+    }
+
     pub(super) fn check_stop(&self) -> Result<()> {
         self.control.check_stop()
     }

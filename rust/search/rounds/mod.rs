@@ -1,6 +1,8 @@
 //! A search over a lattice, round by round.
 
+mod along;
 mod hunt;
+mod made;
 mod nearby;
 mod plan;
 mod ready;

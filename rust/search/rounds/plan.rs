@@ -16,16 +16,23 @@ const ROUND_FOLLOWED: u64 = 1 << 12;
 /// longest: the tables of boxes that two rounds share are made twice.
 pub(super) const BOXED: u64 = 1 << 25;
 const ROUND_LONGEST: u64 = 1 << 22;
+/// Candidates from which on those that are ranked by free runs are proved closely: by the zeros of their divisors and by
+/// test vectors that follow coefficients ([`crate::search::rounds`]). A smaller search is done before these are made.
+const PROVED: u64 = 1 << 18;
 /// Refined candidates that are followed without scouts, one round of them.
 pub(super) const FEW: u64 = ROUND_FOLLOWED;
 
 /// Number of the algorithm by which the rounds of a search over so many candidates are cut and done.
 #[must_use]
 pub fn algorithm(candidates: u64, options: &Options) -> u64 {
-    if candidates < BOXED || options.refines() || !options.early_stopping {
+    if options.refines() || !options.early_stopping {
         1
-    } else {
+    } else if candidates >= PROVED && options.scored_by_free_runs() {
+        4
+    } else if candidates >= BOXED {
         3
+    } else {
+        1
     }
 }
 
@@ -35,7 +42,7 @@ pub(super) fn round_length(candidates: u64, options: &Options, algorithm: u64) -
         ROUND_FOLLOWED
     } else if options.scored_by_products() && algorithm < 3 {
         ROUND_PLAIN
-    } else if algorithm < 2 {
+    } else if algorithm < 2 || candidates < BOXED {
         ROUND_BOUNDED
     } else {
         (candidates / (BOXED / ROUND_BOUNDED)).next_power_of_two().clamp(ROUND_BOUNDED, ROUND_LONGEST)

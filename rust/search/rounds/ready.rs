@@ -16,6 +16,7 @@ use crate::search::lattice::independent::Lattice;
 use crate::search::options::Options;
 use crate::search::outcome::{Counts, Kept, Outcome, Part, Row};
 use crate::search::rounds::hunt::Hunt;
+use crate::search::rounds::made::Made;
 use crate::search::rounds::plan::{algorithm, round_length, rounds, waves, BOXED, FEW};
 use crate::search::rounds::scouts::Scouted;
 use crate::search::spread::visit;
@@ -95,14 +96,41 @@ impl<'a> Search<'a> {
             return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
         }
         let pay = count >= BOXED && Boxes::pay(&catalogue);
-        let Scouted { limit, which, adapted } = Hunt::new(&catalogue, None, pool, control).scout(pay)?;
+        let closely = algorithm(count, options) >= 4;
+        let Scouted { mut kept, mut tried, hard, which } =
+            Hunt::new(&catalogue, None, pool, control).scout(pay, closely)?;
         if let Some(which) = which {
             let problem = &mut catalogue.problem;
             problem.bound = problem.bound.take().map(|bound| bound.chosen(&which));
         }
-        if let Some((adapted, bytes)) = adapted {
-            catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(adapted.each.len() as u64));
+        // Of equation errors in squares the Gram matrix says all.
+        if pay && catalogue.problem.squares.is_none() && kept.limit < f64::INFINITY {
+            let (adapted, bytes) = catalogue.problem.no_adapted();
             catalogue.problem.adapted = Some(adapted);
+            for time in 0.. {
+                let best = kept.rows.first().map(|row| row.index);
+                let Made { vectors, left, again } =
+                    Hunt::new(&catalogue, None, pool, control).made(kept.limit, time, best)?;
+                catalogue.spare = catalogue.spare.saturating_sub(bytes.saturating_mul(vectors.len() as u64));
+                if let Some(adapted) = &mut catalogue.problem.adapted {
+                    adapted.each.extend(vectors);
+                }
+                // What no vector excludes is likely to be good.
+                Hunt::new(&catalogue, None, pool, control).on_from(&left, &mut kept, &mut tried)?;
+                if !again {
+                    break;
+                }
+            }
+        }
+        let limit = kept.limit;
+        if hard {
+            let spare = catalogue.spare;
+            catalogue.spare -= pool.install(|| catalogue.problem.with_roots(spare));
+            let along = Hunt::new(&catalogue, None, pool, control).along(limit)?;
+            if let Some(along) = along {
+                catalogue.spare = catalogue.spare.saturating_sub(along.held());
+                catalogue.problem.tangents = Some(along);
+            }
         }
         let boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
         control.check_stop()?;
