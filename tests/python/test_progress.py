@@ -251,6 +251,17 @@ def test_large_files_and_long_records_are_announced_and_small_ones_are_not(folde
     assert [words for words, *_ in told] == ["reading"]
 
 
+def test_designs_are_announced_by_the_samples_that_their_loops_are_judged_on(monkeypatch, told):
+    monkeypatch.setattr(wait, "expected", lambda seconds, threads: seconds)
+    for design, samples in (("pid", 100), ("lqg", 100), ("lqg", 1000)):
+        wait.expect_designing(design, samples)
+    assert [words for words, *_ in told] == ["designing"] * 3
+    times = [(least, most) for _, least, most in told]
+    assert times == sorted(times)
+    # On the known machine they took 0.6, 1.4 and some 10 s.
+    assert all(least < took < most for (least, most), took in zip(times, (0.6, 1.4, 10.0), strict=True))
+
+
 def test_orders_on_unseen_runs_say_how_long_all_of_their_fits_take(monkeypatch, told):
     signals = {f"theta{n}{k}": np.zeros(300) for n in (1, 2) for k in (1, 2)}
     runs = [ftlm.Run.from_arrays(step=0.01, inputs={"I1": np.ones(300)}, outputs=signals, name=n) for n in "ab"]

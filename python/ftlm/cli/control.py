@@ -14,6 +14,7 @@ from ftlm.base.errors import ModelError
 from ftlm.base.output import COMMAND, check_free, write_atomically
 from ftlm.cli.command import command, say, show_json
 from ftlm.cli.options import Force, Json, Noise, Number, SavedModel, Text, Texts
+from ftlm.cli.wait import expect_designing
 from ftlm.cli.words import numbers, several
 from ftlm.cli.written import check_ending, say_written
 from ftlm.model.model import load_model
@@ -86,6 +87,7 @@ def control(
     if design == "pid":
         if crossover is None:
             raise ModelError("--crossover is missing: where the loop's gain is to be 1 [rad/s]")
+        expect_designing(design, samples)
         found = designs.fractional_pid(
             loaded, crossover=crossover, phase_margin=60.0 if phase_margin is None else phase_margin, **common
         )
@@ -96,6 +98,7 @@ def control(
                 "--allowed OUTPUT=A and --effort A are missing: which deviations are as dear as which input"
             )
         low_high = None if band is None else several("--band", band, 2)
+        expect_designing(design, samples)
         found = designs.lqg(
             loaded, allowed=numbers("--allowed", allowed), effort=effort, drift=drift,
             noise=numbers("--noise", noise) or None, measured=measured or None, limit=most, poles=poles,
