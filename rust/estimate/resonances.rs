@@ -140,6 +140,8 @@ fn at(parts: &[Part], fixed: &[Option<f64>], point: &[f64], size: f64) -> Result
 fn solved(columns: Vec<Vec<f64>>, target: Vec<f64>, starts: Vec<Vec<Vec<f64>>>) -> Option<(Vec<f64>, f64)> {
     let lengths: Vec<usize> = starts.iter().map(|own| own.first().map_or(0, Vec::len)).collect();
     let free = columns.len();
+    // Of columns that are combinations of one another, initial terms would leave rounding.
+    solve(&columns, &target, free).ok()?;
     let (mut less, mut left) = (columns.clone(), target.clone());
     let mut from = 0;
     for (own, &m) in starts.iter().zip(&lengths) {

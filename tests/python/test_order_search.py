@@ -322,7 +322,7 @@ def test_progress_shows_rate_share_pruned_and_time_left(monkeypatch, run):
         bar(500, 1000, 499)
     text = shown.getvalue()
     assert "searching" in text
-    assert "500/1,000" in text
+    assert "50 % of 1,000" in text
     assert "99.8 % pruned" in text
     assert "/s" in text
     # Somebody else's function is told two numbers, as ever.

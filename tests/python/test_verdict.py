@@ -409,7 +409,8 @@ def test_the_first_screen_has_three_groups_and_says_where_the_rest_is(found):
 # The first screen
 
 
-def test_the_first_screen_has_verdict_model_behaviour_and_both_fits(found, checked):
+def test_the_first_screen_has_verdict_model_behaviour_and_both_fits(found, checked, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
     text = found.summary(checked)
     lines = text.splitlines()
     assert len(lines) <= 24
