@@ -72,6 +72,10 @@ pub fn projected(
     own.iter().try_for_each(|&eta| check_order("integration of an own term", eta))?;
     points.iter().try_for_each(|point| check_length("coefficients of a point", own.len(), point.len()))?;
     let regression = Regression::new(records, structure, &vec![None; fixed.len()], initial)?;
+    // What is a combination of others drives as one, and own terms leave no more than rounding between the two.
+    if solve(&regression.columns[..regression.free()], &regression.target, regression.free()).is_err() {
+        return Ok(vec![None; points.len()]);
+    }
     let parts: Vec<Part> = (records.iter().enumerate()).map(|(r, record)| part(&regression, own, r, record)).collect();
     let size = norm(&regression.target).max(1e-300);
     points.iter().map(|point| at(&parts, fixed, point, size)).collect()
@@ -140,8 +144,6 @@ fn at(parts: &[Part], fixed: &[Option<f64>], point: &[f64], size: f64) -> Result
 fn solved(columns: Vec<Vec<f64>>, target: Vec<f64>, starts: Vec<Vec<Vec<f64>>>) -> Option<(Vec<f64>, f64)> {
     let lengths: Vec<usize> = starts.iter().map(|own| own.first().map_or(0, Vec::len)).collect();
     let free = columns.len();
-    // Of columns that are combinations of one another, initial terms would leave rounding.
-    solve(&columns, &target, free).ok()?;
     let (mut less, mut left) = (columns.clone(), target.clone());
     let mut from = 0;
     for (own, &m) in starts.iter().zip(&lengths) {
