@@ -162,3 +162,28 @@ def test_samples_at_corners_are_read_to_second_order(alpha: float, order: float,
     for errors in (fitted, free):
         assert errors[-1] < 1e-3
         assert all(fine < coarse / 3.0 for coarse, fine in pairwise(errors)), errors
+
+
+@pytest.mark.parametrize("behind", [False, True])
+def test_slopes_of_a_term_above_its_equation_are_those_of_differences(behind):
+    """Kernels below order 0 and powers of t that are infinite at 0, behind a filter too, turned with both orders."""
+    rng = np.random.default_rng(0)
+    driven = np.cumsum(np.cumsum(rng.standard_normal(400))) * 1e-2
+    outputs = {"y": np.sin(np.arange(400) * 0.02), "u": driven}
+    run = ftlm.Run.from_arrays(step=0.02, outputs=outputs, inputs={"v": np.zeros(400)})
+    sensor = ftlm.SensorFilter.low_pass(["y", "u"]) if behind else None
+    problem = FreeProblem.of(
+        ftlm.equation("D^alpha y = a y + b D^gamma u", initial="caputo", offset="none", sensor_filter=sensor)
+    )
+    grid, point = Grid(problem, [run], [1.0]), np.array([1.3, 1.8])
+
+    def at(orders, evaluations):
+        start = Attempt(list(orders), [-4.0, 2.0], "here", {})
+        return grid.descend(start, evaluations, plain=True, held=[2, 3]).outcome
+
+    there, shift = at(point, 1), 1e-4
+    residuals = np.asarray(there["residuals"])
+    for k, slope in enumerate(np.asarray(there["jacobian"])[:2]):
+        up, down = (np.asarray(at(point + s * shift * np.eye(2)[k], 0)["residuals"]) for s in (1, -1))
+        # Initial terms are projected out of both, so what counts is the slope of the sum of squares.
+        assert slope @ residuals == pytest.approx((up - down) @ residuals / (2 * shift), rel=1e-5)
