@@ -301,6 +301,11 @@ class Run(Measured):
                 readings = readings.changed(**{limit.signal: limit.of(readings.data[limit.signal])})
         return self._with(_data=data, readings=readings)
 
+    def with_samples(self, samples: Mapping[str, Floats], read: Mapping[str, Floats] | None = None) -> Run:
+        """Return this run with other samples of some signals, and other readings of them if it has times of its own."""
+        readings = self.readings and self.readings.changed(**(read or {}))
+        return self._with(_data={**self._data, **samples}, readings=readings)
+
     def rename(self, mapping: Mapping[str, str]) -> Run:
         """Return this run with other signal names.
 

@@ -19,7 +19,7 @@ from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
-from ftlm.solve.records import Record, acting, initial_tuple, record, sensor_series
+from ftlm.solve.records import Record, driving, initial_tuple, record, sensor_series
 
 #: A descent ends where a whole step would lower the cost by a smaller share than this.
 TOLERANCE = 1e-9
@@ -106,7 +106,7 @@ def _instant(
     if name not in run or name in run.missing or (rec.sensor is not None and not structure.measured_through(name)):
         return None, False
     held = name in run.inputs and run.intersample[name] == "zoh"
-    values, delay = acting(run, structure, name)[name], structure.delay.get(name, 0.0)
+    values, delay = driving(run, structure, name)[name], structure.delay.get(name, 0.0)
     if delay and held:
         # A command switches between samples after a delay: what it is then is the pulse that follows.
         means = rec.of(name)[::every]

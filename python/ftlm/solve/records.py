@@ -23,6 +23,7 @@ from ftlm.data.run import Run
 from ftlm.data.samples import locked
 from ftlm.data.several import Runs
 from ftlm.data.structures import Initial, Offset, Structure, check_decided
+from ftlm.solve.held import without_held
 from ftlm.solve.motion import decided, has_memory, together
 
 #: The paper's number of block pulses, used where the record carries as many.
@@ -167,6 +168,11 @@ def acting(run: Run, structure: Structure, name: str | None = None) -> Run:
     return run.bent(limits) if limits else run
 
 
+def driving(run: Run, structure: Structure, name: str | None = None) -> Run:
+    """The run with its signals, or one of them, as they drive equations: inputs acting, filters begun at rest."""
+    return without_held(acting(run, structure, name), structure, name)
+
+
 def check_held(run: Run, structure: Structure, known: Mapping[str, float] | None = None) -> None:
     """Refuse the derivative of a jump: a held input above the order of the output that it drives.
 
@@ -271,7 +277,7 @@ def _means(run: Run, structure: Structure, name: str, m: int, *, at_rest: bool) 
             f"run {run.name!r} has no signal {name!r}{nearest(name, run.signals)}, which the model needs; "
             f"it has {', '.join(run.signals)}: name the columns with inputs= and outputs= (commands: -u and -y)"
         )
-    run = acting(run, structure, name)
+    run = driving(run, structure, name)
     samples = bridged(run[name])
     if name in structure.free_delays:
         raise ModelError(

@@ -24,7 +24,7 @@ from ftlm.data.structures import History, Initial, Offset, Structure, offset_exp
 from ftlm.solve.friction import begun, motion_with_friction
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
 from ftlm.solve.motion import decided, misfit, missed, needed
-from ftlm.solve.records import Record, acting, equation_tuple, record, sensor_series
+from ftlm.solve.records import Record, driving, equation_tuple, record, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
 #: least from which a sample follows that no jump of a held input at its instant has reached.
@@ -420,7 +420,7 @@ def _at_instants(
     filtered = rec.sensor is not None and not structure.measured_through(name)
     if not delay and not filtered:
         # Between two pulses there may be a corner, which their mean rounds off.
-        return acting(run, structure, name)[name]
+        return driving(run, structure, name)[name]
     means = rec.of(name)
     if filtered or run.intersample.get(name) != "zoh":
         return _core.point_samples(means)[::every]
