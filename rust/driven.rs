@@ -3,7 +3,7 @@
 use crate::equation::Equation;
 use crate::error::{check_length, Error, Result};
 use crate::excess::kernel;
-use crate::impulses::{add_impulses, is_impulse, parted};
+use crate::impulses::is_impulse;
 use crate::regressors::Record;
 use crate::series::{self, Buffers, Kernel, SumOfProducts};
 
@@ -12,6 +12,8 @@ use crate::series::{self, Buffers, Kernel, SumOfProducts};
 /// Coefficients may be of any size here, as the steps of an estimator make them; what people give is checked before.
 pub(crate) struct System<'a> {
     record: &'a Record,
+    /// Whether the sensor of each output may still have held something.
+    held: Vec<bool>,
     pub(crate) matrix: Vec<Vec<Vec<f64>>>,
     pub(crate) rhs: Vec<Vec<f64>>,
 }
@@ -47,7 +49,7 @@ impl<'a> System<'a> {
                 let eta = structure.integration(k);
                 let unknown = outputs.iter().position(|&o| o == term.signal);
                 if unknown.is_none() {
-                    let signal = record.signal(term.signal);
+                    let signal = record.driver(term.signal, eta);
                     // What stands still drives nothing.
                     if signal.iter().all(|v| *v == 0.0) {
                         continue;
@@ -67,7 +69,7 @@ impl<'a> System<'a> {
                     Some(j) => matrix[i][j].iter_mut().zip(kernel).for_each(|(a, v)| *a -= c * v),
                     None => {
                         // Of a single sample, only that: nothing is to be transformed then.
-                        let signal = record.signal(term.signal);
+                        let signal = record.driver(term.signal, eta);
                         let last = signal.iter().rposition(|v| *v != 0.0).map_or(0, |k| k + 1);
                         let integral = series::multiply(kernel, if last <= FEW { &signal[..last] } else { signal }, m);
                         rhs[i].iter_mut().zip(integral).for_each(|(b, v)| *b += c * v);
@@ -75,7 +77,8 @@ impl<'a> System<'a> {
                 }
             }
         }
-        Ok(Self { record, matrix, rhs })
+        let held = outputs.iter().map(|&o| record.is_held(o)).collect();
+        Ok(Self { record, held, matrix, rhs })
     }
 
     /// The matrix read at ρz, ρ = e^{−decay}, which makes every model stable for a large enough decay [1/pulse].
@@ -90,15 +93,16 @@ impl<'a> System<'a> {
     pub(crate) fn respond(&self, initial: &[Vec<(f64, f64)>]) -> Result<Vec<Vec<f64>>> {
         let (rhs, beside) = self.driven(initial);
         let mut outputs = self.solve(&rhs)?;
-        add_impulses(&mut outputs, &beside, self.record.step());
+        self.add_beside(&mut outputs, &beside);
         Ok(outputs)
     }
 
     /// The right-hand side with these initial terms, and those that are added to the outputs instead.
     #[allow(clippy::type_complexity)]
     fn driven(&self, initial: &[Vec<(f64, f64)>]) -> (Vec<Vec<f64>>, Vec<Vec<(f64, f64)>>) {
-        let (driving, beside) =
-            if self.record.is_filtered() { (initial.to_vec(), Vec::new()) } else { parted(initial) };
+        let (beside, driving): (Vec<_>, Vec<_>) = (initial.iter().enumerate())
+            .map(|(i, own)| own.iter().copied().partition(|&(exponent, _)| self.is_beside(i, exponent)))
+            .unzip();
         let mut rhs = self.rhs.clone();
         for (b, terms) in rhs.iter_mut().zip(&driving) {
             for &(exponent, coefficient) in terms {
@@ -119,7 +123,7 @@ impl<'a> System<'a> {
     ) -> Result<(Vec<Vec<f64>>, bool)> {
         let (rhs, beside) = self.driven(initial);
         let finish = |mut outputs: Vec<Vec<f64>>| {
-            add_impulses(&mut outputs, &beside, self.record.step());
+            self.add_beside(&mut outputs, &beside);
             outputs
         };
         let outputs = finish(self.solve(&rhs)?);
@@ -156,9 +160,19 @@ impl<'a> System<'a> {
         }
     }
 
-    /// Whether an initial term is an impulse that only the filter of its output gets: of none that the record is behind.
-    fn is_beside(&self, exponent: f64) -> bool {
-        is_impulse(exponent) && !self.record.is_filtered()
+    /// Whether an initial term of an equation is an impulse that only the sensor of its output gets: of an output that
+    /// passes the record's filter with all that drives it, the motion of both.
+    fn is_beside(&self, equation: usize, exponent: f64) -> bool {
+        is_impulse(exponent) && (!self.record.is_filtered() || self.held[equation])
+    }
+
+    /// Adds impulses that only sensors get to the outputs.
+    fn add_beside(&self, outputs: &mut [Vec<f64>], beside: &[Vec<(f64, f64)>]) {
+        for (output, own) in outputs.iter_mut().zip(beside) {
+            for &(exponent, value) in own.iter().filter(|(_, value)| *value != 0.0) {
+                output.iter_mut().zip(self.record.initial_term(exponent)).for_each(|(s, v)| *s += value * v);
+            }
+        }
     }
 
     /// Series of the inverse of the matrix, see [`series::Solver::inverse`].
@@ -191,7 +205,7 @@ impl<'a> System<'a> {
                 .iter()
                 .map(|&(i, exponent)| {
                     let term = alone(i, exponent);
-                    if self.is_beside(exponent) {
+                    if self.is_beside(i, exponent) {
                         Ok(term)
                     } else {
                         solver.solve(&term)
@@ -210,7 +224,7 @@ impl<'a> System<'a> {
         Ok(units
             .iter()
             .map(|&(i, exponent)| {
-                if self.is_beside(exponent) {
+                if self.is_beside(i, exponent) {
                     return alone(i, exponent);
                 }
                 let term = self.record.driving_term(exponent);

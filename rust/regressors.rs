@@ -19,6 +19,10 @@ pub struct Record {
     signals: Vec<Vec<f64>>,
     filter: Option<Vec<f64>>,
     clean: Option<Vec<Vec<f64>>>,
+    /// Signals whose own sensor may still have held something when the run began; none where it is empty.
+    held: Vec<bool>,
+    /// Signals less the level at which they began, where there is one; of none where it is empty.
+    moving: Vec<Option<Vec<f64>>>,
 }
 
 impl Record {
@@ -43,7 +47,7 @@ impl Record {
             check_length("filter", m, series.len())?;
             check_finite("filter", series)?;
         }
-        Ok(Self { step, signals, filter, clean: None })
+        Ok(Self { step, signals, filter, clean: None, held: Vec::new(), moving: Vec::new() })
     }
 
     /// Gives every signal a substitute without most of its noise, for instrumental variables.
@@ -65,7 +69,8 @@ impl Record {
     #[must_use]
     pub fn cleaned(&self) -> Self {
         let signals = self.clean.clone().unwrap_or_else(|| self.signals.clone());
-        Self { step: self.step, signals, filter: self.filter.clone(), clean: None }
+        let (held, moving) = (self.held.clone(), Vec::new());
+        Self { step: self.step, signals, filter: self.filter.clone(), clean: None, held, moving }
     }
 
     /// The record of the substitutes for all signals but one.
@@ -95,7 +100,62 @@ impl Record {
         check_length("filter", m, filter.len())?;
         let filtered = |series: &Vec<f64>| series::multiply(filter, series, m);
         let known = self.filter.as_ref().map_or_else(|| filter.to_vec(), filtered);
-        Self::new(self.step, self.signals.iter().map(filtered).collect(), Some(known))
+        let mut through = Self::new(self.step, self.signals.iter().map(filtered).collect(), Some(known))?;
+        through.held.clone_from(&self.held);
+        through.moving = self.moving.iter().map(|moving| moving.as_ref().map(filtered)).collect();
+        Ok(through)
+    }
+
+    /// The same of a run in motion: which signals came through a sensor that may still have held something of the time
+    /// before, and the level at which each signal began.
+    ///
+    /// A derivative above its equation's order drives by what a signal is above its level: from a jump that only the
+    /// record's beginning makes none is taken, and what the time before left is for the initial terms to say.
+    ///
+    /// # Errors
+    /// [`Error::Length`] where there are not as many of both as signals, [`Error::NotFinite`] for a level that is none.
+    ///
+    /// ```
+    /// # use ftlm::regressors::Record;
+    /// let record = Record::new(0.5, vec![vec![1.0, 2.0, 3.0]], None)?.begun(vec![false], &[1.0])?;
+    /// assert_eq!(record.moving(0), [0.0, 1.0, 2.0]);
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    pub fn begun(mut self, held: Vec<bool>, levels: &[f64]) -> Result<Self> {
+        check_length("signals whose sensor held something", self.len(), held.len())?;
+        check_length("levels of signals", self.len(), levels.len())?;
+        check_finite("level of a signal", levels)?;
+        let unit = if levels.iter().any(|v| *v != 0.0) { self.initial_term(0.0) } else { Vec::new() };
+        let above = |(signal, &level): (&Vec<f64>, &f64)| {
+            (level != 0.0).then(|| signal.iter().zip(&unit).map(|(v, one)| v - level * one).collect())
+        };
+        self.moving = self.signals.iter().zip(levels).map(above).collect();
+        self.held = held;
+        Ok(self)
+    }
+
+    /// Pulse means of a signal above the level at which it began, see [`Record::begun`].
+    ///
+    /// # Panics
+    /// Where there is no such signal.
+    #[must_use]
+    pub fn moving(&self, index: usize) -> &[f64] {
+        self.moving.get(index).and_then(Option::as_ref).unwrap_or(&self.signals[index])
+    }
+
+    /// What a term drives by that is integrated by `eta`: below 0 by what moves.
+    pub(crate) fn driver(&self, index: usize, eta: f64) -> &[f64] {
+        if eta < 0.0 {
+            self.moving(index)
+        } else {
+            self.signal(index)
+        }
+    }
+
+    /// Whether a signal came through a sensor that may still have held something when the run began.
+    #[must_use]
+    pub fn is_held(&self, index: usize) -> bool {
+        self.held.get(index).copied().unwrap_or(false)
     }
 
     /// Whether signals and initial terms went through a sensor filter.

@@ -12,7 +12,17 @@ use crate::regressors::Record;
 const MOST_VALUES: usize = 1 << 30;
 
 /// (step, signals as rows, series of the sensor filter or None).
-pub type RecordArg<'py> = (f64, PyReadonlyArray2<'py, f64>, Option<PyReadonlyArray1<'py, f64>>);
+#[derive(FromPyObject)]
+pub enum RecordArg<'py> {
+    /// With which signals' sensors may still have held something, and the level at which each signal began.
+    Begun(
+        f64,
+        PyReadonlyArray2<'py, f64>,
+        Option<PyReadonlyArray1<'py, f64>>,
+        (List<bool>, List<f64>),
+    ),
+    Plain(f64, PyReadonlyArray2<'py, f64>, Option<PyReadonlyArray1<'py, f64>>),
+}
 /// (output, alpha, [(signal, order), …]).
 pub type StructureArg = (usize, f64, List<(usize, f64)>);
 /// A structure and its coefficients.
@@ -53,8 +63,16 @@ pub fn rows(array: &PyReadonlyArray2<'_, f64>) -> PyResult<Vec<Vec<f64>>> {
 }
 
 pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
-    let filter = argument.2.as_ref().map(|f| vector("filter", f)).transpose()?;
-    Ok(Record::new(argument.0, rows(&argument.1)?, filter)?)
+    let (step, signals, filter, begun) = match argument {
+        RecordArg::Begun(step, signals, filter, begun) => (step, signals, filter, Some(begun)),
+        RecordArg::Plain(step, signals, filter) => (step, signals, filter, None),
+    };
+    let filter = filter.as_ref().map(|f| vector("filter", f)).transpose()?;
+    let record = Record::new(*step, rows(signals)?, filter)?;
+    Ok(match begun {
+        Some((held, levels)) => record.begun(held.to_vec(), levels)?,
+        None => record,
+    })
 }
 
 pub fn records(arguments: &[RecordArg<'_>]) -> PyResult<Vec<Record>> {

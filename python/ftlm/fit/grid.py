@@ -57,7 +57,7 @@ def experiment(
     filtered = _output_filter(structure, rec)
     instants = [_instant(run, structure, rec, name, every, decimation) for name in structure.signals]
     measured, counted = _counted(np.stack(samples), slice(1, -1), shares)
-    return rec.core(), every, measured, filtered, list(weights), instants, counted, None
+    return rec.begun(), every, measured, filtered, list(weights), instants, counted, None
 
 
 def _at_own_times(
@@ -75,7 +75,7 @@ def _at_own_times(
     # What was not read everywhere drives nothing.
     instants = [(None if v is None or np.isnan(v).any() else v, False) for v in signals]
     own = (at.places, [at.jumps(name) for name in structure.signals])
-    return rec.core(), 1, measured, filtered, list(weights), instants, counted, own
+    return rec.begun(), 1, measured, filtered, list(weights), instants, counted, own
 
 
 def _output_filter(structure: Structure, rec: Record) -> tuple[Floats | None, list[bool]] | None:

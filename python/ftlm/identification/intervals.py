@@ -23,9 +23,9 @@ PRINTED = 0.95
 TOLD = 1e-3
 #: How often a fit goes on from a lower optimum that its intervals came upon.
 REFITS = 2
-#: Pulses that may be spent on profiles nobody asked for, all numbers together, free runs that an end is worth beginning
-#: with, and by how much these may exceed the former. Where an order is free, a pulse costs so many of running sums.
-UNASKED, FEWEST, STRETCH = 6_000_000, 20, 2
+#: Pulses that may be spent on profiles nobody asked for, all numbers together, and free runs that an end is worth
+#: beginning with. Where an order is free, a pulse costs so many of running sums.
+UNASKED, FEWEST = 6_000_000, 20
 FRACTIONAL = 3
 
 
@@ -54,10 +54,10 @@ def with_intervals(
         pulses, least = joint.samples * joint.refinement, FEWEST * 2 * len(names)
         pulses *= FRACTIONAL if joint.orders else 1
         allowed = (UNASKED - spent) // pulses
-        if intervals == "auto" and least > STRETCH * allowed:
+        if intervals == "auto" and least > allowed:
             found = Profiles({}, None, tuple(names))
             break
-        most = None if intervals == "profile" else max(allowed, least)
+        most = None if intervals == "profile" else allowed
         found = profiled(valley, names, PRINTED, threads=threads, progress=progress, most=most)
         spent += found.evaluations * pulses
         if found.lower is None or turn == REFITS:

@@ -37,6 +37,8 @@ COULOMB = "coulomb_"
 KEPT_SERIES = 4
 #: Initial terms as the core takes them.
 InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int] | tuple[bool, list[float], int, int]
+#: Which signals' sensors may have held something, and where each signal began.
+Begun: TypeAlias = tuple[tuple[bool, ...], tuple[float, ...]]
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,11 @@ class Record:
         Unknown constant of each equation on this run.
     states
         Free motions of the sensor filter beside the initial terms of every output that passes it.
+    held
+        Whether a signal came through a sensor that may still have held something when the run began.
+    levels
+        Where each signal began, in a run that is not from rest: derivatives above their equation's order are of what a
+        signal is above it. 0 of what the filter's free motion was taken out of.
     """
 
     signals: tuple[str, ...]
@@ -71,6 +78,8 @@ class Record:
     initial: Initial
     offset: Offset = "none"
     states: int = 0
+    held: tuple[bool, ...] = ()
+    levels: tuple[float, ...] = ()
 
     @property
     def start(self) -> InitialTuple:
@@ -85,6 +94,10 @@ class Record:
     def core(self) -> tuple[float, Floats, Floats | None]:
         """Return the record as the core takes it."""
         return self.step, self.means, self.sensor
+
+    def begun(self) -> tuple[float, Floats, Floats | None] | tuple[float, Floats, Floats | None, Begun]:
+        """Return the record as the core takes it to drive equations."""
+        return (*self.core(), (self.held, self.levels)) if any(self.held) or any(self.levels) else self.core()
 
     def of(self, name: str) -> Floats:
         """Return the pulse means of a signal."""
@@ -144,6 +157,8 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
                 f"{SMALLEST:g} lose their digits; scale the signal"
             )
         rows.append(means)
+    states, levels = structure.filter_states(initial), tuple(_level(run, structure, s, initial) for s in structure.signals)
+    held = tuple(states > 0 and sensor is not None and structure.measured_through(s) for s in structure.signals)
     return Record(
         structure.signals,
         run.duration / m,
@@ -152,8 +167,18 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         sensor,
         initial,
         structure.offset,
-        structure.filter_states(initial),
+        states,
+        held,
+        levels,
     )
+
+
+def _level(run: Run, structure: Structure, name: str, initial: Initial) -> float:
+    """Where a signal began; 0 from rest, of what came through the filter of an equation, and where it was not read."""
+    if initial == "rest" or name not in run or (structure.behind_filter and structure.measured_through(name)):
+        return 0.0
+    first = float(acting(run, structure, name)[name][0])
+    return first if math.isfinite(first) else 0.0
 
 
 def acting(run: Run, structure: Structure, name: str | None = None) -> Run:

@@ -218,8 +218,8 @@ def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
     powers = [sorted(terms[o].items()) for o in model.outputs]
     inputs = list(rec.inputs)
     if model.structure.coupling == "simulated":
-        return _core.respond(rec.core(), equations, inputs, powers)
-    return np.concatenate([_core.respond(rec.core(), [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
+        return _core.respond(rec.begun(), equations, inputs, powers)
+    return np.concatenate([_core.respond(rec.begun(), [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
 
 
 def _free_and_units(model: Solved, rec: Record, names: Sequence[tuple[str, float]]) -> tuple[Floats, list[Floats]]:
@@ -228,7 +228,7 @@ def _free_and_units(model: Solved, rec: Record, names: Sequence[tuple[str, float
     A unit (output, power) acts while nothing else drives.
     """
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
-    inputs, outputs, core = list(rec.inputs), model.outputs, rec.core()
+    inputs, outputs, core = list(rec.inputs), model.outputs, rec.begun()
     if model.structure.coupling == "simulated":
         asked = [(outputs.index(output), power) for output, power in names]
         free, rows = _core.respond_and_units(core, equations, inputs, asked)

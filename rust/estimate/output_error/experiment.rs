@@ -161,9 +161,9 @@ impl Experiment {
         }
     }
 
-    /// Whether an initial term of this exponent moves nothing but the filter of an output.
-    pub(super) fn moves_filter(&self, exponent: f64) -> bool {
-        is_impulse(exponent) && (self.passed || !self.record.is_filtered())
+    /// Whether an initial term of this exponent moves nothing but the filter of the output that is this signal.
+    pub(super) fn moves_filter(&self, output: usize, exponent: f64) -> bool {
+        is_impulse(exponent) && (self.passed || !self.record.is_filtered() || self.record.is_held(output))
     }
 
     /// Whether an output passes a filter before it is compared, by itself or with all of its equation.

@@ -135,11 +135,11 @@ impl FreeModel {
         if asked {
             let terms: Vec<(usize, f64)> =
                 out.exponents.iter().enumerate().flat_map(|(i, list)| list.iter().map(move |e| (i, *e))).collect();
-            let moving: Vec<(usize, f64)> =
-                terms.iter().filter(|&&(_, e)| !experiment.moves_filter(e)).copied().collect();
+            let beside = |i: usize, e: f64| experiment.moves_filter(self.equations[i].output, e);
+            let moving: Vec<(usize, f64)> = terms.iter().filter(|&&(i, e)| !beside(i, e)).copied().collect();
             let mut answers = shelf.natural(&solved, (structures.len(), record.m()), &moving)?.into_iter();
             for (i, exponent) in terms {
-                let moves = if experiment.moves_filter(exponent) { None } else { answers.next() };
+                let moves = if beside(i, exponent) { None } else { answers.next() };
                 let (samples, means) = match moves {
                     None => (shelf.impulse(experiment, i, exponent), Rc::default()),
                     Some(means) => {
@@ -221,9 +221,10 @@ impl FreeModel {
                     for (i, k) in places() {
                         let (signal, c) = (self.equations[i].terms[k].0, coefficient(i, k));
                         if self.unknown(i, signal).is_none() && c != 0.0 {
-                            let series = || Cow::Borrowed(self.drives(record, signal, acted));
+                            let eta = operators[i][k].eta();
+                            let series = || Cow::Borrowed(self.drives(record, (signal, eta), acted));
                             rights.add(i, c, (&operators[i][k], false), series, || {
-                                shelf.driver(self, experiment, signal, acted)
+                                shelf.driver(self, experiment, (signal, eta), acted)
                             });
                         }
                     }
@@ -248,7 +249,7 @@ impl FreeModel {
                     bits.extend([operator.eta().to_bits(), c.to_bits()]);
                 } else if c != 0.0 {
                     drives = true;
-                    sum.add(c, &operator.spectrum(false), &shelf.driver(self, experiment, signal, acted));
+                    sum.add(c, &operator.spectrum(false), &shelf.driver(self, experiment, (signal, operator.eta()), acted));
                 }
             }
             if drives {
@@ -273,9 +274,15 @@ impl FreeModel {
         Ok((response, solved))
     }
 
-    /// Pulse means of what drives: a signal of the record, or what an actuator makes of it.
-    pub(super) fn drives<'a>(&self, record: &'a Record, signal: usize, acted: &'a [(Vec<f64>, Vec<f64>)]) -> &'a [f64] {
-        self.law_of(signal).map_or_else(|| record.signal(signal), |law| &acted[law].0)
+    /// Pulse means of what drives a term that is integrated by `eta`: a signal of the record, or what an actuator makes of
+    /// it.
+    pub(super) fn drives<'a>(
+        &self,
+        record: &'a Record,
+        (signal, eta): (usize, f64),
+        acted: &'a [(Vec<f64>, Vec<f64>)],
+    ) -> &'a [f64] {
+        self.law_of(signal).map_or_else(|| record.driver(signal, eta), |law| &acted[law].0)
     }
 
     /// Initial terms: the projection of the residuals on their responses.

@@ -59,9 +59,10 @@ impl FreeModel {
                     for (k, (signal, _, monomial)) in equation.terms.iter().enumerate() {
                         let weight = monomial.slope(&point.coefficients, coefficients[place]);
                         if weight != 0.0 {
-                            let series = || Cow::Borrowed(self.drives(record, *signal, &part.acted));
+                            let eta = part.operators[i][k].eta();
+                            let series = || Cow::Borrowed(self.drives(record, (*signal, eta), &part.acted));
                             rights.add(i, weight, (&part.operators[i][k], false), series, || {
-                                shelf.driver(self, experiment, *signal, &part.acted)
+                                shelf.driver(self, experiment, (*signal, eta), &part.acted)
                             });
                         }
                     }

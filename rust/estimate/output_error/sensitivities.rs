@@ -76,8 +76,8 @@ impl FreeModel {
                             let made = || known.get_or_insert_with(|| shelf.spectrum(response)).clone();
                             rights.add(i, weight, (operator, turns), || Cow::Borrowed(response), made);
                         } else {
-                            let series = || Cow::Borrowed(self.drives(record, *signal, &part.acted));
-                            let made = || shelf.driver(self, experiment, *signal, &part.acted);
+                            let series = || Cow::Borrowed(self.drives(record, (*signal, operator.eta()), &part.acted));
+                            let made = || shelf.driver(self, experiment, (*signal, operator.eta()), &part.acted);
                             rights.add(i, weight, (operator, turns), series, made);
                         }
                     }

@@ -57,7 +57,7 @@ pub(super) struct Shelf {
     /// Points of every series that is multiplied, in all factors together.
     pub(super) total: usize,
     /// Spectra of signals that drive and have no free number.
-    drivers: HashMap<usize, Rc<Kernel>>,
+    drivers: HashMap<(usize, bool), Rc<Kernel>>,
     /// Weighted samples of impulses that the filter of an output gets, by output and the bits of their exponents.
     impulses: HashMap<(usize, u64), Vec<f64>>,
 }
@@ -155,23 +155,24 @@ impl Shelf {
         }
     }
 
-    /// The spectrum of a signal that drives, for products of [`FACTORS`] series; of what an actuator makes of it.
+    /// The spectrum of a signal that drives a term integrated by `eta`, for products of [`FACTORS`] series; of what an actuator makes of it.
     pub(super) fn driver(
         &mut self,
         model: &FreeModel,
         experiment: &Experiment,
-        signal: usize,
+        (signal, eta): (usize, f64),
         acted: &[(Vec<f64>, Vec<f64>)],
     ) -> Rc<Kernel> {
         if let Some(law) = model.law_of(signal) {
             return self.spectrum(&acted[law].0);
         }
+        let series = experiment.record.driver(signal, eta);
         if experiment.record.m() > KEPT_PULSES {
-            return self.spectrum(experiment.record.signal(signal));
+            return self.spectrum(series);
         }
         let total = self.total;
-        let made = || Rc::new(Kernel::with_length(experiment.record.signal(signal), total));
-        self.drivers.entry(signal).or_insert_with(made).clone()
+        let made = || Rc::new(Kernel::with_length(series, total));
+        self.drivers.entry((signal, eta < 0.0)).or_insert_with(made).clone()
     }
 
     /// Of a series, for products of [`FACTORS`] of them.
