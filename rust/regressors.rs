@@ -6,6 +6,7 @@ use crate::abreast;
 use crate::equation::{grains, tidy};
 use crate::error::{check_finite, check_length, check_step, Error, Result};
 use crate::excess::kernel;
+use crate::impulses::is_impulse;
 use crate::kernels::{power_means, power_pulses};
 use crate::series::{self, Buffers, Kernel};
 
@@ -23,6 +24,8 @@ pub struct Record {
     held: Vec<bool>,
     /// Signals less the level at which they began, where there is one; of none where it is empty.
     moving: Vec<Option<Vec<f64>>>,
+    /// Answers of the filter to an impulse and to derivatives of one, where they are known better than by pulses.
+    answers: Vec<Vec<f64>>,
 }
 
 impl Record {
@@ -47,7 +50,7 @@ impl Record {
             check_length("filter", m, series.len())?;
             check_finite("filter", series)?;
         }
-        Ok(Self { step, signals, filter, clean: None, held: Vec::new(), moving: Vec::new() })
+        Ok(Self { step, signals, filter, clean: None, held: Vec::new(), moving: Vec::new(), answers: Vec::new() })
     }
 
     /// Gives every signal a substitute without most of its noise, for instrumental variables.
@@ -69,8 +72,8 @@ impl Record {
     #[must_use]
     pub fn cleaned(&self) -> Self {
         let signals = self.clean.clone().unwrap_or_else(|| self.signals.clone());
-        let (held, moving) = (self.held.clone(), Vec::new());
-        Self { step: self.step, signals, filter: self.filter.clone(), clean: None, held, moving }
+        let (held, moving, answers) = (self.held.clone(), Vec::new(), self.answers.clone());
+        Self { step: self.step, signals, filter: self.filter.clone(), clean: None, held, moving, answers }
     }
 
     /// The record of the substitutes for all signals but one.
@@ -107,30 +110,36 @@ impl Record {
     }
 
     /// The same of a run in motion: which signals came through a sensor that may still have held something of the time
-    /// before, and the level at which each signal began.
+    /// before, the level at which each signal began, and pulse means of the filter's answers to an impulse and to
+    /// derivatives of one, as far as they are known.
     ///
     /// A derivative above its equation's order drives by what a signal is above its level: from a jump that only the
     /// record's beginning makes none is taken, and what the time before left is for the initial terms to say.
     ///
     /// # Errors
-    /// [`Error::Length`] where there are not as many of both as signals, [`Error::NotFinite`] for a level that is none.
+    /// [`Error::Length`] where there are not as many of both as signals, or answers of other lengths;
+    /// [`Error::NotFinite`] for a level or an answer that is none.
     ///
     /// ```
     /// # use ftlm::regressors::Record;
-    /// let record = Record::new(0.5, vec![vec![1.0, 2.0, 3.0]], None)?.begun(vec![false], &[1.0])?;
+    /// let record = Record::new(0.5, vec![vec![1.0, 2.0, 3.0]], None)?.begun(vec![false], &[1.0], Vec::new())?;
     /// assert_eq!(record.moving(0), [0.0, 1.0, 2.0]);
     /// # Ok::<(), ftlm::error::Error>(())
     /// ```
-    pub fn begun(mut self, held: Vec<bool>, levels: &[f64]) -> Result<Self> {
+    pub fn begun(mut self, held: Vec<bool>, levels: &[f64], answers: Vec<Vec<f64>>) -> Result<Self> {
         check_length("signals whose sensor held something", self.len(), held.len())?;
         check_length("levels of signals", self.len(), levels.len())?;
         check_finite("level of a signal", levels)?;
+        for answer in &answers {
+            check_length("answer of the filter", self.m(), answer.len())?;
+            check_finite("answer of the filter", answer)?;
+        }
         let unit = if levels.iter().any(|v| *v != 0.0) { self.initial_term(0.0) } else { Vec::new() };
         let above = |(signal, &level): (&Vec<f64>, &f64)| {
             (level != 0.0).then(|| signal.iter().zip(&unit).map(|(v, one)| v - level * one).collect())
         };
         self.moving = self.signals.iter().zip(levels).map(above).collect();
-        self.held = held;
+        (self.held, self.answers) = (held, answers);
         Ok(self)
     }
 
@@ -233,14 +242,26 @@ impl Record {
     /// ```
     #[must_use]
     pub fn initial_term(&self, exponent: f64) -> Vec<f64> {
-        self.behind_filter(power_means(exponent, self.m(), self.step))
+        self.answer(exponent).unwrap_or_else(|| self.behind_filter(power_means(exponent, self.m(), self.step)))
+    }
+
+    /// What is known of the filter's answer to an impulse or to a derivative of one.
+    #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
+    fn answer(&self, exponent: f64) -> Option<Vec<f64>> {
+        if !is_impulse(exponent) {
+            return None;
+        }
+        self.answers.get((-1.0 - exponent) as usize).cloned()
     }
 
     /// The same to drive a free run ([`power_pulses`]): where a filter makes something smooth of it.
     pub(crate) fn driving_term(&self, exponent: f64) -> Vec<f64> {
         match &self.filter {
             None => self.initial_term(exponent),
-            Some(_) => self.behind_filter(power_pulses(exponent, self.m(), self.step)),
+            Some(_) => {
+                let pulses = || self.behind_filter(power_pulses(exponent, self.m(), self.step));
+                self.answer(exponent).unwrap_or_else(pulses)
+            }
         }
     }
 

@@ -68,7 +68,7 @@ _Matrix: TypeAlias = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 _Floats: TypeAlias = NDArray[np.float64]
 
 #: (step [s], signals as rows, series of the sensor filter or None)
-_Begun: TypeAlias = tuple[Sequence[bool], Sequence[float]]
+_Begun: TypeAlias = tuple[Sequence[bool], Sequence[float], _Floats | None]
 _Record: TypeAlias = tuple[float, _Floats, _Floats | None] | tuple[float, _Floats, _Floats | None, _Begun]
 #: (output, alpha, [(signal, order), ...]); signals by row of the record
 _Structure: TypeAlias = tuple[int, float, Sequence[tuple[int, float]]]

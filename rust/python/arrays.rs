@@ -14,12 +14,13 @@ const MOST_VALUES: usize = 1 << 30;
 /// (step, signals as rows, series of the sensor filter or None).
 #[derive(FromPyObject)]
 pub enum RecordArg<'py> {
-    /// With which signals' sensors may still have held something, and the level at which each signal began.
+    /// With which signals' sensors may still have held something, the level at which each signal began, and answers of
+    /// the filter to an impulse and to derivatives of one as rows.
     Begun(
         f64,
         PyReadonlyArray2<'py, f64>,
         Option<PyReadonlyArray1<'py, f64>>,
-        (List<bool>, List<f64>),
+        (List<bool>, List<f64>, Option<PyReadonlyArray2<'py, f64>>),
     ),
     Plain(f64, PyReadonlyArray2<'py, f64>, Option<PyReadonlyArray1<'py, f64>>),
 }
@@ -70,7 +71,10 @@ pub fn record(argument: &RecordArg<'_>) -> PyResult<Record> {
     let filter = filter.as_ref().map(|f| vector("filter", f)).transpose()?;
     let record = Record::new(*step, rows(signals)?, filter)?;
     Ok(match begun {
-        Some((held, levels)) => record.begun(held.to_vec(), levels)?,
+        Some((held, levels, answers)) => {
+            let answers = answers.as_ref().map(rows).transpose()?.unwrap_or_default();
+            record.begun(held.to_vec(), levels, answers)?
+        }
         None => record,
     })
 }

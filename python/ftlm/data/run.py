@@ -302,7 +302,15 @@ class Run(Measured):
         return self._with(_data=data, readings=readings)
 
     def with_samples(self, samples: Mapping[str, Floats], read: Mapping[str, Floats] | None = None) -> Run:
-        """Return this run with other samples of some signals, and other readings of them if it has times of its own."""
+        """Return this run with other samples of some of its signals.
+
+        Parameters
+        ----------
+        samples : mapping of str to array
+            New samples by name, shape (N,).
+        read : mapping of str to array, optional
+            The same at the rows' own times, if it has some.
+        """
         readings = self.readings and self.readings.changed(**(read or {}))
         return self._with(_data={**self._data, **samples}, readings=readings)
 

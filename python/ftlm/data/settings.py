@@ -109,12 +109,13 @@ class Settings:
         """Whether m must be a power of two."""
         return self.coefficients == "multi-innovation" and self.rows == "haar"
 
-    def core(self) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
-        """As the core takes them; the memory that may be taken is asked for here and now, where the search runs."""
+    def core(self, memory: int | None = None) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
+        """As the core takes them; memory that is not given is asked for here and now, where the search runs."""
         p = self.innovation_length if self.coefficients == "multi-innovation" else 0
         steps = REFINEMENTS if self.coefficients == "instrumental-variables" else 0
         ranked = (self.criterion, self.norm, p, self.prior_covariance, self.rows == "haar")
-        return *ranked, self.keep, self.threads, self.early_stopping, steps, memory_limit()
+        most = memory_limit() if memory is None else memory
+        return *ranked, self.keep, self.threads, self.early_stopping, steps, most
 
     def to_dict(self) -> dict[str, Any]:
         """For results and reports."""

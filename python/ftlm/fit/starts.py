@@ -11,6 +11,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.base.errors import FtlmError, ModelError
+from ftlm.base.memory import memory_limit
 from ftlm.data.equations import Equation
 from ftlm.data.limits import FreeInput
 from ftlm.data.orders import SEARCHED_ORDER
@@ -74,6 +75,20 @@ class Row:
 
     orders: dict[str, float]
     coefficients: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Coarse:
+    """How coarse lattices are searched: by least squares, in time, on so many threads, within so many bytes."""
+
+    threads: int
+    memory: int
+    keep: int = ROWS_PER_FILTER
+
+    def core(self) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
+        """As the core takes it."""
+        settings = Settings(coefficients="least-squares", rows="time", keep=self.keep, threads=self.threads)
+        return settings.core(self.memory)
 
 
 def start_axes(problem: FreeProblem) -> dict[str, list[float]]:
@@ -159,6 +174,8 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, threads: int) -> l
     lattices = [(start_axes(problem), APART)] + ([] if natural is None else [(natural, 0.0)])
     attempts: list[Attempt] = []
     fastest = math.pi / max(run.duration / m for run in runs)
+    # What memory there is is asked for once: these lattices are many, and small.
+    coarse = Coarse(threads, memory_limit())
     for multiple in PREFILTERS:
         if multiple is not None and multiple * frequency >= fastest:
             # Nothing on these pulses lies above it.
@@ -167,26 +184,26 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, threads: int) -> l
         origin = "no prefilter" if multiple is None else f"prefilter {multiple * frequency:.3g} rad/s"
         here: list[Attempt] = []
         for axes, apart in lattices:
-            here += lattice_attempts(problem, structure, records, axes, apart, origin, here, threads)
+            here += lattice_attempts(problem, structure, records, axes, apart, origin, here, coarse)
         if natural is not None and multiple in (PREFILTERS[0], None):
-            here += lawful_attempts(problem, structure, records, natural, origin, threads)
+            here += lawful_attempts(problem, structure, records, natural, origin, coarse)
         attempts += here
     return attempts + scanned_attempts(runs, problem, structure, m, attempts)
 
 
 def lattice_attempts(
     problem: FreeProblem, structure: Structure, records: list[Record], axes: Mapping[str, list[float]], apart: float,
-    origin: str, before: Sequence[Attempt], threads: int,
+    origin: str, before: Sequence[Attempt], coarse: Coarse,
 ) -> list[Attempt]:  # fmt: skip
     """Starts from the rows of a lattice that lie apart, the best one followed downhill; none that stood before."""
     attempts: list[Attempt] = []
     picked: list[list[float]] = []
-    for row in lattice_rows(structure, records, axes, threads):
+    for row in lattice_rows(structure, records, axes, coarse):
         values = [row.orders[n] for n in problem.orders]
         far = all(max(abs(a - b) for a, b in zip(values, p, strict=True)) >= apart for p in picked)
         if picked and not far:
             continue
-        start = row if picked else zoom(problem, structure, records, row, threads)
+        start = row if picked else zoom(problem, structure, records, row, coarse)
         picked.append(values)
         values = [start.orders[n] for n in problem.orders]
         if any(np.allclose(values, a.orders, atol=1e-9) for a in (*before, *attempts)):
@@ -199,7 +216,7 @@ def lattice_attempts(
 
 def lawful_attempts(
     problem: FreeProblem, structure: Structure, records: list[Record], axes: Mapping[str, list[float]], origin: str,
-    threads: int,
+    coarse: Coarse,
 ) -> list[Attempt]:  # fmt: skip
     """Starts with one equation's coefficients from another's by the law, the rest of it by least squares.
 
@@ -211,13 +228,13 @@ def lawful_attempts(
     if not tied:
         return []
     attempts = []
-    for row in lattice_rows(structure, records, axes, threads)[:STARTS_PER_FILTER]:
+    for row in lattice_rows(structure, records, axes, coarse)[:STARTS_PER_FILTER]:
         point = {n: [v] for n, v in row.orders.items()}
         for ratio in LAW_RATIOS:
             known = {free: abs(row.coefficients[n]) / ratio ** len(others) for n, (free, others) in tied.items()}
             if not all(math.isfinite(v) and v for v in known.values()):
                 continue
-            for rest in lattice_rows(structure.with_coefficients(known), records, point, threads, keep=1):
+            for rest in lattice_rows(structure.with_coefficients(known), records, point, replace(coarse, keep=1)):
                 values = dict.fromkeys(problem.coefficients, ratio) | rest.coefficients | known
                 orders = [row.orders[n] for n in problem.orders]
                 words = f"{origin}, by the law at {ratio:g}"
@@ -264,7 +281,7 @@ def whole_orders(problem: FreeProblem) -> list[float]:
     return [min(max(usual.get(n, 0.0), low), high) for n, (low, high) in pairs]
 
 
-def zoom(problem: FreeProblem, structure: Structure, records: list[Record], row: Row, threads: int) -> Row:
+def zoom(problem: FreeProblem, structure: Structure, records: list[Record], row: Row, coarse: Coarse) -> Row:
     """Follow a row downhill on ever finer lattices around it."""
     if not row.orders:
         return row
@@ -276,7 +293,7 @@ def zoom(problem: FreeProblem, structure: Structure, records: list[Record], row:
                 low, high = bounds[name]
                 around = (value - step, value, value + step)
                 axes[name] = sorted({round(min(max(v, low), high), 9) for v in around})
-            rows = lattice_rows(structure, records, axes, threads, keep=1)
+            rows = lattice_rows(structure, records, axes, replace(coarse, keep=1))
             if not rows or rows[0].orders == row.orders:
                 break
             row = rows[0]
@@ -297,24 +314,22 @@ def prefiltered(rec: Record, frequency: float | None) -> Record:
 
 
 def lattice_rows(
-    structure: Structure, records: list[Record], axes: Mapping[str, list[float]], threads: int, *,
-    keep: int = ROWS_PER_FILTER,
-) -> list[Row]:  # fmt: skip
+    structure: Structure, records: list[Record], axes: Mapping[str, list[float]], coarse: Coarse
+) -> list[Row]:
     """Best rows of a coarse lattice, by least squares."""
-    settings = Settings(coefficients="least-squares", rows="time", keep=keep, threads=threads)
     if not structure.has_order_law:
-        return side_by_side([equation_rows(e, records, axes, settings) for e in structure.equations], structure)
+        return side_by_side([equation_rows(e, records, axes, coarse) for e in structure.equations], structure)
     stages = list(structure.parts().values())
     if len(stages) <= 1:
-        return stage_rows(structure, records, axes, settings)
+        return stage_rows(structure, records, axes, coarse)
     # Stages that share no order are searched one by one; the best of each belong together.
     own = [{n: v for n, v in axes.items() if n in stage.order_names} for stage in stages]
-    tables = [lattice_rows(s, records, a, threads, keep=keep) for s, a in zip(stages, own, strict=True)]
+    tables = [lattice_rows(s, records, a, coarse) for s, a in zip(stages, own, strict=True)]
     return side_by_side(tables, structure)
 
 
 def stage_rows(
-    structure: Structure, records: list[Record], axes: Mapping[str, list[float]], settings: Settings
+    structure: Structure, records: list[Record], axes: Mapping[str, list[float]], coarse: Coarse
 ) -> list[Row]:
     """Best rows of equations under their order law."""
     signals, names = records[0].signals, list(axes)
@@ -329,7 +344,7 @@ def stage_rows(
     joined = _core.search_stage(
         [r.core() for r in records], [axes[n] for n in names], laws, list(records[0].inputs),
         [[t.fixed for t in e.terms] for e in structure.equations], scales,
-        records[0].start, settings.core(), None,
+        records[0].start, coarse.core(), None,
     )  # fmt: skip
     rows = []
     for _, _, free, parts in joined["rows"]:
@@ -340,34 +355,34 @@ def stage_rows(
     return rows
 
 
-def equation_rows(
-    item: Equation, records: list[Record], axes: Mapping[str, list[float]], settings: Settings
-) -> list[Row]:
+def equation_rows(item: Equation, records: list[Record], axes: Mapping[str, list[float]], coarse: Coarse) -> list[Row]:
     """Best rows of one equation whose orders are free by themselves."""
     signals = records[0].signals
     try:
         table = _core.search(
             [r.core() for r in records], lattice_tuple(item, signals, axes), list(records[0].inputs),
-            [t.fixed for t in item.terms], records[0].start, settings.core(), None,
+            [t.fixed for t in item.terms], records[0].start, coarse.core(), None,
         )  # fmt: skip
     except ModelError as error:
         raise named_signals(error, signals) from None
-    rows = []
-    for _, _, alpha, orders, raw, _ in table["rows"]:
-        every = zip((item.order, *(t.order for t in item.terms)), (alpha, *orders), strict=True)
-        rows.append(Row({o.names[0]: v for o, v in every if o.names}, named_coefficients(item, raw)))
-    return rows
+    placed = enumerate((item.order, *(t.order for t in item.terms)))
+    names = [(place, order.names[0]) for place, order in placed if order.names]
+    free = [(k, t.coefficient, t.factor) for k, t in enumerate(item.terms) if isinstance(t.coefficient, str)]
+    return [
+        Row({name: (alpha, *orders)[place] for place, name in names}, {name: raw[k] / f for k, name, f in free})
+        for _, _, alpha, orders, raw, _ in table["rows"]
+    ]
 
 
 def side_by_side(tables: Sequence[Sequence[Row]], structure: Structure) -> list[Row]:
     """Rows of independent tables side by side, rank by rank; a table that ends goes on with its last row."""
-    rows = []
+    rows, wanted = [], len(structure.coefficient_names)
     for rank in range(max(map(len, tables), default=0)):
         merged = Row({}, {})
         for table in filter(None, tables):
             row = table[min(rank, len(table) - 1)]
             merged.orders.update(row.orders)
             merged.coefficients.update(row.coefficients)
-        if len(merged.coefficients) == len(structure.coefficient_names):
+        if len(merged.coefficients) == wanted:
             rows.append(merged)
     return rows

@@ -8,13 +8,14 @@ first sample it is a jump, whose derivative of an order above the equation's is 
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.data.filters import SensorFilter
 from ftlm.data.run import Run
-from ftlm.data.samples import HELD
+from ftlm.data.samples import HELD, locked
 from ftlm.data.structures import Structure
 from ftlm.solve.motion import decided
 
@@ -22,6 +23,8 @@ from ftlm.solve.motion import decided
 #: what came in is as good as a level and a slope; and over so many samples a number at least.
 SHOWN = 1.0
 SAMPLES = 2
+#: Answers of a filter that are kept: those of the grids at hand.
+KEPT = 4
 
 
 def without_held(run: Run, structure: Structure, name: str | None = None) -> Run:
@@ -67,11 +70,9 @@ def _held(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Fl
     whole = np.zeros((size + 2, size + 2))
     whole[:size, :size], whole[size - 1, size], whole[size, size + 1] = system, gain, 1.0
     begun = np.zeros((size + 2, states + 2))
-    for k in range(states):
-        # An impulse is caught by the last state; each derivative of one goes through the system once more.
-        begun[:size, k] = np.linalg.matrix_power(system, k)[:, size - 1] * gain
+    begun[:size, :states] = _caught(system, gain, states)
     begun[size, states], begun[size + 1, states + 1] = 1.0, 1.0
-    columns = _motions(whole * step, begun, count)
+    columns = _motions(whole * step, begun, count, 0)
     jump = columns[0, states - 1]
     rest = np.delete(columns, states - 1, axis=1)
     level = samples[0] / jump
@@ -79,7 +80,31 @@ def _held(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Fl
     sizes[sizes == 0] = 1.0
     found = np.linalg.lstsq(rest / sizes, samples[:count] - level * columns[:, states - 1], rcond=None)[0] / sizes
     first = begun[:size, :states] @ np.append(found[: states - 1], level)
-    return _motions(system * step, first[:, None], samples.size)[:, 0]
+    return _motions(system * step, first[:, None], samples.size, 0)[:, 0]
+
+
+@lru_cache(maxsize=KEPT)
+def answers(sensor: SensorFilter, states: int, m: int, step: float) -> Floats | None:
+    """Pulse means of a filter's answers to an impulse and to derivatives of one, shape (states, m); None with zeros.
+
+    Pulses would have an impulse last for one of them, and its derivative for two.
+    """
+    if not sensor.holds_answers or not states:
+        return None
+    system, gain = _states(sensor)
+    size = system.shape[0]
+    # What the answer has come to is one state more.
+    whole = np.zeros((size + 1, size + 1))
+    whole[:size, :size], whole[size, 0] = system, 1.0
+    begun = np.zeros((size + 1, states))
+    begun[:size] = _caught(system, gain, states)
+    return locked(np.ascontiguousarray(np.diff(_motions(whole * step, begun, m + 1, size), axis=0).T / step))
+
+
+def _caught(system: Floats, gain: float, states: int) -> Floats:
+    """States after an impulse, and after derivatives of one, column by column."""
+    # An impulse is caught by the last state; each derivative of one goes through the system once more.
+    return np.stack([np.linalg.matrix_power(system, k)[:, -1] * gain for k in range(states)], axis=1)
 
 
 def _states(sensor: SensorFilter) -> tuple[Floats, float]:
@@ -93,18 +118,18 @@ def _states(sensor: SensorFilter) -> tuple[Floats, float]:
     return system, sum(c for c, _ in sensor.numerator) / powers[size]
 
 
-def _motions(system: Floats, begun: Floats, count: int) -> Floats:
-    """First state at so many samples from each of several beginnings, shape (count, beginnings), a unit of time apart."""
+def _motions(system: Floats, begun: Floats, count: int, state: int) -> Floats:
+    """A state at so many samples, a unit of time apart, from each of several beginnings, shape (count, beginnings)."""
     power = exponential(system)
     states = begun[None]
     while states.shape[0] < count:
         states = np.concatenate([states, power @ states])
         power = power @ power
-    return np.asarray(states[:count, 0])
+    return np.asarray(states[:count, state])
 
 
 def exponential(matrix: Floats) -> Floats:
-    """e to the power of a small matrix: Taylor's series of a part so small that its terms soon vanish, squared again."""
+    """Exponential of a small matrix: Taylor's series of a part so small that its terms soon vanish, squared again."""
     halvings = max(0, math.ceil(math.log2(max(float(np.linalg.norm(matrix, 1)), 1e-300))) + 1)
     part = matrix / 2.0**halvings
     term = total = np.eye(matrix.shape[0])

@@ -23,7 +23,7 @@ from ftlm.data.run import Run
 from ftlm.data.samples import locked
 from ftlm.data.several import Runs
 from ftlm.data.structures import Initial, Offset, Structure, check_decided
-from ftlm.solve.held import without_held
+from ftlm.solve.held import answers, without_held
 from ftlm.solve.motion import decided, has_memory, together
 
 #: The paper's number of block pulses, used where the record carries as many.
@@ -37,8 +37,8 @@ COULOMB = "coulomb_"
 KEPT_SERIES = 4
 #: Initial terms as the core takes them.
 InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int] | tuple[bool, list[float], int, int]
-#: Which signals' sensors may have held something, and where each signal began.
-Begun: TypeAlias = tuple[tuple[bool, ...], tuple[float, ...]]
+#: Which signals' sensors may have held something, where each signal began, answers of the filter to impulses.
+Begun: TypeAlias = tuple[tuple[bool, ...], tuple[float, ...], Floats | None]
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,8 @@ class Record:
     levels
         Where each signal began, in a run that is not from rest: derivatives above their equation's order are of what a
         signal is above it. 0 of what the filter's free motion was taken out of.
+    answers
+        Pulse means of the filter's free motions, a row a state; None where it has others, and from rest.
     """
 
     signals: tuple[str, ...]
@@ -80,6 +82,7 @@ class Record:
     states: int = 0
     held: tuple[bool, ...] = ()
     levels: tuple[float, ...] = ()
+    answers: Floats | None = None
 
     @property
     def start(self) -> InitialTuple:
@@ -97,7 +100,9 @@ class Record:
 
     def begun(self) -> tuple[float, Floats, Floats | None] | tuple[float, Floats, Floats | None, Begun]:
         """Return the record as the core takes it to drive equations."""
-        return (*self.core(), (self.held, self.levels)) if any(self.held) or any(self.levels) else self.core()
+        if not any(self.held) and not any(self.levels):
+            return self.core()
+        return (*self.core(), (self.held, self.levels, self.answers))
 
     def of(self, name: str) -> Floats:
         """Return the pulse means of a signal."""
@@ -157,11 +162,12 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
                 f"{SMALLEST:g} lose their digits; scale the signal"
             )
         rows.append(means)
-    states, levels = structure.filter_states(initial), tuple(_level(run, structure, s, initial) for s in structure.signals)
+    states, step = structure.filter_states(initial), run.duration / m
+    levels = tuple(_level(run, structure, s, initial) for s in structure.signals)
     held = tuple(states > 0 and sensor is not None and structure.measured_through(s) for s in structure.signals)
     return Record(
         structure.signals,
-        run.duration / m,
+        step,
         locked(np.stack(rows)),
         tuple(s in run.inputs for s in structure.signals),
         sensor,
@@ -170,6 +176,9 @@ def record(run: Run, structure: Structure, m: int, *, filtered: bool = True) -> 
         states,
         held,
         levels,
+        None
+        if sensor is None or structure.sensor_filter is None
+        else answers(structure.sensor_filter, states, m, step),
     )
 
 

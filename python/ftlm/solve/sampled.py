@@ -216,10 +216,10 @@ def _responses(model: Solved, rec: Record, terms: Terms) -> Floats:
         return motion_with_friction(model, rec, [sorted(terms[o].items()) for o in model.outputs])["outputs"]
     equations = [equation_tuple(e, rec.signals) for e in model.equations]
     powers = [sorted(terms[o].items()) for o in model.outputs]
-    inputs = list(rec.inputs)
+    inputs, core = list(rec.inputs), rec.begun()
     if model.structure.coupling == "simulated":
-        return _core.respond(rec.begun(), equations, inputs, powers)
-    return np.concatenate([_core.respond(rec.begun(), [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
+        return _core.respond(core, equations, inputs, powers)
+    return np.concatenate([_core.respond(core, [e], inputs, [p]) for e, p in zip(equations, powers, strict=True)])
 
 
 def _free_and_units(model: Solved, rec: Record, names: Sequence[tuple[str, float]]) -> tuple[Floats, list[Floats]]:
@@ -335,11 +335,11 @@ def _early(model: Solved, run: Run, rec: Record, every: int) -> Floats:
             if not own and (name not in run or (rec.sensor is not None and not structure.measured_through(name))):
                 # It was made smooth, or is known by its means alone.
                 continue
-            for (between, driving), leading in ((answered, _first(eta, rec.step)), (direct, float(abs(eta) <= GRAIN))):
+            for (between, driven), leading in ((answered, _first(eta, rec.step)), (direct, float(abs(eta) <= GRAIN))):
                 if own:
                     between[i, names.index(name)] -= factor * leading
                 else:
-                    driving.setdefault(name, np.zeros(count))[i] += factor * leading
+                    driven.setdefault(name, np.zeros(count))[i] += factor * leading
             if not own and name not in halves:
                 means = rec.of(name)
                 told = 0.5 * (means[every - 1 : -1 : every] + means[every::every])
@@ -348,7 +348,7 @@ def _early(model: Solved, run: Run, rec: Record, every: int) -> Floats:
                 halves[name] = values - told if held else told - values
     out = np.zeros((count, rec.m // every - 1))
     for name, half in halves.items():
-        gains = [np.linalg.solve(between, driving[name]) for between, driving in (answered, direct)]
+        gains = [np.linalg.solve(between, driven[name]) for between, driven in (answered, direct)]
         out += np.outer(gains[0] - gains[1], half)
     return out
 
