@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from scipy.signal import lsim
 
 import friction
@@ -18,6 +19,7 @@ from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.joint import fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.judge.comparison import compare_means
+from ftlm.solve.held import answers, exponential, without_held
 
 STEP, COUNT, FINE = 1e-3, 6001, 4
 OMEGA, ZETA = 2 * np.pi * 1.0, 0.9
@@ -63,9 +65,9 @@ def measured(filtered: tuple[str, ...], *, together: bool = False, inertial: boo
     return {n: x[::FINE] for n, x in signals.items()}
 
 
-def run_of(signals: dict[str, Floats], inputs: tuple[str, ...] = ("u", "v")) -> ftlm.Run:
+def run_of(signals: dict[str, Floats], inputs: tuple[str, ...] = ("u", "v"), *, step: float = STEP) -> ftlm.Run:
     return ftlm.Run.from_arrays(
-        step=STEP, inputs={n: signals[n] for n in inputs},
+        step=step, inputs={n: signals[n] for n in inputs},
         outputs={n: x for n, x in signals.items() if n not in inputs}, intersample=dict.fromkeys(inputs, "foh"),
     )  # fmt: skip
 
@@ -125,6 +127,87 @@ def test_a_run_in_motion_starts_with_a_filter_in_motion(filtered):
     # Exponents that are given are all there is.
     given = ftlm.Model(replace(found.model.structure, initial=(0.0, 1.0))).compare(run).fit_percent["y"]
     assert given < 99.0
+
+
+#: A fractional equation whose input is differentiated more often than its output.
+ABOVE = "D^1.5 y = a y + d D y + b u + p D^2 v"
+ABOVE_TRUTH = {"a": -9.0, "d": -1.5, "b": 4.0, "p": 0.5}
+
+
+def above_run(filtered: tuple[str, ...], begin: float, every: int) -> ftlm.Run:
+    """Signals of a stable plant by Fourier's integral, from rest to rest, cut in the middle of the motion."""
+    count = 1 << 18
+    t = np.arange(count) * STEP
+
+    def smooth(seed):
+        rng = np.random.default_rng(seed)
+        waves = sum(np.sin(w * t + rng.uniform(0.0, 6.3)) for w in np.geomspace(0.6, 14.0, 14))
+        return waves * (1.0 - np.exp(-((t / 0.7) ** 4))) * np.exp(-((np.maximum(t - 8.0, 0.0) / 0.7) ** 4))
+
+    s = 2j * np.pi * np.fft.rfftfreq(count, STEP)
+    u, v = (np.fft.rfft(smooth(seed)) for seed in (3, 17))
+    c = ABOVE_TRUTH
+    y = (c["b"] * u + c["p"] * s**2 * v) / (s**1.5 - c["d"] * s - c["a"])
+    low = OMEGA**2 / (s**2 + 2 * ZETA * OMEGA * s + OMEGA**2)
+    first, last = round(begin / STEP), round((begin + 5.0) / STEP)
+    return run_of(
+        {n: np.fft.irfft(x * (low if n in filtered else 1.0), count)[first : last + 1 : every]
+         for n, x in (("u", u), ("v", v), ("y", y))}, step=STEP * every,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("filtered", SUBSETS, ids="+".join)
+def test_a_derivative_above_its_equations_order_takes_none_of_the_beginning(filtered):
+    # Signals begin at a level, and what came through a filter with the motion of what that held: neither is a jump.
+    run = above_run(filtered, 1.7, 4)
+    found = ftlm.identify(run, ftlm.equation(ABOVE, sensor_filter=sensor(filtered)), intervals="quadratic")
+    for name, value in ABOVE_TRUTH.items():
+        assert found.coefficients[name] == pytest.approx(value, rel=0.01), name
+    compared = found.model.compare(run)
+    assert compared.fit_percent["y"] > 99.8
+    if "v" not in filtered:
+        # At the first samples as everywhere.
+        missed = np.abs(compared.simulated["y"][0] - run["y"])
+        assert missed[:5].max() < 2e-3 * np.std(run["y"])
+
+
+def test_what_a_filter_held_is_told_from_what_came_in():
+    sensor_filter = ftlm.SensorFilter.low_pass(("v",), frequency=1.0)
+    words = ftlm.equation("D^1.5 y = a y + p D^2 v", sensor_filter=sensor_filter, initial="caputo")
+    t = np.arange(400) * 0.004
+    system = ([[0.0, 1.0], [-(OMEGA**2), -2 * ZETA * OMEGA]], [[0.0], [OMEGA**2]], [[1.0, 0.0]], [[0.0]])
+    came, moved = 0.3 - 0.8 * t, lsim(system, np.zeros(t.size), t, X0=[0.4, -1.7])[1]
+    answer = lsim(system, came, t)[1]
+    run = ftlm.Run.from_arrays(step=0.004, inputs={}, outputs={"v": answer + moved, "y": np.cos(t)})
+    np.testing.assert_allclose(without_held(run, words)["v"], answer, atol=1e-9)
+    np.testing.assert_array_equal(without_held(run, words)["y"], run["y"])
+    # From rest it held nothing.
+    rest = replace(words, initial="rest")
+    np.testing.assert_array_equal(without_held(run, rest)["v"], run["v"])
+    # Noise leaves the first sample where it is, and little of the rest.
+    noise = 1e-3 * np.random.default_rng(5).normal(size=t.size)
+    noisy = ftlm.Run.from_arrays(step=0.004, inputs={}, outputs={"v": answer + moved + noise, "y": np.cos(t)})
+    left = without_held(noisy, words)["v"]
+    assert left[0] == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_allclose(left - answer - noise, 0.0, atol=5e-3)
+
+
+def test_a_filters_answers_to_impulses_are_those_of_its_states():
+    sensor_filter = ftlm.SensorFilter(("v",), ((6.0, 0.0),), ((2.0, 3.0), (5.0, 2.0), (7.0, 1.0), (3.0, 0.0)))
+    m, step, fine = 40, 0.05, 20
+    found = answers(sensor_filter, 3, m, step)
+    system = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-1.5, -3.5, -2.5]]
+    t = (np.arange(m * fine) + 0.5) * step / fine
+    begun = np.array([0.0, 0.0, 3.0])
+    for row in found:
+        there = np.array([(expm(np.array(system) * x) @ begun)[0] for x in t]).reshape(m, fine)
+        np.testing.assert_allclose(row, there.mean(axis=1), atol=1e-4)
+        begun = np.array(system) @ begun
+    np.testing.assert_allclose(
+        exponential(np.array(system) * 7.0), expm(np.array(system) * 7.0), rtol=1e-12, atol=1e-12
+    )
+    zero = ftlm.SensorFilter(("v",), ((1.0, 1.0), (6.0, 0.0)), ((1.0, 2.0), (5.0, 1.0), (7.0, 0.0)))
+    assert answers(zero, 1, m, step) is None
 
 
 #: A hub and the elastic link on it; each drives the other, the current both.
