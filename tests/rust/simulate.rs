@@ -514,3 +514,55 @@ fn singular_powers_drive_filtered_equations_to_second_order() {
         check_between(&format!("order of the response to t^{exponent}"), order, 1.9, 2.4);
     }
 }
+
+#[test]
+fn a_derivative_above_its_equations_order_is_of_what_a_signal_is_above_its_level() {
+    let (m, step, level) = (200, 0.02, 0.7);
+    let mut random = Random::new(11);
+    let input: Vec<f64> = random.signal(m).iter().map(|v| level + 0.3 * v).collect();
+    let above: Vec<f64> = input.iter().map(|v| v - level).collect();
+    let run = |input: &[f64]| record(step, vec![vec![0.0; m], input.to_vec()]);
+    let begun = run(&input).begun(vec![false; 2], &[0.0, level], Vec::new()).unwrap();
+    for (order, expected) in [(1.3, &above), (0.9, &input), (0.2, &input)] {
+        let model = equation(0, 0.9, &[(0, 0.0, -3.0), (1, order, 2.0)]);
+        let (found, told) = (respond(one(&model), &begun, &[]), respond(one(&model), &run(expected), &[]));
+        assert!(distance(&found.unwrap()[0], &told.unwrap()[0]) < 1e-12, "order {order}");
+    }
+    // Behind a filter the level is what the filter makes of it.
+    let lag =
+        Filter { numerator: vec![(4.0, 0.0)], denominator: vec![(1.0, 1.0), (4.0, 0.0)] }.series(m, step).unwrap();
+    let through = begun.through(&lag).unwrap();
+    assert!(distance(through.moving(1), &series::multiply_naive(&lag, &above, m)) < 1e-12);
+    let unit = record(step, vec![vec![1.0; m]]).through(&lag).unwrap();
+    let late = run(&input).through(&lag).unwrap().begun(vec![false; 2], &[0.0, level], Vec::new()).unwrap();
+    let expected: Vec<f64> = late.signal(1).iter().zip(unit.signal(0)).map(|(v, one)| v - level * one).collect();
+    assert!(distance(late.moving(1), &expected) < 1e-12);
+    assert_eq!(late.moving(0), late.signal(0));
+    assert!(matches!(run(&input).begun(vec![false], &[0.0, level], Vec::new()), Err(Error::Length { .. })));
+    assert!(matches!(run(&input).begun(vec![false; 2], &[0.0], Vec::new()), Err(Error::Length { .. })));
+    assert!(matches!(run(&input).begun(vec![false; 2], &[0.0, f64::NAN], Vec::new()), Err(Error::NotFinite { .. })));
+    assert!(matches!(run(&input).begun(vec![false; 2], &[0.0; 2], vec![vec![0.0; 3]]), Err(Error::Length { .. })));
+}
+
+#[test]
+fn what_a_sensor_held_moves_its_output_alone() {
+    let (m, step) = (120, 0.05);
+    let lag = Filter { numerator: vec![(4.0, 0.0)], denominator: vec![(1.0, 2.0), (3.0, 1.0), (4.0, 0.0)] }
+        .series(m, step)
+        .unwrap();
+    let run = record(step, vec![vec![0.0; m], vec![0.0; m]]).through(&lag).unwrap();
+    let model = equation(0, 1.4, &[(0, 0.6, -1.0), (0, 0.0, -5.0), (1, 0.0, 1.0)]);
+    let answers: Vec<Vec<f64>> = (1..=2).map(|k| vec![f64::from(k); m]).collect();
+    let held = run.clone().begun(vec![true, false], &[0.0; 2], answers.clone()).unwrap();
+    let units = [(0, -1.0), (0, -2.0), (0, 0.4)];
+    let (_, found) = respond_and_units(one(&model), &held, &units).unwrap();
+    let (_, moved) = respond_and_units(one(&model), &run, &units).unwrap();
+    assert_eq!(found[0][0], answers[0]);
+    assert_eq!(found[1][0], answers[1]);
+    // Of others, and of outputs that pass the filter later, it is a motion of the equation.
+    assert!(distance(&found[2][0], &moved[2][0]) < 1e-12);
+    assert!(distance(&moved[0][0], &run.initial_term(-1.0)) > 1e-3);
+    let together = respond(one(&model), &held, &[vec![(-1.0, 0.5), (-2.0, -0.25), (0.4, 2.0)]]).unwrap();
+    let sum: Vec<f64> = (0..m).map(|k| 0.5 * found[0][0][k] - 0.25 * found[1][0][k] + 2.0 * found[2][0][k]).collect();
+    assert!(distance(&together[0], &sum) < 1e-10);
+}

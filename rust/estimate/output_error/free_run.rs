@@ -249,7 +249,11 @@ impl FreeModel {
                     bits.extend([operator.eta().to_bits(), c.to_bits()]);
                 } else if c != 0.0 {
                     drives = true;
-                    sum.add(c, &operator.spectrum(false), &shelf.driver(self, experiment, (signal, operator.eta()), acted));
+                    sum.add(
+                        c,
+                        &operator.spectrum(false),
+                        &shelf.driver(self, experiment, (signal, operator.eta()), acted),
+                    );
                 }
             }
             if drives {
