@@ -15,7 +15,7 @@ from ftlm.data.settings import Loss
 from ftlm.data.structures import History, Initial, Structure
 from ftlm.fit.joint import RACED, SWEEP, JointFit, Outset, Race, fit_output_error
 from ftlm.fit.problem import FreeProblem
-from ftlm.solve.motion import has_memory, history, misfit, needed, together
+from ftlm.solve.motion import has_memory, history, misfit_of_fits, needed, together
 from ftlm.solve.past import in_motion
 
 
@@ -97,7 +97,7 @@ def asks_for_history(few: JointFit, many: JointFit, runs: Sequence[Run], structu
         [fit.noise[o] * np.concatenate([part[o] for part in fit.residuals]) for o in outputs] for fit in (few, many)
     )
     sizes = [float(np.nanstd(np.concatenate([run[o] for run in runs]))) for o in outputs]
-    return needed(structure, misfit(ours, theirs, sizes), many.initial_terms - few.initial_terms)
+    return needed(structure, misfit_of_fits(ours, theirs, sizes), many.initial_terms - few.initial_terms)
 
 
 def _moved(joint: JointFit, runs: Sequence[Run], structure: Structure) -> bool:

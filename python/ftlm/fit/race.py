@@ -14,7 +14,7 @@ from ftlm.data.structures import History
 from ftlm.fit.clock import Clock
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.simpler import LowerOrder, Simpler, Whole, held, lower_orders, simpler, whole
+from ftlm.fit.simpler import LowerOrder, Simpler, Whole, held, lower_orders, simpler, unlike, whole
 from ftlm.fit.starts import delayed_attempts, power_frequency
 
 #: Samples a run of the coarse fits that compare starts; the best ones continue on all samples.
@@ -107,7 +107,7 @@ def without_history(
         reached = laps.run(coarse, starts, FIRST_LAP)
     # Whatever a simpler equation reaches, this one reaches too: it starts there with the term's coefficient at 0, or
     # with a pole too fast to see.
-    others: list[Simpler | LowerOrder | Whole] = [*simpler(problem), *lower_orders(problem, runs)]
+    others: list[Simpler | LowerOrder | Whole] = [*unlike(simpler(problem)), *lower_orders(problem, runs)]
     others += whole(problem, reached[0].orders) if reached else []
     first, wholes = reached, list[Attempt]()
     for less in others if reached else []:
@@ -120,6 +120,13 @@ def without_history(
             reached = sorted(
                 reached + laps.run(coarse, [less.embedded(a, problem) for a in ended[:1]], 1), key=lambda a: a.level
             )
+            continue
+        if isinstance(less, Simpler) and is_rich(problem) and len(less.problem.orders) < len(problem.orders):
+            # One of several terms of free orders less is still an equation of many optima: searched like the whole.
+            ended = without_history(replace(alike, problem=less.problem), floor, threads, None)[0]
+            # Which of its optima is the lowest, a history may turn round.
+            there = laps.run(coarse, [less.embedded(a, problem) for a in in_reach(ended)[:FEWEST]], 1)
+            reached = sorted(reached + there, key=lambda a: a.level)
             continue
         try:
             runners = delayed_attempts(runs, less.problem, threads)
@@ -160,6 +167,12 @@ def without_history(
     if progress is not None:
         progress(len(starts), len(starts))
     return reached, coarse
+
+
+def is_rich(problem: FreeProblem) -> bool:
+    """Whether an equation has several own terms of free order."""
+    equations = problem.structure.equations
+    return any(sum(bool(t.order.names) for t in e.terms if t.signal == e.output) > 1 for e in equations)
 
 
 def with_history(

@@ -248,3 +248,24 @@ def simpler(problem: FreeProblem) -> list[Simpler]:
             held = structure.with_coefficients({name: known[name]})
             out.append(Simpler(FreeProblem.of(held), name, item.order, known[name], driven=True))
     return out
+
+
+def unlike(problems: Sequence[Simpler]) -> list[Simpler]:
+    """One of those that are one equation but for the names of its free numbers: of two terms alike either may go."""
+    kept: dict[object, Simpler] = {}
+    for less in problems:
+        structure = less.problem.structure
+        alone = len(structure.equations) == 1 and not less.driven and not structure.delay
+        kept.setdefault(_nameless(less.problem) if alone else id(less), less)
+    return list(kept.values())
+
+
+def _nameless(problem: FreeProblem) -> tuple[object, ...]:
+    """The equation of a problem, its terms in an order of their own, and bounds in place of the names of orders."""
+    (item,), bounds = problem.structure.equations, dict(zip(problem.orders, problem.bounds, strict=True))
+
+    def of(order: Order) -> tuple[object, ...]:
+        return order.constant, *((w, bounds[n]) for n, w in order.weights)
+
+    terms = [(t.signal, of(t.order), t.fixed, t.factor) for t in item.terms]
+    return item.output, of(item.order), *sorted(terms, key=repr)

@@ -7,6 +7,7 @@ answers its inputs before they come, which no machine does, and where residuals 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,8 +17,10 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
+from ftlm.fit.clock import Clock
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
+from ftlm.fit.simpler import held as known_orders
 
 #: Stretches of the runs whose sums of squares are compared, and the 99 % quantile of Student's t of one less.
 STRETCHES, STUDENT_99 = 20, 2.54
@@ -94,24 +97,62 @@ def dissipative(problem: FreeProblem, attempt: Attempt) -> tuple[Attempt, list[i
     return replace(attempt, coefficients=values, origin=origin), [len(problem.orders) + k for k in turned]
 
 
+def lacking(problem: FreeProblem, attempt: Attempt) -> list[tuple[Attempt, list[int]]]:
+    """The point without one own term after the other, each held at 0 where the rest follows first.
+
+    What a term less explains without growing, the whole equation explains, too.
+    """
+    own = own_terms(problem)
+    places = [k for k, name in enumerate(problem.coefficients) if name in own]
+    out = []
+    for k in places if len(places) > 1 else []:
+        values = [0.0 if i == k else v for i, v in enumerate(attempt.coefficients)]
+        origin = f"{attempt.origin}, from {problem.coefficients[k]} = 0"
+        out.append((replace(attempt, coefficients=values, origin=origin), [len(problem.orders) + k]))
+    return out
+
+
+def stable_ends(held: Grid, best: Attempt, reached: Sequence[Attempt]) -> list[Attempt]:
+    """Where attempts end whose free runs die away: those of a race, and what is nearest to a growing optimum."""
+    problem = held.problem
+    starts: list[tuple[Attempt, list[int]]] = [(a, []) for a in reached if not grows(problem, a)]
+    ends = []
+    for start, turned in (*starts[:LOOKED_AT], dissipative(problem, best), *lacking(problem, best)):
+        if grows(problem, start):
+            continue
+        try:
+            near = held.descend(start, EVALUATIONS, plain=True, held=turned) if turned else start
+            ends.append(ended_steadily(held, near))
+        except FtlmError:
+            # No finite free run on this grid; the others have one.
+            continue
+    return ends
+
+
+def ended_steadily(held: Grid, start: Attempt) -> Attempt:
+    """Where a descent ends that goes to no free run that grows, along the limit of growth if it comes there."""
+    end = held.descend(start, EVALUATIONS, plain=True)
+    return end if end.converged else along_limit(held, end)
+
+
 def steadied(best: Attempt, grid: Grid, reached: Sequence[Attempt]) -> tuple[Attempt, Grid, Growth | None]:
     """The optimum to go on from, on a grid that stays where free runs die away if it does, and what was compared."""
     problem = grid.problem
     if not grows(problem, best):
         return best, grid, None
     held = replace(grid, steady=True)
-    starts: list[tuple[Attempt, list[int]]] = [(a, []) for a in reached if not grows(problem, a)]
-    ends = []
-    for start, turned in (*starts[:LOOKED_AT], dissipative(problem, best)):
-        if grows(problem, start):
-            continue
-        try:
-            near = held.descend(start, EVALUATIONS, plain=True, held=turned) if turned else start
-            end = held.descend(near, EVALUATIONS, plain=True)
-            ends.append(end if end.converged else along_limit(held, end))
-        except FtlmError:
-            # No finite free run on this grid; the others have one.
-            continue
+    ends = stable_ends(held, best, reached)
+    clock = Clock.of(problem, grid.runs)
+    for one in known_orders(problem):
+        # What the equation explains with an order known without growing, it explains with that order free.
+        narrow = replace(held, problem=one.problem)
+        inside = stable_ends(
+            narrow, one.without(best, problem, clock), [one.without(a, problem, clock) for a in reached]
+        )
+        if inside:
+            with contextlib.suppress(FtlmError):
+                there = one.embedded(nearest_stable(narrow, inside), problem.orders[one.order])
+                ends.append(ended_steadily(held, there))
     if not ends:
         return best, grid, Growth(kept=True, excess=math.inf)
     other = nearest_stable(held, ends)

@@ -38,6 +38,9 @@ WHOLE = 3
 #: runs. The usual share of 1 or 5 % would let a weak past through unseen, with intervals too short for its bias. Beside
 #: an offset, which explains a first value away from zero by itself and which a history would hide, it is less.
 DOUBT, DOUBT_BESIDE_OFFSET = 0.25, 0.02
+#: Share of an excess in squares that asks for a history as well: what few samples far out make of it is no history, but
+#: where squares are what is fitted, no fit is to leave more than one with fewer numbers does that has a history.
+OF_SQUARES = 0.25
 
 
 def starts_at_rest(run: Run, structure: Structure) -> bool:
@@ -110,6 +113,16 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
         if float(np.sqrt(np.mean(one[there] ** 2))) > ROUNDING * size:
             excess += huber_excess(one[there], other[there])
     return excess
+
+
+def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
+    """The misfit of one fit beside another, or a share of what squares say of it where that is more."""
+    squares = 0.0
+    for one, other in zip(few, many, strict=True):
+        there = ~np.isnan(one)
+        floor, above = float(np.mean(other[there] ** 2)), float(np.sum(one[there] ** 2 - other[there] ** 2))
+        squares += above / floor if floor > 0.0 else 0.0
+    return max(misfit(few, many, sizes), OF_SQUARES * squares)
 
 
 def missed(measured: Floats, simulated: Floats) -> Floats:

@@ -23,7 +23,7 @@ from ftlm.data.solved import Solved
 from ftlm.data.structures import History, Initial, Offset, Structure, offset_exponents
 from ftlm.solve.friction import begun, motion_with_friction
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
-from ftlm.solve.motion import decided, misfit, missed, needed
+from ftlm.solve.motion import decided, misfit_of_fits, missed, needed
 from ftlm.solve.records import Record, driving, equation_tuple, record, sensor_series
 
 #: First refinement of the record's own grid, doubled until the response stands still. Two pulses an interval are the
@@ -109,7 +109,7 @@ def started(model: Solved, run: Run) -> Solved:
         return long
     more = sum(map(len, theirs.values())) - sum(map(len, ours.values()))
     sizes = np.nanstd(measured, axis=1).tolist()
-    excess = misfit([*missed(measured, few)], [*missed(measured, many)], sizes)
+    excess = misfit_of_fits([*missed(measured, few)], [*missed(measured, many)], sizes)
     return long if needed(model.structure, excess, more) else short
 
 
