@@ -118,10 +118,11 @@ def misfit(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]
 def misfit_of_fits(few: Sequence[Floats], many: Sequence[Floats], sizes: Sequence[float]) -> float:
     """The misfit of one fit beside another, or a share of what squares say of it where that is more."""
     squares = 0.0
-    for one, other in zip(few, many, strict=True):
+    for one, other, size in zip(few, many, sizes, strict=True):
         there = ~np.isnan(one)
         floor, above = float(np.mean(other[there] ** 2)), float(np.sum(one[there] ** 2 - other[there] ** 2))
-        squares += above / floor if floor > 0.0 else 0.0
+        if math.sqrt(float(np.mean(one[there] ** 2))) > ROUNDING * size:
+            squares += above / floor if floor > 0.0 else math.inf
     return max(misfit(few, many, sizes), OF_SQUARES * squares)
 
 
