@@ -1,8 +1,8 @@
 //! What the sensor filter of an output still held when a run began: its answers to an impulse and to derivatives of one.
 //!
-//! They are written as powers of t below zero, −1, −2, …, among the initial terms of an equation. Where the whole
-//! equation stands behind the filter they drive it like any other; where the machine moves before its filter they move
-//! nothing, and are added to the output that passes it.
+//! They are written as powers of t below zero, −1, −2, …, among the initial terms of an equation. They move nothing, and are
+//! added to the output that came through the sensor. Only where the whole equation is put through the filter afterwards, with
+//! an output that was not measured through it, do they drive the equation like others: what drives then held them.
 
 use crate::kernels::power_means;
 

@@ -34,8 +34,8 @@ pub struct OutputFilter<'a> {
 ///
 /// One equation alone is driven by the measured other outputs (measured coupling); all equations of a stage together
 /// by the currents alone. `initial` holds (exponent, coefficient) pairs per equation, empty at rest; whole exponents
-/// below 0 are impulses, which of a record that is not behind a filter only the filter of the output gets, so that they
-/// are added to it. An unstable model may leave the range of floating point: the values are then not finite.
+/// below 0 are impulses, which only the sensor of the output gets where the record is not behind a filter, or where the
+/// output came through it ([`Record::begun`]), so that they are added to it. An unstable model may leave the range of floating point: the values are then not finite.
 /// O(n² m log² m).
 ///
 /// # Errors
@@ -70,7 +70,7 @@ fn checked<'a>(equations: &[Equation], record: &'a Record, initial: &[Vec<(f64, 
     for terms in initial {
         let (exponents, coefficients): (Vec<f64>, Vec<f64>) = terms.iter().copied().unzip();
         check_finite("coefficients of the initial terms", &coefficients)?;
-        // Behind a filter an impulse is a motion like others.
+        // Through a filter that is applied afterwards an impulse is a motion like others.
         Initial::Powers(exponents.into_iter().filter(|&e| !is_impulse(e)).collect()).check()?;
     }
     let system = System::new(equations, record)?;
