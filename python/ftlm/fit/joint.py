@@ -51,6 +51,8 @@ SETTLED = 0.01
 #: Refinement ends when halving the step moves no estimate, or none extrapolated to step 0, by this share of its
 #: standard error.
 REFINED = 0.1
+#: Logarithm of residuals by which halving the step may raise them before other starts have their way on the finer grid.
+ROSE = 5e-4
 
 
 @dataclass(frozen=True)
@@ -290,7 +292,7 @@ def ended(best: Attempt, grid: Grid, reached: Sequence[Attempt], loss: Loss, *, 
     best, grid, growth = steadied(best, grid, reached)
     if growth is not None and not growth.kept:
         best, grid = with_settled_weights(best, grid, loss)
-    others = reached[:1]
+    others = finalists(reached) if reached else ()
     optimum = refined(best, grid, loss, others) if refine else Optimum(best, grid, best.values, settled=True)
     starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
     return replace(joint_fit(optimum, starts), growth=growth)
@@ -369,8 +371,11 @@ def refined(best: Attempt, grid: Grid, loss: Loss = "squares", others: Sequence[
         except FtlmError:
             # Where two grids point there may be no free run.
             finer, fine_grid = with_settled_weights(best, grid.finer, loss)
-        if finer.outcome["status"] == "wall" and before is None:
+        rose = likelihood(finer, fine_grid) > likelihood(best, grid) + ROSE
+        if (finer.outcome["status"] == "wall" and before is None) or (rose and others):
             finer, fine_grid = freed(finer, fine_grid, others, loss)
+            # They have had their way.
+            others = ()
         grid = fine_grid
         errors = clock.errors(finer.values, covariance(finer, grid))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
