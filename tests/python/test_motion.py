@@ -18,7 +18,7 @@ import motion
 import oracles
 from ftlm import cli
 from ftlm.data.structures import History
-from ftlm.solve.motion import decided, history
+from ftlm.solve.motion import decided, history, misfit, misfit_of_fits
 from ftlm.solve.records import prepare, record
 from ftlm.solve.sampled import started
 
@@ -275,3 +275,18 @@ def test_equation_error_methods_carry_the_history_too(halves, method):
     found = ftlm.identify(run, structure, method=method, **options)
     assert found.settings["initial"] == "history, 8 powers of t up to 2"
     assert found.coefficients == pytest.approx({"a": 0.5, "b": 1.0}, rel=0.1)
+
+
+def test_squares_have_a_say_in_what_a_history_is_worth():
+    rng = np.random.default_rng(0)
+    many = rng.normal(size=2000)
+    # What lies far out hardly counts by Huber's measure, and in squares as much as it lies.
+    few = many.copy()
+    few[::200] += 40.0
+    by_huber, together = misfit([few], [many], [100.0]), misfit_of_fits([few], [many], [100.0])
+    squares = np.sum(few**2 - many**2) / np.mean(many**2)
+    assert by_huber < 0.25 * squares
+    assert together == pytest.approx(0.25 * squares)
+    assert misfit_of_fits([many], [many], [100.0]) == 0.0
+    assert misfit_of_fits([1e-16 * few], [0.0 * many], [100.0]) == 0.0
+    assert misfit_of_fits([few], [0.0 * many], [100.0]) == np.inf

@@ -20,7 +20,7 @@ from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.race import distinct, without_vanished
 from ftlm.fit.simpler import whole
-from ftlm.fit.steady import dissipative, forced, grows, nearest_stable
+from ftlm.fit.steady import dissipative, forced, grows, lacking, nearest_stable
 from measured import DATA, needs_data
 
 ANGLES = {"theta11": "th11_deg", "theta12": "th12_deg", "theta21": "th21_deg", "theta22": "th22_deg"}
@@ -118,6 +118,20 @@ def test_a_steady_descent_stays_where_free_runs_die_away() -> None:
     assert forced(grid, free, kept)
     # From where it grows, it may leave.
     assert grows(problem, held.descend(free, 20, plain=True))
+
+
+def test_a_growing_optimum_is_held_against_what_lacks_one_own_term() -> None:
+    problem = FreeProblem.of(ftlm.equation("D^2 y = d D y + a y + e D^nu y + b u", initial="caputo"))
+    point = Attempt([0.5], [0.3, -2.0, 0.7, 4.0], "here", {})
+    assert problem.coefficients == ("d", "a", "e", "b")
+    found = [(attempt.coefficients, attempt.orders, held) for attempt, held in lacking(problem, point)]
+    assert found == [
+        ([0.0, -2.0, 0.7, 4.0], [0.5], [1]),
+        ([0.3, 0.0, 0.7, 4.0], [0.5], [2]),
+        ([0.3, -2.0, 0.0, 4.0], [0.5], [3]),
+    ]
+    alone = FreeProblem.of(ftlm.equation("D^alpha y = a y + b u", initial="caputo"))
+    assert lacking(alone, Attempt([1.2], [0.3, 1.0], "here", {})) == []
 
 
 def test_a_wall_counts_where_every_optimum_is_far_worse() -> None:
