@@ -221,7 +221,7 @@ def test_an_equation_is_rich_with_two_own_terms_of_free_order(text: str, rich: b
 
 
 def test_what_only_a_coarse_grid_carries_gives_way_to_another_optimum() -> None:
-    # The samples' own grid has its lowest optimum where finer ones lead to two orders in one, 3 % above what is contained.
+    # The samples' own grid is lowest where finer ones lead to two orders in one, 3 % above what is contained.
     run, noise = resonant_plant(39), []
     for text in ("D^alpha y = d D^mu y + a y + b u", "D^alpha y = d D^mu y + e D^nu y + a y + b u"):
         found = ftlm.identify(run, ftlm.equation(text), intervals="quadratic")
