@@ -373,9 +373,13 @@ def refined(best: Attempt, grid: Grid, loss: Loss = "squares", others: Sequence[
             finer, fine_grid = with_settled_weights(best, grid.finer, loss)
         rose = likelihood(finer, fine_grid) > likelihood(best, grid) + ROSE
         if (finer.outcome["status"] == "wall" and before is None) or (rose and others):
-            finer, fine_grid = freed(finer, fine_grid, others, loss)
+            other, fine_grid = freed(finer, fine_grid, others, loss)
             # They have had their way.
             others = ()
+            if other is not finer:
+                # Two grids have two optima, of which they tell nothing together.
+                before, best, estimate, grid = None, other, other.values, fine_grid
+                continue
         grid = fine_grid
         errors = clock.errors(finer.values, covariance(finer, grid))
         # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
