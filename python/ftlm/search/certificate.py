@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from ftlm import _core
@@ -17,6 +16,7 @@ from ftlm.data.settings import Settings
 from ftlm.data.structures import Structure
 from ftlm.search.job import Job
 from ftlm.search.orders import make_job
+from ftlm.search.proved import OrderCertificate
 from ftlm.solve.records import named_signals
 
 #: How much better than the best found other orders may be, and boxes of orders after which a proof ends.
@@ -25,92 +25,11 @@ CELLS = 20_000_000
 #: How large an equation's terms may be beside the output: larger ones cancel but for a thousandth.
 LARGEST = 1000.0
 #: What a certificate is of, as settings of an order search.
-PROVED = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
+PROVED: dict[str, Any] = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
 _WAY_OUT = (
     "rank by squared equation errors with least-squares coefficients (criterion='equation-error', norm='l2', "
     "coefficients='least-squares'), or ask for none"
 )
-
-
-@dataclass(frozen=True)
-class OrderCertificate:
-    """What is proved of the equation errors of all orders in some intervals.
-
-    Parameters
-    ----------
-    at_least
-        No orders of the intervals leave a smaller RMS equation error, with any coefficients whose terms are not beyond
-        `largest`, in exact arithmetic on the pulse means; 0 where nothing is proved.
-    best
-        The smallest that was found on the way, infinite where none was.
-    orders
-        Where that is: free orders by name.
-    asked
-        How much better than that other orders might have been, as a share.
-    intervals
-        Lowest and highest value of each free order.
-    apart
-        How far orders of the output stay below its highest one, and orders of one signal from one another.
-    largest
-        How many times the RMS size of the output those of an equation's terms have together at most.
-    cells
-        Boxes of orders that were bounded.
-    open
-        Those of them whose bound is lower than was asked for, too small to be halved or one too many.
-    m
-        Block pulses a run.
-    """
-
-    at_least: float
-    best: float
-    orders: dict[str, float]
-    asked: float
-    intervals: dict[str, tuple[float, float]]
-    apart: float
-    largest: float
-    cells: int
-    open: int
-    m: int
-
-    @property
-    def within(self) -> float:
-        """By what share of the best found other orders may be better: 1 where nothing is proved."""
-        return max(0.0, 1 - self.at_least / self.best)
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        return {
-            "at_least": self.at_least,
-            "best": self.best if self.orders else None,
-            "within": self.within,
-            "asked": self.asked,
-            "orders": self.orders,
-            "intervals": {name: list(interval) for name, interval in self.intervals.items()},
-            "apart": self.apart,
-            "largest": self.largest,
-            "cells": self.cells,
-            "open": self.open,
-            "m": self.m,
-        }
-
-    def __str__(self) -> str:
-        intervals = ", ".join(f"{n} from {low:g} to {high:g}" for n, (low, high) in self.intervals.items())
-        where = f"{intervals} (orders of the output {self.apart:g} below its highest, of one signal {self.apart:g} apart)"
-        found = ", ".join(f"{name} {value:.5g}" for name, value in self.orders.items())
-        cells = f"{self.cells} boxes of orders"
-        if self.at_least == 0:
-            return (
-                f"certificate: nothing is proved of all orders with {where}: {self.open} of {cells} are left; narrow the "
-                "intervals, keep orders farther apart, or allow more boxes"
-            )
-        text = (
-            f"certificate: no orders with {where}, on a lattice or between, leave an RMS equation error below "
-            f"{self.at_least:.5g}, with any coefficients whose terms are not {self.largest:g} times the output; {found} "
-            f"leave {self.best:.5g}, so nothing is better by more than {100 * self.within:.2g} % ({cells})"
-        )
-        if self.open:
-            text += f"; {100 * self.asked:g} % was asked for, and {self.open} boxes were too small to be halved or too many"
-        return text
 
 
 def certify_orders(
@@ -129,8 +48,8 @@ def certify_orders(
     """Prove that no orders in the intervals of a lattice, on it or between, have a much smaller equation error.
 
     Boxes of orders are halved until each is proved to leave, with the coefficients that suit each of its orders best,
-    an RMS equation error of at least the best one found times ``1 - within``. What is proved is of the equation error in
-    squares, of equations at rest and of coefficients that are all free; of free runs no such certificate is known.
+    an RMS equation error of at least the best one found times ``1 - within``. What is proved is of the equation error
+    in squares, of equations at rest and of coefficients that are all free; of free runs no such certificate is known.
 
     Parameters
     ----------
@@ -172,9 +91,7 @@ def certify_orders(
     KeyboardInterrupt
         Ctrl-C, within half a second.
     """
-    share = real_number("within", within)
-    if not 0 < share < 1:
-        raise ModelError(f"within = {within!r} is outside (0, 1); 0.05 asks that nothing be better by more than 5 %")
+    share = _check_within(within)
     most = whole_number(cells)
     if most is None or not 1 <= most < 1 << 62:
         raise ModelError(f"cells = {cells!r} is no whole number from 1; the default is {CELLS}")
@@ -188,12 +105,33 @@ def certify_orders(
     return certify_job(job, within=share, apart=gap, largest=size, cells=most, progress=progress)
 
 
-def check_certified(settings: Settings) -> None:
-    """Refuse a certificate of what nothing is proved of."""
+def check_certifiable(job: Job, within: float) -> None:
+    """Refuse a certificate of what nothing is proved of, or of no share."""
+    _check_within(within)
     for name, value in PROVED.items():
-        given = getattr(settings, name)
+        given = getattr(job.settings, name)
         if given != value:
             raise ModelError(f"there is no certificate over all orders for {name} = {given!r}; {_WAY_OUT}")
+    if job.structure.has_order_law:
+        raise ModelError(
+            "there is no certificate over all orders of a stage under its law; take its equations one by one"
+        )
+    item = job.structure.equations[0]
+    if tuple(job.records[0].start) != (False, []):
+        raise ModelError("there is no certificate over all orders with initial terms; give the equation initial='rest'")
+    known = [t for t in item.terms if t.fixed is not None]
+    if known:
+        raise ModelError(
+            f"there is no certificate over all orders with known coefficients, and {len(known)} of the terms of "
+            f"{item.output} have one (the first is {known[0].fixed:g}); name them"
+        )
+
+
+def _check_within(within: float) -> float:
+    share = real_number("within", within)
+    if not 0 < share < 1:
+        raise ModelError(f"within = {within!r} is outside (0, 1); 0.05 asks that nothing be better by more than 5 %")
+    return share
 
 
 def certify_job(
@@ -206,18 +144,8 @@ def certify_job(
     progress: Callable[[int, int], None] | None = None,
 ) -> OrderCertificate:
     """Prove it of a search that is ready; see :func:`certify_orders`."""
-    check_certified(job.settings)
-    if job.structure.has_order_law:
-        raise ModelError("there is no certificate over all orders of a stage under its law; take its equations one by one")
+    check_certifiable(job, within)
     record, item = job.records[0], job.structure.equations[0]
-    if tuple(record.start) != (False, []):
-        raise ModelError("there is no certificate over all orders with initial terms; give the equation initial='rest'")
-    known = [t for t in item.terms if t.fixed is not None]
-    if known:
-        raise ModelError(
-            f"there is no certificate over all orders with known coefficients, and {len(known)} of {item.output}'s are "
-            f"(the first is {known[0].fixed:g}); name them"
-        )
     intervals = {name: (min(values), max(values)) for name, values in job.values.items()}
     region = _region(item, intervals, record.signals)
     try:
@@ -233,7 +161,15 @@ def certify_job(
     names = [item.order, *(t.order for t in item.terms)]
     orders = {o.names[0]: v for o, v in zip(names, values, strict=False) if o.names}
     return OrderCertificate(
-        found["at_least"], found["best"], orders, within, intervals, apart, largest, found["cells"], found["open"],
+        found["at_least"],
+        found["best"],
+        orders,
+        within,
+        intervals,
+        apart,
+        largest,
+        found["cells"],
+        found["open"],
         record.m,
     )
 

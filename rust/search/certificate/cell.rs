@@ -12,7 +12,8 @@
 use crate::dense::inner_products;
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
-use crate::search::certificate::curve::{series, unit, Curve, ALL, MADE};
+use crate::search::certificate::curve::{series, unit, Curve, ALL};
+use crate::search::certificate::span::Span;
 
 /// Most terms of an equation.
 pub(super) const MOST: usize = 6;
@@ -82,7 +83,7 @@ impl Local {
         for i in 0..k {
             c[i] = (0..k).map(|j| inverse[i][j] * self.target[0][j]).sum();
         }
-        let all = 1.0 + c[..k].iter().map(|c| c.abs()).sum::<f64>();
+        let all = 1.0 + (0..k).map(|i| c[i].abs() * self.sizes[0][i]).sum::<f64>();
         let along = |m: usize, j: usize| -> f64 {
             self.target[m][j] - (0..k).map(|i| c[i] * self.products[m][i][j]).sum::<f64>()
         };
@@ -192,24 +193,33 @@ fn dominating(a: &[Row; MOST], gamma: &Row, tau: &Row, k: usize) -> Option<Row> 
     (0..k).all(proved).then_some(b)
 }
 
-/// At least Σε² of the equation errors of any coefficients, at rest, of every equation whose terms are integrals of these
-/// signals of orders within half widths of middles: (signal, middle, half width) by term. 0 where nothing is proved.
+/// What is proved of a cell: at least so much is Σε² of the equation errors, at rest, of every equation whose terms are
+/// integrals of these signals of orders within half widths of middles, (signal, middle, half width) by term; 0 where
+/// nothing is.
+///
+/// The first holds for any coefficients; the second, which a goal is tried for, for those whose terms have together at
+/// most `largest` times the size of the output.
 ///
 /// # Errors
 /// No records or terms, too many of these, a signal that is not there or is zero, middles below their half widths.
 ///
 /// ```
-/// # use ftlm::search::certificate::cell_bound;
+/// # use ftlm::search::certificate::cell_bounds;
 /// # use ftlm::regressors::Record;
 /// # let input: Vec<f64> = (0..64).map(|k| if k % 16 < 8 { 1.0 } else { -1.0 }).collect();
 /// # let output = Record::new(0.1, vec![input.clone()], None)?.integral(0, 0.8);
 /// let record = Record::new(0.1, vec![output, input], None)?;
 /// // y is the integral of order 0.8 of u: that order leaves nothing, orders near 0.5 leave something.
-/// let proved = |middle: f64| cell_bound(&[record.clone()], 0, &[(1, middle, 0.01)]);
-/// assert!(proved(0.8)? == 0.0 && proved(0.5)? > 0.0);
+/// let proved = |middle: f64| cell_bounds(&[record.clone()], 0, &[(1, middle, 0.01)], (10.0, 1.0));
+/// assert!(proved(0.8)? == (0.0, 0.0) && proved(0.5)?.0 > 0.0 && proved(0.5)?.1 > 0.0);
 /// # Ok::<(), ftlm::error::Error>(())
 /// ```
-pub fn cell_bound(records: &[Record], output: usize, terms: &[(usize, f64, f64)]) -> Result<f64> {
+pub fn cell_bounds(
+    records: &[Record],
+    output: usize,
+    terms: &[(usize, f64, f64)],
+    (largest, goal): (f64, f64),
+) -> Result<(f64, f64)> {
     check(records, output, terms.iter().map(|t| t.0))?;
     for &(_, middle, half) in terms {
         if !(half >= 0.0 && half <= middle && middle < 20.0) {
@@ -221,26 +231,35 @@ pub fn cell_bound(records: &[Record], output: usize, terms: &[(usize, f64, f64)]
             });
         }
     }
+    let (local, span, square) = about(records, output, terms)?;
+    Ok((local.bound().least * square, span.bound(largest, goal / square) * square))
+}
+
+/// What a cell with these middles and half widths is bounded from, and the squares of the output.
+pub(super) fn about(records: &[Record], output: usize, terms: &[(usize, f64, f64)]) -> Result<(Local, Span, f64)> {
     let target: Vec<f64> = records.iter().flat_map(|r| r.signal(output)).copied().collect();
-    let size = target.iter().map(|v| v * v).sum::<f64>();
+    let square = target.iter().map(|v| v * v).sum::<f64>();
     let curves =
         terms.iter().map(|&(s, middle, half)| Curve::new(records, s, middle, half)).collect::<Result<Vec<_>>>()?;
-    let first: Vec<&[f64]> = curves.iter().map(|c| &c.columns[0][..]).collect();
     let all: Vec<&[f64]> = curves.iter().flat_map(|c| c.columns.iter().map(Vec::as_slice)).collect();
-    let (products, along) = (inner_products(&first, &all), inner_products(&[&target], &all));
-    let mut local = Local::new(terms.len(), target.len());
-    for (j, curve) in curves.iter().enumerate() {
-        for m in 0..=MADE {
+    let (products, along) = (inner_products(&all, &all), inner_products(&[&target], &all));
+    let product = |(i, n): (usize, usize), (j, m): (usize, usize)| products[(i * ALL + n) * all.len() + j * ALL + m];
+    let target_product = |(j, m): (usize, usize)| along[j * ALL + m] / square.sqrt();
+    let (mut local, mut span) = (Local::new(terms.len(), target.len()), Span::new(target.len()));
+    for (j, (curve, &(_, _, half))) in curves.iter().zip(terms).enumerate() {
+        for m in 0..ALL {
             for i in 0..terms.len() {
-                local.products[m][i][j] = products[i * all.len() + j * ALL + m];
+                local.products[m][i][j] = product((i, 0), (j, m));
             }
-            local.target[m][j] = along[j * ALL + m] / size.sqrt();
+            local.target[m][j] = target_product((j, m));
             local.sizes[m][j] = curve.sizes[m];
         }
         local.rests[j] = curve.rest;
-        local.halves[j] = terms[j].2;
+        local.halves[j] = half;
+        span.add(half, curve.sizes, curve.rest);
     }
-    Ok(local.bound().least * size)
+    span.fill(product, target_product);
+    Ok((local, span, square))
 }
 
 /// Refuses records and signals of which nothing can be made.

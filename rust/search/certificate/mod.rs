@@ -11,6 +11,6 @@ mod span;
 mod sweep;
 mod tables;
 
-pub use cell::cell_bound;
+pub use cell::cell_bounds;
 pub use region::{Range, Region};
 pub use sweep::{certify, Asked, Certificate};

@@ -10,8 +10,10 @@ use crate::search::certificate::curve::{unit, ALL};
 /// The value and the derivatives that are taken into the space.
 const SPANNED: usize = 3;
 const ROWS: usize = SPANNED * MOST;
-/// What is added to squares of coefficients, so that columns that depend on one another do no harm.
-const RIDGE: f64 = 1e-12;
+/// What is added to squares of coefficients, which may not be as large as they like: as a share of what is to be proved,
+/// all of them taken together, and so much at least that columns that depend on one another do no harm.
+const SHARE: f64 = 0.05;
+const RIDGE: f64 = 1e-11;
 /// A hair more, for the rounding of what is put together here.
 const HAIR: f64 = 1e-9;
 
@@ -75,31 +77,31 @@ impl Span {
     }
 
     /// No orders of the cell, with coefficients whose terms have together at most `largest` times the size of the output,
-    /// leave a smaller share of its square; 0 where nothing is proved.
-    pub(super) fn bound(&self, largest: f64) -> f64 {
-        let n = self.count;
-        if self.least.is_nan() || self.least <= 0.5 {
+    /// leave a smaller share of its square; 0 where nothing is proved. To prove this goal is what is tried.
+    pub(super) fn bound(&self, largest: f64, goal: f64) -> f64 {
+        if self.least.is_nan() || self.least <= 0.5 || goal.is_nan() {
             return 0.0;
         }
-        let all = largest / self.least;
-        let coefficients = self.minimum();
-        // The least of the form with the ridge is at least its value anywhere less |gradient|²/(4·ridge).
+        let (n, all) = (self.count, largest / self.least);
+        let powers = f64::from(u8::try_from(SPANNED).unwrap_or(u8::MAX));
+        let added = (SHARE * goal / (powers * all * all)).clamp(RIDGE, 1.0);
+        let coefficients = self.minimum(added);
+        // The least of the form with the ridge is at least its value anywhere less |gradient|²/(4·ridge); so the form of the
+        // columns themselves is asked, which has no negative squares, not the rounded one.
         let (mut value, mut gradient, mut sum) = (1.0, 0.0, 1.0);
         for i in 0..n {
-            let row: f64 = (0..n).map(|j| self.matrix[i][j] * coefficients[j]).sum::<f64>() + RIDGE * coefficients[i];
+            let row: f64 = (0..n).map(|j| self.matrix[i][j] * coefficients[j]).sum::<f64>() + added * coefficients[i];
             value += coefficients[i] * (row - 2.0 * self.target[i]);
             let off = 2.0 * (row - self.target[i]);
             gradient += off * off;
             sum += coefficients[i].abs();
         }
         #[allow(clippy::cast_precision_loss)]
-        let rounded = 16.0 * f64::EPSILON * n as f64;
-        let slope = gradient.sqrt() + 2.0 * rounded * sum * (n as f64).sqrt();
-        let ridge = value - rounded * sum * sum - slope * slope / (4.0 * RIDGE);
-        // Coefficients of the values add up to `all` at most, those of derivatives too.
-        let powers = f64::from(u8::try_from(SPANNED).unwrap_or(u8::MAX));
-        let most = 1.0 + powers * all;
-        let square = ridge - RIDGE * powers * all * all - self.rounding * most * most;
+        let (count, rounded) = (n as f64, self.rounding + 16.0 * f64::EPSILON * n as f64);
+        let slope = gradient.sqrt() + 2.0 * rounded * sum * count.sqrt();
+        let ridge = value - rounded * sum * sum - slope * slope / (4.0 * added);
+        // Coefficients of the values add up to `all` at most, those of each derivative too.
+        let square = ridge - added * powers * all * all;
         let root = square.max(0.0).sqrt() - all * self.beyond;
         let least = root * root * (1.0 - HAIR);
         if root > 0.0 && least.is_finite() {
@@ -110,14 +112,14 @@ impl Span {
     }
 
     /// Coefficients where the form with the ridge is about least.
-    fn minimum(&self) -> [f64; ROWS] {
+    fn minimum(&self, added: f64) -> [f64; ROWS] {
         let n = self.count;
         let mut factor = self.matrix;
         let mut x = self.target;
-        factor.iter_mut().enumerate().for_each(|(i, row)| row[i] += RIDGE);
+        factor.iter_mut().enumerate().for_each(|(i, row)| row[i] += added);
         for i in 0..n {
             let row = factor[i];
-            let pivot = row[i].max(RIDGE);
+            let pivot = row[i].max(added);
             for l in i + 1..n {
                 let share = row[l] / pivot;
                 for (a, b) in factor[l][l..n].iter_mut().zip(&row[l..n]) {
@@ -128,7 +130,7 @@ impl Span {
         }
         for i in (0..n).rev() {
             let sum: f64 = (i + 1..n).map(|j| factor[i][j] * x[j]).sum();
-            x[i] = (x[i] - sum) / factor[i][i].max(RIDGE);
+            x[i] = (x[i] - sum) / factor[i][i].max(added);
         }
         x
     }

@@ -4,9 +4,9 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::regressors::Record;
-use crate::search::certificate::cell::{check, Bounded, MOST};
+use crate::search::certificate::cell::{about, check, Bounded, MOST};
 use crate::search::certificate::region::Region;
-use crate::search::certificate::tables::{Cell, Tables};
+use crate::search::certificate::tables::{Cell, Tables, DEEPEST};
 use crate::search::control::Control;
 use crate::search::threads::pool;
 
@@ -124,6 +124,11 @@ impl Sweep<'_> {
         let (mut proved, mut bounded, mut open) = (f64::INFINITY, 0_u64, 0_u64);
         let target = |best: f64| (1.0 - self.asked.within).powi(2) * best;
         let most = self.asked.cells.min(self.asked.memory.saturating_sub(self.tables.bytes) / HELD);
+        // What is known beforehand saves halving.
+        for cells in cells.chunks(AT_ONCE) {
+            let found = self.bounds(cells, 0.0)?;
+            self.better(cells, &found, &mut best, &mut place);
+        }
         while !cells.is_empty() {
             if bounded + cells.len() as u64 > most {
                 open += cells.len() as u64;
@@ -132,23 +137,9 @@ impl Sweep<'_> {
             }
             let mut next = Vec::new();
             for cells in cells.chunks(AT_ONCE) {
-                let goal = target(best);
-                let bounds = |chunk: &'_ [Cell]| -> Vec<Bounded> {
-                    let all = chunk.iter().take(if self.control.stopped() { 0 } else { CHUNK });
-                    all.map(|cell| self.bound(cell, goal)).collect()
-                };
-                let found: Vec<Bounded> = cells.par_chunks(CHUNK).flat_map_iter(bounds).collect();
-                self.control.check_stop()?;
+                let found = self.bounds(cells, target(best))?;
                 self.control.count(cells.len() as u64, 0);
-                for (cell, found) in cells.iter().zip(&found) {
-                    if found.middle >= best {
-                        continue;
-                    }
-                    let middles: Vec<f64> = self.all_within(cell).iter().map(|(a, b)| (a + b) / 2.0).collect();
-                    if self.region.orders(&middles).is_some() {
-                        (best, place) = (found.middle, middles);
-                    }
-                }
+                self.better(cells, &found, &mut best, &mut place);
                 let goal = target(best);
                 for (cell, found) in cells.iter().zip(&found) {
                     let least = found.least.max(cell.least);
@@ -165,6 +156,11 @@ impl Sweep<'_> {
             bounded += cells.len() as u64;
             cells = next;
         }
+        if !place.is_empty() {
+            // Deep in a table columns are nearly what they are: here they are.
+            let terms = self.region.terms.iter().zip(&place).map(|(term, eta)| (term.signal, *eta, 0.0));
+            best = about(records, self.region.output, &terms.collect::<Vec<_>>())?.0.bound().middle;
+        }
         #[allow(clippy::cast_precision_loss)]
         let mean = {
             let squares: f64 = records.iter().flat_map(|r| r.signal(self.region.output)).map(|y| y * y).sum();
@@ -176,11 +172,34 @@ impl Sweep<'_> {
         Ok(Certificate { at_least, best: root(best), order, orders, cells: bounded, open })
     }
 
+    /// What is known of some cells.
+    fn bounds(&self, cells: &[Cell], goal: f64) -> Result<Vec<Bounded>> {
+        let bounds = |chunk: &'_ [Cell]| -> Vec<Bounded> {
+            let all = chunk.iter().take(if self.control.stopped() { 0 } else { CHUNK });
+            all.map(|cell| self.bound(cell, goal)).collect()
+        };
+        let found = cells.par_chunks(CHUNK).flat_map_iter(bounds).collect();
+        self.control.check_stop()?;
+        Ok(found)
+    }
+
+    /// Takes the best middle of some cells.
+    fn better(&self, cells: &[Cell], found: &[Bounded], best: &mut f64, place: &mut Vec<f64>) {
+        for (cell, found) in cells.iter().zip(found) {
+            if found.middle < *best {
+                let middles: Vec<f64> = self.all_within(cell).iter().map(|(a, b)| (a + b) / 2.0).collect();
+                if self.region.orders(&middles).is_some() {
+                    (*best, *place) = (found.middle, middles);
+                }
+            }
+        }
+    }
+
     /// What is known of a cell: by its space too where that may help.
     fn bound(&self, cell: &Cell, goal: f64) -> Bounded {
         let mut found = self.tables.local(cell).bound();
         if found.least.max(cell.least) < goal {
-            found.least = found.least.max(self.tables.span(cell).bound(self.asked.largest));
+            found.least = found.least.max(self.tables.span(cell).bound(self.asked.largest, goal));
         }
         found
     }
@@ -215,7 +234,7 @@ impl Sweep<'_> {
             for cell in &cells {
                 for at in first..first + count {
                     let mut cell = *cell;
-                    cell.at[term] = u16::try_from(at).unwrap_or(u16::MAX);
+                    cell.at[term] = u32::try_from(at).unwrap_or(u32::MAX);
                     let within: Vec<(f64, f64)> =
                         (0..=term).map(|t| self.tables.within(self.region, &cell, t)).collect();
                     if self.region.alphas(&within).is_some() {
@@ -230,8 +249,7 @@ impl Sweep<'_> {
 
     /// Both halves along the order that costs most, as far as they hold orders; none where all are too short.
     fn halved(&self, cell: &Cell, least: f64, costs: &[f64; MOST]) -> Option<[Option<Cell>; 2]> {
-        let may = (0..self.region.terms.len())
-            .filter(|&term| !self.tables.known(term) && cell.level[term] < self.tables.deepest);
+        let may = (0..self.region.terms.len()).filter(|&term| !self.tables.known(term) && cell.level[term] < DEEPEST);
         let term = may.max_by(|&a, &b| costs[a].total_cmp(&costs[b]).then(b.cmp(&a)))?;
         Some([0, 1].map(|half| {
             let mut part = Cell { least, ..*cell };

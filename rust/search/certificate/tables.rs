@@ -7,17 +7,19 @@ use crate::dense::inner_products;
 use crate::error::{Error, Result};
 use crate::regressors::Record;
 use crate::search::certificate::cell::{Local, MOST};
-use crate::search::certificate::curve::{Curve, ALL, MADE};
+use crate::search::certificate::curve::{Curve, ALL};
 use crate::search::certificate::region::Region;
 use crate::search::certificate::span::Span;
 use crate::search::control::Control;
 
 /// Width of the largest cells: above it a bound proves hardly ever anything.
 const WIDEST: f64 = 0.1;
-/// How often an order's interval may be halved at most.
-const DEEPEST: u8 = 4;
-/// Derivatives whose products are made: those of values with all, and of the first two.
-const PAIRS: [(usize, usize); 7] = [(0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (2, 2)];
+/// How often an order's interval is halved in tables, and at all: what lies deeper is told by the series of the tables.
+const TABLED: u8 = 3;
+pub(super) const DEEPEST: u8 = 10;
+/// Derivatives whose products are made, by [`pair`].
+const PAIRS: [(usize, usize); ALL * (ALL + 1) / 2] =
+    [(0, 0), (0, 1), (1, 1), (0, 2), (1, 2), (2, 2), (0, 3), (1, 3), (2, 3), (3, 3)];
 /// Columns whose products with all others are made at a time.
 const BATCH: usize = 64;
 
@@ -25,7 +27,7 @@ const BATCH: usize = 64;
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Cell {
     pub(super) level: [u8; MOST],
-    pub(super) at: [u16; MOST],
+    pub(super) at: [u32; MOST],
     /// What is proved of the cell that it is a part of.
     pub(super) least: f64,
 }
@@ -37,8 +39,8 @@ type Stretches = Vec<(usize, usize)>;
 pub(super) struct Tables {
     /// Of each term: none where its order of integration is known, and the node that it has then.
     terms: Vec<(Option<Stretches>, usize)>,
-    /// Halvings of an interval.
-    pub(super) deepest: u8,
+    /// Halvings in tables.
+    tabled: u8,
     /// Bytes of them.
     pub(super) bytes: u64,
     nodes: usize,
@@ -48,6 +50,20 @@ pub(super) struct Tables {
     target: [Vec<f64>; ALL],
     sizes: Vec<[f64; ALL]>,
     rests: Vec<f64>,
+}
+
+/// Place in [`PAIRS`] of n and m, n ≤ m.
+fn pair(n: usize, m: usize) -> usize {
+    m * (m + 1) / 2 + n
+}
+
+/// A term at the middle of a cell: node, distance from its middle, half the cell's width.
+#[derive(Debug, Clone, Copy, Default)]
+struct Middle {
+    node: usize,
+    /// Powers of the distance over factorials.
+    off: [f64; ALL],
+    half: f64,
 }
 
 /// Width of a stretch.
@@ -117,11 +133,11 @@ impl Tables {
         let target: Vec<f64> = records.iter().flat_map(|r| r.signal(region.output)).copied().collect();
         let samples = target.len();
         let fits = |deepest: u8| bytes(lay(region, deepest).nodes.len(), samples) <= memory;
-        let Some(deepest) = (2..=DEEPEST).rev().find(|d| fits(*d)) else {
+        let Some(tabled) = (2..=TABLED).rev().find(|d| fits(*d)) else {
             let (bytes, limit) = (bytes(lay(region, 2).nodes.len(), samples).into(), memory.into());
             return Err(Error::Memory { what: "the columns of a certificate and their products".into(), bytes, limit });
         };
-        let Laid { nodes, terms } = lay(region, deepest);
+        let Laid { nodes, terms } = lay(region, tabled);
         let curves: Vec<Result<Curve>> = abreast::map(
             nodes.clone(),
             || (),
@@ -133,7 +149,7 @@ impl Tables {
         let curves = curves.into_iter().collect::<Result<Vec<Curve>>>()?;
         let size = target.iter().map(|v| v * v).sum::<f64>().sqrt();
         let count = nodes.len();
-        let all: [Vec<&[f64]>; MADE] = std::array::from_fn(|n| curves.iter().map(|c| &c.columns[n][..]).collect());
+        let all: [Vec<&[f64]>; ALL] = std::array::from_fn(|n| curves.iter().map(|c| &c.columns[n][..]).collect());
         let batches: Vec<(usize, &[Curve])> =
             (0..PAIRS.len()).flat_map(|pair| curves.chunks(BATCH).map(move |batch| (pair, batch))).collect();
         let made = abreast::map(
@@ -157,7 +173,7 @@ impl Tables {
         }
         Ok(Self {
             terms,
-            deepest,
+            tabled,
             bytes: bytes(count, samples),
             nodes: count,
             samples,
@@ -192,55 +208,87 @@ impl Tables {
         }
     }
 
-    /// Nodes of a cell's middle and its half widths.
-    fn middle(&self, cell: &Cell) -> ([usize; MOST], [f64; MOST]) {
-        let (mut nodes, mut halves) = ([0; MOST], [0.0; MOST]);
-        for (term, (stretches, node)) in self.terms.iter().enumerate() {
-            nodes[term] = *node;
-            if let Some(stretches) = stretches {
-                let (first, node) = stretches[usize::from(cell.level[term])];
-                nodes[term] = node + usize::from(cell.at[term]) - first;
-                halves[term] = width(cell.level[term]) / 2.0;
+    /// Where the middle of a cell is.
+    fn middle(&self, cell: &Cell) -> [Middle; MOST] {
+        let mut out = [Middle::default(); MOST];
+        for (term, ((stretches, known), out)) in self.terms.iter().zip(&mut out).enumerate() {
+            (out.node, out.off[0]) = (*known, 1.0);
+            let Some(stretches) = stretches else { continue };
+            let (level, at) = (cell.level[term], cell.at[term]);
+            let above = level.min(self.tabled);
+            let whole = at >> (level - above);
+            let (first, node) = stretches[usize::from(above)];
+            out.node = node + whole as usize - first;
+            out.half = width(level) / 2.0;
+            let distance = f64::from(2 * at + 1) * out.half - f64::from(2 * whole + 1) * width(above) / 2.0;
+            for m in 1..ALL {
+                #[allow(clippy::cast_precision_loss)]
+                let next = out.off[m - 1] * distance / m as f64;
+                out.off[m] = next;
             }
         }
-        (nodes, halves)
+        out
+    }
+
+    /// Product of the nth derivative of one column with the mth of another, at nodes.
+    fn raw(&self, (i, n): (usize, usize), (j, m): (usize, usize)) -> f64 {
+        if n <= m {
+            self.products[pair(n, m)][j * self.nodes + i]
+        } else {
+            self.products[pair(m, n)][i * self.nodes + j]
+        }
+    }
+
+    /// The same at middles, where columns are cubic about nodes.
+    fn product(&self, a: &Middle, n: usize, b: &Middle, m: usize) -> f64 {
+        let mut sum = 0.0;
+        for p in n..ALL {
+            for q in m..ALL {
+                let weight = a.off[p - n] * b.off[q - m];
+                if weight != 0.0 {
+                    sum += weight * self.raw((a.node, p), (b.node, q));
+                }
+            }
+        }
+        sum
+    }
+
+    /// Product of the mth derivative with the target, and the most that its size may be.
+    fn alone(&self, a: &Middle, m: usize) -> (f64, f64) {
+        let all = (m..ALL).map(|q| (a.off[q - m], q));
+        all.fold((0.0, 0.0), |(sum, size), (weight, q)| {
+            (sum + weight * self.target[q][a.node], size + weight.abs() * self.sizes[a.node][q])
+        })
     }
 
     /// What a cell is bounded from.
     pub(super) fn local(&self, cell: &Cell) -> Local {
         let k = self.terms.len();
-        let (nodes, halves) = self.middle(cell);
+        let middles = self.middle(cell);
         let mut local = Local::new(k, self.samples);
-        local.halves = halves;
-        for (j, &node) in nodes.iter().enumerate().take(k) {
+        for (j, b) in middles.iter().enumerate().take(k) {
             for m in 0..ALL {
-                // The first pairs are those of values.
-                let row = &self.products[m][node * self.nodes..(node + 1) * self.nodes];
-                for i in 0..k {
-                    local.products[m][i][j] = row[nodes[i]];
+                for (i, a) in middles.iter().enumerate().take(k) {
+                    local.products[m][i][j] = self.product(a, 0, b, m);
                 }
-                local.target[m][j] = self.target[m][node];
-                local.sizes[m][j] = self.sizes[node][m];
+                (local.target[m][j], local.sizes[m][j]) = self.alone(b, m);
             }
-            local.rests[j] = self.rests[node];
+            local.rests[j] = self.rests[b.node];
+            local.halves[j] = b.half;
         }
         local
     }
 
     /// The space that its columns and their first derivatives span.
     pub(super) fn span(&self, cell: &Cell) -> Span {
-        let k = self.terms.len();
-        let (nodes, halves) = self.middle(cell);
+        let middles = self.middle(cell);
         let mut span = Span::new(self.samples);
-        for (&node, &half) in nodes.iter().zip(&halves).take(k) {
-            span.add(half, self.sizes[node], self.rests[node]);
+        for middle in middles.iter().take(self.terms.len()) {
+            let sizes = std::array::from_fn(|m| self.alone(middle, m).1);
+            span.add(middle.half, sizes, self.rests[middle.node]);
         }
-        let product = |(i, n): (usize, usize), (j, m): (usize, usize)| {
-            let ((i, n), (j, m)) = if n <= m { ((i, n), (j, m)) } else { ((j, m), (i, n)) };
-            let pair = PAIRS.iter().position(|pair| *pair == (n, m)).unwrap_or(0);
-            self.products[pair][nodes[j] * self.nodes + nodes[i]]
-        };
-        span.fill(product, |(j, m)| self.target[m][nodes[j]]);
+        let product = |(i, n): (usize, usize), (j, m): (usize, usize)| self.product(&middles[i], n, &middles[j], m);
+        span.fill(product, |(j, m)| self.alone(&middles[j], m).0);
         span
     }
 }
