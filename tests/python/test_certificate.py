@@ -125,8 +125,9 @@ def csv(run, tmp_path_factory):
 
 def test_the_command_line_prints_it_behind_the_table(csv, proved):
     words = [
-        "search", str(csv), "--structure", WORDS, "-u", "u", "-y", "y", "--initial", "rest", "--m", "128", "--step", "0.1",
-        "--lattice", "alpha=1.3:1.8:0.1", "--lattice", "beta=0.5:0.9:0.1", "--coefficients", "least-squares",
+        "search", str(csv), "--structure", WORDS, "-u", "u", "-y", "y", "--initial", "rest", "--m", "128",
+        "--step", "0.1", "--lattice", "alpha=1.3:1.8:0.1", "--lattice", "beta=0.5:0.9:0.1", "--coefficients",
+        "least-squares",
     ]  # fmt: skip
     ranked = ["--criterion", "equation-error", "--norm", "l2"]
     told = CliRunner().invoke(app, [*words, *ranked, "--certify", "0.05"])
