@@ -168,7 +168,8 @@ def search(
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 results[name] = run_job(replace(job, progress=progress), store=kept, number=number)
             if certify is not None:
-                proved = certify_job(job, within=certify, apart=lattice.step)
+                with Progress(f"proving what lies between of {name}", quiet=as_json) as progress:
+                    proved = certify_job(job, within=certify, apart=lattice.step, progress=progress.so_far)
                 results[name] = replace(results[name], certificate=proved)
     show_searches(results, as_json=as_json)
 

@@ -74,7 +74,7 @@ def certify_orders(
     threads
         Threads; default all cores.
     progress
-        Called about twenty times a second with (boxes done, 0).
+        Called about twenty times a second with (boxes done, boxes known of so far): halves are added as they come.
 
     Returns
     -------
@@ -130,7 +130,9 @@ def check_certifiable(job: Job, within: float) -> None:
 def _check_within(within: float) -> float:
     share = real_number("within", within)
     if not 0 < share < 1:
-        raise ModelError(f"within = {within!r} is outside (0, 1); 0.05 asks that nothing be better by more than 5 %")
+        raise ModelError(
+            f"within={within!r} (--certify) is outside (0, 1); 0.05 asks that nothing be better by more than 5 %"
+        )
     return share
 
 

@@ -269,5 +269,6 @@ def search_html(found: SearchResult) -> str:
         if reason == "bound" and found.boxed:
             rows.append(["of these in boxes excluded whole", found.boxed])
     name = found.model.outputs[0] if len(found.model.outputs) == 1 else "stage"
-    rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows)
+    note = "" if found.certificate is None else str(found.certificate)
+    rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows, note=note)
     return str(search_top(name, found).to_html() + rest.to_html())

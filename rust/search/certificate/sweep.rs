@@ -1,12 +1,14 @@
 //! Cells are halved until each is known to hold nothing much better than the best.
 
+use std::sync::atomic::Ordering;
+
 use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::regressors::Record;
 use crate::search::certificate::cell::{about, check, Bounded, MOST};
 use crate::search::certificate::region::Region;
-use crate::search::certificate::tables::{Cell, Tables, DEEPEST};
+use crate::search::certificate::tables::{width, Cell, Tables, DEEPEST};
 use crate::search::control::Control;
 use crate::search::threads::pool;
 
@@ -15,6 +17,9 @@ const CHUNK: usize = 256;
 const AT_ONCE: usize = 1 << 16;
 /// Bytes that cells take of which some are halved.
 const HELD: u64 = 4 * size_of::<Cell>() as u64;
+
+/// Most orders that are tried on the way down from the best.
+const POLISHED: usize = 400;
 
 /// How much is asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -129,12 +134,15 @@ impl Sweep<'_> {
             let found = self.bounds(cells, 0.0)?;
             self.better(cells, &found, &mut best, &mut place);
         }
+        self.polish(records, &mut best, &mut place)?;
         while !cells.is_empty() {
             if bounded + cells.len() as u64 > most {
                 open += cells.len() as u64;
                 proved = cells.iter().fold(proved, |least, cell| least.min(cell.least));
                 break;
             }
+            // What is known of; halves will come.
+            self.control.total.store(bounded + cells.len() as u64, Ordering::Relaxed);
             let mut next = Vec::new();
             for cells in cells.chunks(AT_ONCE) {
                 let found = self.bounds(cells, target(best))?;
@@ -156,11 +164,7 @@ impl Sweep<'_> {
             bounded += cells.len() as u64;
             cells = next;
         }
-        if !place.is_empty() {
-            // Deep in a table columns are nearly what they are: here they are.
-            let terms = self.region.terms.iter().zip(&place).map(|(term, eta)| (term.signal, *eta, 0.0));
-            best = about(records, self.region.output, &terms.collect::<Vec<_>>())?.0.bound().middle;
-        }
+        self.polish(records, &mut best, &mut place)?;
         #[allow(clippy::cast_precision_loss)]
         let mean = {
             let squares: f64 = records.iter().flat_map(|r| r.signal(self.region.output)).map(|y| y * y).sum();
@@ -202,6 +206,51 @@ impl Sweep<'_> {
             found.least = found.least.max(self.tables.span(cell).bound(self.asked.largest, goal));
         }
         found
+    }
+
+    /// What orders of integration leave themselves, not read off a table.
+    fn left(&self, records: &[Record], etas: &[f64]) -> Result<f64> {
+        let terms = self.region.terms.iter().zip(etas).map(|(term, eta)| (term.signal, *eta, 0.0));
+        Ok(about(records, self.region.output, &terms.collect::<Vec<_>>())?.0.bound().middle)
+    }
+
+    /// Goes down from the best orders, one or two of them at a time: to edges of the region too, where no middle is.
+    fn polish(&self, records: &[Record], best: &mut f64, place: &mut Vec<f64>) -> Result<()> {
+        if place.is_empty() {
+            return Ok(());
+        }
+        *best = self.left(records, place)?;
+        let vary: Vec<usize> = (0..place.len()).filter(|&term| !self.tables.known(term)).collect();
+        let ways = [-1.0, 0.0, 1.0];
+        let pairs = vary.iter().enumerate().flat_map(|(n, &i)| vary[n..].iter().map(move |&j| (i, j)));
+        let moves: Vec<(usize, f64, usize, f64)> = pairs
+            .flat_map(|(i, j)| ways.into_iter().flat_map(move |a| ways.into_iter().map(move |b| (i, a, j, b))))
+            .filter(|&(i, a, j, b)| if i == j { a == b && a != 0.0 } else { a != 0.0 && b != 0.0 })
+            .collect();
+        let (mut step, mut tried) = (width(1), 0);
+        while step > width(DEEPEST) && tried < POLISHED {
+            let before = *best;
+            for &(i, a, j, b) in &moves {
+                self.control.check_stop()?;
+                let mut there = place.clone();
+                for (term, way) in [(i, a), (j, b)] {
+                    let (low, high) = self.region.integrations(term);
+                    there[term] = (place[term] + way * step).clamp(low, high);
+                }
+                if there == *place || self.region.orders(&there).is_none() {
+                    continue;
+                }
+                tried += 1;
+                let left = self.left(records, &there)?;
+                if left < *best {
+                    (*best, *place) = (left, there);
+                }
+            }
+            if *best >= before {
+                step /= 2.0;
+            }
+        }
+        Ok(())
     }
 
     fn all_within(&self, cell: &Cell) -> Vec<(f64, f64)> {
