@@ -22,8 +22,8 @@ from ftlm.solve.records import named_signals
 #: How much better than the best found other orders may be, and boxes of orders after which a proof ends.
 WITHIN = 0.05
 CELLS = 20_000_000
-#: How large an equation's terms may be beside the output: larger ones cancel but for a thousandth.
-LARGEST = 1000.0
+#: How large an equation's terms may be beside the output: larger ones cancel but for a hundredth.
+LARGEST = 100.0
 #: What a certificate is of, as settings of an order search.
 PROVED: dict[str, Any] = {"criterion": "equation-error", "norm": "l2", "coefficients": "least-squares"}
 _WAY_OUT = (

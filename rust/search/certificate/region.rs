@@ -103,4 +103,23 @@ impl Region {
         let alpha = ((low + high) / 2.0).clamp(self.alpha.0, self.alpha.1);
         Some((alpha, etas.iter().map(|eta| alpha - eta).collect()))
     }
+
+    /// Orders of integration near these that are of the region, where a cell holds some.
+    pub(super) fn near(&self, within: &[(f64, f64)]) -> Option<Vec<f64>> {
+        let (low, high) = self.alphas(within)?;
+        let alpha = ((low + high) / 2.0).clamp(self.alpha.0, self.alpha.1);
+        let etas: Vec<f64> = within.iter().map(|(a, b)| (a + b) / 2.0).collect();
+        self.of_orders(alpha, &etas.iter().map(|eta| alpha - eta).collect::<Vec<_>>())
+    }
+
+    /// Orders of integration of an equation's order and those of its terms, each moved into its interval.
+    pub(super) fn of_orders(&self, alpha: f64, orders: &[f64]) -> Option<Vec<f64>> {
+        let alpha = alpha.clamp(self.alpha.0, self.alpha.1);
+        let inside = |(term, order): (usize, &f64)| {
+            let (least, range) = (self.integrations(term).0, self.terms[term]);
+            (alpha - order.clamp(range.lowest, range.highest)).max(least)
+        };
+        let etas: Vec<f64> = orders.iter().enumerate().map(inside).collect();
+        self.orders(&etas).map(|_| etas)
+    }
 }

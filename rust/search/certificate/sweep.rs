@@ -20,6 +20,8 @@ const HELD: u64 = 4 * size_of::<Cell>() as u64;
 
 /// Most orders that are tried on the way down from the best.
 const POLISHED: usize = 400;
+/// Middles near which orders are looked for at a time.
+const LIKELY: usize = 4;
 
 /// How much is asked for.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -99,7 +101,7 @@ pub fn certify(records: &[Record], region: &Region, asked: &Asked, control: &Con
             name: "largest".into(),
             value: asked.largest,
             range: "[1, 1e9]".into(),
-            remedy: "1000 leaves out terms that cancel but for a thousandth".into(),
+            remedy: "100 leaves out terms that cancel but for a hundredth".into(),
         });
     }
     let pool = pool(asked.threads)?;
@@ -132,7 +134,7 @@ impl Sweep<'_> {
         // What is known beforehand saves halving.
         for cells in cells.chunks(AT_ONCE) {
             let found = self.bounds(cells, 0.0)?;
-            self.better(cells, &found, &mut best, &mut place);
+            self.better(records, (cells, &found), &mut best, &mut place)?;
         }
         self.polish(records, &mut best, &mut place)?;
         while !cells.is_empty() {
@@ -147,7 +149,7 @@ impl Sweep<'_> {
             for cells in cells.chunks(AT_ONCE) {
                 let found = self.bounds(cells, target(best))?;
                 self.control.count(cells.len() as u64, 0);
-                self.better(cells, &found, &mut best, &mut place);
+                self.better(records, (cells, &found), &mut best, &mut place)?;
                 let goal = target(best);
                 for (cell, found) in cells.iter().zip(&found) {
                     let least = found.least.max(cell.least);
@@ -187,16 +189,24 @@ impl Sweep<'_> {
         Ok(found)
     }
 
-    /// Takes the best middle of some cells.
-    fn better(&self, cells: &[Cell], found: &[Bounded], best: &mut f64, place: &mut Vec<f64>) {
-        for (cell, found) in cells.iter().zip(found) {
-            if found.middle < *best {
-                let middles: Vec<f64> = self.all_within(cell).iter().map(|(a, b)| (a + b) / 2.0).collect();
-                if self.region.orders(&middles).is_some() {
-                    (*best, *place) = (found.middle, middles);
-                }
+    /// Takes the best orders of the region near the best middles of some cells.
+    fn better(
+        &self,
+        records: &[Record],
+        (cells, found): (&[Cell], &[Bounded]),
+        best: &mut f64,
+        place: &mut Vec<f64>,
+    ) -> Result<()> {
+        let mut likely: Vec<usize> = (0..cells.len()).filter(|&n| found[n].middle < *best).collect();
+        likely.sort_by(|&a, &b| found[a].middle.total_cmp(&found[b].middle).then(a.cmp(&b)));
+        for n in likely.into_iter().take(LIKELY) {
+            let Some(there) = self.region.near(&self.all_within(&cells[n])) else { continue };
+            let left = self.left(records, &there)?;
+            if left < *best {
+                (*best, *place) = (left, there);
             }
         }
+        Ok(())
     }
 
     /// What is known of a cell: by its space too where that may help.
@@ -219,27 +229,29 @@ impl Sweep<'_> {
         if place.is_empty() {
             return Ok(());
         }
-        *best = self.left(records, place)?;
-        let vary: Vec<usize> = (0..place.len()).filter(|&term| !self.tables.known(term)).collect();
+        // The equation's own order comes last.
+        let k = place.len();
+        let vary: Vec<usize> = (0..k)
+            .filter(|&term| self.region.terms[term].lowest < self.region.terms[term].highest)
+            .chain((self.region.alpha.0 < self.region.alpha.1).then_some(k))
+            .collect();
         let ways = [-1.0, 0.0, 1.0];
         let pairs = vary.iter().enumerate().flat_map(|(n, &i)| vary[n..].iter().map(move |&j| (i, j)));
-        let moves: Vec<(usize, f64, usize, f64)> = pairs
-            .flat_map(|(i, j)| ways.into_iter().flat_map(move |a| ways.into_iter().map(move |b| (i, a, j, b))))
-            .filter(|&(i, a, j, b)| if i == j { a == b && a != 0.0 } else { a != 0.0 && b != 0.0 })
+        let moves: Vec<[(usize, f64); 2]> = pairs
+            .flat_map(|(i, j)| ways.into_iter().flat_map(move |a| ways.into_iter().map(move |b| [(i, a), (j, b)])))
+            .filter(|[(i, a), (j, b)]| *a != 0.0 && (i == j) == (*b == 0.0))
             .collect();
         let (mut step, mut tried) = (width(1), 0);
         while step > width(DEEPEST) && tried < POLISHED {
             let before = *best;
-            for &(i, a, j, b) in &moves {
+            for moves in &moves {
                 self.control.check_stop()?;
-                let mut there = place.clone();
-                for (term, way) in [(i, a), (j, b)] {
-                    let (low, high) = self.region.integrations(term);
-                    there[term] = (place[term] + way * step).clamp(low, high);
-                }
-                if there == *place || self.region.orders(&there).is_none() {
+                let Some((alpha, mut orders)) = self.region.orders(place) else { return Ok(()) };
+                orders.push(alpha);
+                moves.iter().for_each(|(term, way)| orders[*term] += way * step);
+                let Some(there) = self.region.of_orders(orders[k], &orders[..k]).filter(|there| there != place) else {
                     continue;
-                }
+                };
                 tried += 1;
                 let left = self.left(records, &there)?;
                 if left < *best {
