@@ -68,6 +68,9 @@ def test_the_best_may_stand_on_an_edge(run, equation):
     )
     assert found.at_least <= lattice.score
     assert found.best <= lattice.score * (1 + 1e-9)
+    # Cells that an interval only touches have bounds of their own.
+    assert found.open == 0
+    assert found.within <= 0.05 + 1e-6
 
 
 def test_several_runs_of_their_own_steps_and_threads(run, equation, proved):

@@ -52,6 +52,9 @@ pub(super) struct Tables {
     rests: Vec<f64>,
 }
 
+/// Share of a stretch within which orders touch it: more than rounding is.
+const TOUCHING: f64 = 1e-6;
+
 /// Place in [`PAIRS`] of n and m, n ≤ m.
 fn pair(n: usize, m: usize) -> usize {
     m * (m + 1) / 2 + n
@@ -71,11 +74,11 @@ pub(super) fn width(level: u8) -> f64 {
     WIDEST / f64::from(1_u32 << level)
 }
 
-/// Stretches of a level that orders between these lie in: the first and how many.
+/// Stretches of a level that orders between these lie in or touch: the first and how many.
 #[allow(clippy::cast_possible_truncation, clippy::cast_sign_loss)]
 fn stretches((low, high): (f64, f64), level: u8) -> (usize, usize) {
-    let first = (low / width(level) + 1e-9).floor().max(0.0) as usize;
-    let end = (high / width(level) - 1e-9).ceil().max(0.0) as usize;
+    let first = (low / width(level) - TOUCHING).floor().max(0.0) as usize;
+    let end = (high / width(level) + TOUCHING).ceil().max(0.0) as usize;
     (first, end.max(first + 1) - first)
 }
 
