@@ -12,11 +12,9 @@
 use crate::dense::inner_products;
 use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
-use crate::search::certificate::curve::{series, unit, Curve, ALL};
+use crate::search::certificate::curve::{series, unit, Curve, ALL, MOST};
 use crate::search::certificate::span::Span;
 
-/// Most terms of an equation.
-pub(super) const MOST: usize = 6;
 type Row = [f64; MOST];
 
 /// What a bound adds to B and takes for granted of inverses: far more than rounding does to either.

@@ -9,6 +9,8 @@ use crate::error::{Error, Result};
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
 
+/// Most terms of an equation.
+pub(super) const MOST: usize = 6;
 /// Derivatives that are made.
 pub(super) const MADE: usize = 3;
 /// The value and these.

@@ -4,8 +4,7 @@
 //! proves nothing. There the output's distance from that space still bounds the equation error, for coefficients whose
 //! terms are not beyond all measure: what the space leaves out of the columns is of third order.
 
-use crate::search::certificate::cell::MOST;
-use crate::search::certificate::curve::{unit, ALL};
+use crate::search::certificate::curve::{unit, ALL, MOST};
 
 /// The value and the derivatives that are taken into the space.
 const SPANNED: usize = 3;

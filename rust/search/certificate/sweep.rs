@@ -6,7 +6,8 @@ use rayon::prelude::*;
 
 use crate::error::{Error, Result};
 use crate::regressors::Record;
-use crate::search::certificate::cell::{about, check, Bounded, MOST};
+use crate::search::certificate::cell::{about, check, Bounded};
+use crate::search::certificate::curve::MOST;
 use crate::search::certificate::region::Region;
 use crate::search::certificate::tables::{width, Cell, Tables, DEEPEST};
 use crate::search::control::Control;
