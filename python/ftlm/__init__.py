@@ -48,7 +48,9 @@ if _typing.TYPE_CHECKING:
     from ftlm.judge.residuals import CorrelationTest, OutputResiduals, Residuals, resid
     from ftlm.model.model import Model, load_model
     from ftlm.paper.reproduction import Reproduction, reproduce
+    from ftlm.search.certificate import certify_orders
     from ftlm.search.orders import resume_search, search_orders, search_status
+    from ftlm.search.proved import OrderCertificate
     from ftlm.search.result import SearchResult, SearchRow, StoreStatus
     from ftlm.selection.result import Selection
     from ftlm.selection.select import select
@@ -69,14 +71,15 @@ __all__ = [
     "DesignedInput", "Difference", "Equation", "Estimate", "FeedbackTest", "FileColumn", "FrequencyData",
     "FrequencyIdentification", "FrequencyValidation", "Friction", "FtlmError", "Genetic", "Identification",
     "Identified", "InformationCriteria", "InternalError", "Lattice", "Layout", "LinkParameters", "Metrics", "Model",
-    "ModelError", "OpenedFile", "Order", "OutputResiduals", "PhysicalParameter", "ProfileInterval", "Reproduction",
-    "Residuals", "RigFault", "Run", "SearchResult", "SearchRow", "Selection", "SensorFilter", "StoreStatus", "Stribeck",
-    "Structure", "Term", "Trace", "Trial", "Validation", "Verdict", "__version__", "agreement", "block_pulse_matrix",
-    "compare", "design_input", "energies", "equation", "explicit_euler", "flexible_link", "fractional_derivative",
-    "fractional_integral", "haar_inverse", "haar_matrix", "haar_transform", "identify", "identify_frequency",
-    "identify_many", "information_criteria", "lattice", "link_model", "load", "load_frequency", "load_model", "metrics",
-    "multi_innovation_trace", "open_file", "operational_matrix", "order_law", "physical_parameters", "reproduce",
-    "resid", "resume_search", "rig", "search_orders", "search_status", "select", "simulate",
+    "ModelError", "OpenedFile", "Order", "OrderCertificate", "OutputResiduals", "PhysicalParameter", "ProfileInterval",
+    "Reproduction", "Residuals", "RigFault", "Run", "SearchResult", "SearchRow", "Selection", "SensorFilter",
+    "StoreStatus", "Stribeck", "Structure", "Term", "Trace", "Trial", "Validation", "Verdict", "__version__",
+    "agreement", "block_pulse_matrix", "certify_orders", "compare", "design_input", "energies", "equation",
+    "explicit_euler", "flexible_link", "fractional_derivative", "fractional_integral", "haar_inverse", "haar_matrix",
+    "haar_transform", "identify", "identify_frequency", "identify_many", "information_criteria", "lattice",
+    "link_model", "load", "load_frequency", "load_model", "metrics", "multi_innovation_trace", "open_file",
+    "operational_matrix", "order_law", "physical_parameters", "reproduce", "resid", "resume_search", "rig",
+    "search_orders", "search_status", "select", "simulate",
 ]  # fmt: skip
 
 #: Where each name lives.
@@ -120,7 +123,9 @@ _HOMES = {
         "judge.residuals": "CorrelationTest OutputResiduals Residuals resid",
         "model.model": "Model load_model",
         "paper.reproduction": "Reproduction reproduce",
+        "search.certificate": "certify_orders",
         "search.orders": "resume_search search_orders search_status",
+        "search.proved": "OrderCertificate",
         "search.result": "SearchResult SearchRow StoreStatus",
         "selection.result": "Selection",
         "selection.select": "select",

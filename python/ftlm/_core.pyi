@@ -21,6 +21,7 @@ __all__ = [
     "__version__",
     "block_pulse_kernel",
     "block_pulse_matrix",
+    "certify",
     "corners",
     "correlation",
     "delayed",
@@ -132,6 +133,14 @@ class _Found(TypedDict):
     boxed: int
     #: (index, alpha, orders, reason)
     failures: list[tuple[int, float, list[float], Literal["singular", "diverged"]]]
+
+class _Certified(TypedDict):
+    at_least: float
+    best: float
+    alpha: float
+    orders: list[float]
+    cells: int
+    open: int
 
 class _FoundStage(TypedDict):
     #: (index, score, free orders, per equation (score, alpha, orders, coefficients, initial terms per record))
@@ -296,6 +305,12 @@ def metrics(measured: _Floats, residuals: _Floats) -> tuple[float, float, float,
 
 # ------------------------------------------------------------------------------------------------------------ searches
 
+def certify(
+    runs: Sequence[_Record],
+    region: tuple[int, tuple[float, float], Sequence[tuple[int, float, float]], float],
+    asked: tuple[float, float, int, int, int],
+    progress: _Progress | None,
+) -> _Certified: ...
 def lattice_size(orders: _Lattice, inputs: Sequence[bool]) -> int: ...
 def search(
     runs: Sequence[_Record],

@@ -41,8 +41,8 @@ mod _core {
 
     #[pymodule_export]
     use super::search::{
-        lattice_size, panic_on_purpose, portable, search, search_join, search_plan, search_stage, OrderSearch, Points,
-        StageSearch,
+        certify, lattice_size, panic_on_purpose, portable, search, search_join, search_plan, search_stage, OrderSearch,
+        Points, StageSearch,
     };
 
     #[pymodule_export]

@@ -1,5 +1,6 @@
 """Order searches over lattices that are screened in boxes, beside the same candidates one by one."""
 
+import numpy as np
 import pytest
 
 import ftlm
@@ -79,3 +80,43 @@ def test_boxes_give_the_same_bits_for_any_threads_in_a_store_and_when_cut(run, w
     path.write_bytes(data[: len(data) * 17 // 20])
     assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
     assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
+
+
+@pytest.fixture(scope="module")
+def unruly():
+    """Of an output that no equation of the lattice makes, so that test vectors leave most candidates open."""
+    y = 0.05 * np.cumsum(np.random.default_rng(5).standard_normal(513))
+    u = np.where(np.arange(513) % 160 < 90, 1.0, -0.6)
+    return ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y}, name="unruly")
+
+
+def closely(run, path=None, highest=2.0, **options):
+    equation, lattice = ftlm.equation(EQUATION, initial="rest"), ftlm.lattice(step=0.05, alpha=(1.15, highest))
+    return ftlm.search_orders(run, equation, lattice, coefficients="least-squares", m=32, store=path, **options)
+
+
+def test_a_search_by_close_proofs_goes_on_where_it_was_cut_or_stopped(unruly, tmp_path):
+    path = tmp_path / "s.ftlm"
+    whole = closely(unruly, path, threads=2)
+    # One too small for them excludes next to nothing.
+    small = closely(unruly, highest=1.9)
+    assert small.candidates < 1 << 18 <= whole.candidates
+    assert small.pruned["bound"] < small.candidates // 10
+    assert whole.pruned["bound"] > whole.candidates // 2
+    assert bytes_of(closely(unruly, threads=3)) == bytes_of(whole)
+    data = path.read_bytes()
+    # What is searched, and where, stands first and is most of it.
+    for share in (0.88, 0.97):
+        path.write_bytes(data[: int(len(data) * share)])
+        assert 0 < ftlm.search_status(path)["y"].done < whole.candidates
+        assert bytes_of(ftlm.resume_search(path)["y"]) == bytes_of(whole)
+
+    def stop(done, total):
+        if done > total // 2:
+            raise KeyboardInterrupt
+
+    again = tmp_path / "again.ftlm"
+    with pytest.raises(KeyboardInterrupt):
+        closely(unruly, again, progress=stop)
+    assert not ftlm.search_status(again)["y"].complete
+    assert bytes_of(ftlm.resume_search(again)["y"]) == bytes_of(whole)

@@ -7,6 +7,7 @@ mod common;
 
 mod bindings;
 mod boxes;
+mod certificate;
 mod equation;
 mod estimators;
 mod fractional;

@@ -23,6 +23,7 @@ from ftlm.cli.options import (
     Force,
     GeneticOptions,
     Json,
+    Number,
     Out,
     ReadingOptions,
     SearchOptions,
@@ -39,6 +40,7 @@ from ftlm.data.structures import Structure
 from ftlm.identification import identify as estimation
 from ftlm.model.model import load_model
 from ftlm.search.beforehand import announce
+from ftlm.search.certificate import certify_job, check_certifiable
 from ftlm.search.job import run_job
 from ftlm.search.orders import job_of, make_job, resume_job, search_status
 from ftlm.search.result import SearchResult
@@ -128,6 +130,14 @@ def search(
     coefficients: Annotated[Estimator, Option(help="How coefficients are estimated.")] = "multi-innovation",
     reading: ReadingOptions, shape: StructureOptions, options: SearchOptions, threads: Threads = None,
     store: Annotated[Text, Option(metavar="FILE", help="Keep finished work there; go on with ftlm resume.")] = None,
+    certify: Annotated[
+        Number,
+        Option(
+            metavar="SHARE",
+            help="Prove of orders between those of the lattice, too, that none is better by more than this share; of "
+            "squared equation errors at rest.",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:  # fmt: skip
     """Rank the orders of each equation, or of a stage under its order law, and account for every candidate."""
@@ -146,6 +156,9 @@ def search(
             )
             for name, part in parts.items()
         }
+        if certify is not None:
+            for job in jobs.values():
+                check_certifiable(job, certify)
         kept = None
         if store is not None:
             kept = stack.enter_context(Store(store, [job.request(name) for name, job in jobs.items()]))
@@ -154,6 +167,10 @@ def search(
         for number, (name, job) in enumerate(jobs.items()):
             with Progress(f"searching orders of {name}", quiet=as_json) as progress:
                 results[name] = run_job(replace(job, progress=progress), store=kept, number=number)
+            if certify is not None:
+                with Progress(f"proving what lies between of {name}", quiet=as_json) as progress:
+                    proved = certify_job(job, within=certify, apart=lattice.step, progress=progress.so_far)
+                results[name] = replace(results[name], certificate=proved)
     show_searches(results, as_json=as_json)
 
 

@@ -10,6 +10,7 @@ from ftlm.base.frames import to_frame
 from ftlm.model.model import Model
 from ftlm.paint.table import Table
 from ftlm.paint.text import Cell, Exact, number, symbol, symbol_html
+from ftlm.search.proved import OrderCertificate
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,9 @@ class SearchResult:
         Orders of the first row that stand on the edge of their interval, by name with the edge.
     boxed
         Of those under "bound", the candidates whose whole box of orders was excluded by one bound.
+    certificate
+        What is proved of the orders between the lattice's, where that was asked for (``ftlm search --certify``,
+        :func:`ftlm.certify_orders`).
     """
 
     table: list[SearchRow]
@@ -75,6 +79,7 @@ class SearchResult:
     settings: dict[str, Any]
     edges: dict[str, float]
     boxed: int = 0
+    certificate: OrderCertificate | None = None
 
     @property
     def orders(self) -> dict[str, float]:
@@ -118,7 +123,7 @@ class SearchResult:
             "table": [dict(vars(row)) for row in self.table],
             "failures": [{"orders": o, "reason": reason} for o, reason in self.failures],
             "edges": self.edges,
-        }
+        } | ({} if self.certificate is None else {"certificate": self.certificate.to_dict()})
 
     def __str__(self) -> str:
         names, coefficients = list(self.orders), list(self.coefficients)
@@ -131,6 +136,8 @@ class SearchResult:
             lines.append(f"{row.rank:>4}{row.score:>12.5g}{orders}{values}")
         lines.append(f"{self.candidates} candidates: {len(self.table)} kept{self.left_out}")
         lines += [f"warning: order {n} = {v:g} is on the edge of its interval; widen it" for n, v in self.edges.items()]
+        if self.certificate is not None:
+            lines.append(str(self.certificate))
         return "\n".join(lines)
 
 
@@ -262,5 +269,6 @@ def search_html(found: SearchResult) -> str:
         if reason == "bound" and found.boxed:
             rows.append(["of these in boxes excluded whole", found.boxed])
     name = found.model.outputs[0] if len(found.model.outputs) == 1 else "stage"
-    rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows)
+    note = "" if found.certificate is None else str(found.certificate)
+    rest = Table(f"{found.candidates} candidates", ("became of them", "count"), rows, note=note)
     return str(search_top(name, found).to_html() + rest.to_html())

@@ -1,0 +1,172 @@
+"""Certificates over all orders of intervals: nothing between the values of a lattice does better than is proved."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import ftlm
+from ftlm.cli.app import app
+from ftlm.errors import ModelError
+
+WORDS = "D^alpha y = a D^beta y + c y + b u"
+LATTICE = ftlm.lattice(step=0.1, alpha=(1.3, 1.8), beta=(0.5, 0.9))
+
+
+@pytest.fixture(scope="module")
+def run():
+    u = np.where(np.arange(401) % 130 < 70, 1.0, -0.6)
+    blank = ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": np.zeros(401)}, name="machine")
+    y = ftlm.Model(ftlm.equation("D^1.63 y = -3 D^0.72 y - 8 y + 5 u")).simulate(blank)["y"]
+    noise = 0.01 * np.random.default_rng(3).standard_normal(401)
+    return ftlm.Run.from_arrays(step=0.02, inputs={"u": u}, outputs={"y": y + noise}, name="machine")
+
+
+@pytest.fixture(scope="module")
+def equation():
+    return ftlm.equation(WORDS, initial="rest")
+
+
+@pytest.fixture(scope="module")
+def proved(run, equation):
+    return ftlm.certify_orders(run, equation, LATTICE, within=0.05, m=128)
+
+
+def rmse(run, equation, alpha, beta):
+    """Of the search itself, at one candidate."""
+    return ftlm.search_orders(
+        run, equation, ftlm.Lattice(orders={"alpha": [alpha], "beta": [beta]}), criterion="equation-error", norm="l2",
+        coefficients="least-squares", m=128,
+    ).score  # fmt: skip
+
+
+def test_no_search_between_the_values_of_the_lattice_does_better(run, equation, proved):
+    assert proved.open == 0
+    assert 0.95 * proved.best * (1 - 1e-6) <= proved.at_least <= proved.best
+    assert proved.within <= 0.05 + 1e-6
+    assert rmse(run, equation, *proved.orders.values()) == pytest.approx(proved.best, rel=1e-6)
+    fine: dict = {"alpha": "1.3:1.798:0.003", "beta": "0.5:0.899:0.003"}
+    found = ftlm.search_orders(
+        run, equation, ftlm.Lattice(orders=fine), criterion="equation-error", norm="l2", coefficients="least-squares",
+        m=128,
+    )  # fmt: skip
+    assert proved.at_least <= found.score
+    assert proved.best <= found.score * 1.01
+    assert set(proved.orders) == {"alpha", "beta"}
+    assert proved.intervals == {"alpha": (1.3, 1.8), "beta": (0.5, 0.9)}
+
+
+def test_the_best_may_stand_on_an_edge(run, equation):
+    """Where no middle of a box is."""
+    edge = ftlm.lattice(step=0.1, alpha=(1.3, 1.5), beta=(0.85, 0.9))
+    found = ftlm.certify_orders(run, equation, edge, within=0.05, m=128)
+    assert found.orders["alpha"] in (1.3, 1.5) or found.orders["beta"] in (0.85, 0.9)
+    lattice = ftlm.search_orders(
+        run, equation, edge, criterion="equation-error", norm="l2", coefficients="least-squares", m=128
+    )
+    assert found.at_least <= lattice.score
+    assert found.best <= lattice.score * (1 + 1e-9)
+    # Cells that an interval only touches have bounds of their own.
+    assert found.open == 0
+    assert found.within <= 0.05 + 1e-6
+
+
+def test_several_runs_of_their_own_steps_and_threads(run, equation, proved):
+    again = ftlm.certify_orders(run, equation, LATTICE, within=0.05, m=128, threads=1)
+    assert again == proved
+    twice = ftlm.certify_orders([run, run.slice(1.0, 5.0)], equation, LATTICE, within=0.2, m=128)
+    assert 0 < twice.at_least <= twice.best
+
+
+def test_it_says_in_words_what_is_proved_and_what_is_not(run, equation, proved):
+    text = str(proved)
+    assert "no orders with alpha from 1.3 to 1.8, beta from 0.5 to 0.9" in text
+    assert "on a lattice or between" in text
+    assert f"{proved.cells} boxes" in text
+    assert "asked" not in text
+    cut = ftlm.certify_orders(run, equation, LATTICE, within=0.05, m=128, cells=proved.cells - 1)
+    assert cut.open > 0
+    assert "was asked for" in str(cut) or "nothing is proved" in str(cut)
+    nothing = replace(proved, at_least=0.0, open=7)
+    assert nothing.within == 1
+    assert "nothing is proved" in str(nothing)
+    document = json.loads(json.dumps(proved.to_dict()))
+    assert document["at_least"] == proved.at_least
+    assert document["orders"] == proved.orders
+    searched = ftlm.search_orders(run, equation, ftlm.lattice(step=0.3), m=32)
+    whole = replace(searched, certificate=proved)
+    assert str(whole).endswith(text)
+    assert "certificate" not in searched._repr_html_()
+    assert "certificate: no orders" in whole._repr_html_()
+    assert whole.to_dict()["certificate"] == proved.to_dict()
+    # A share that is said is rounded up.
+    assert "by more than 5.1 %" in str(replace(proved, at_least=0.9495, best=1.0))
+
+
+@pytest.mark.parametrize(
+    ("words", "options", "said"),
+    [
+        ("D^alpha y = a D^beta y + 3 u", {}, "known coefficients, and 1 of the terms of y"),
+        (WORDS, {"within": 0}, "within=0"),
+        (WORDS, {"within": "much"}, "within"),
+        (WORDS, {"within": float("nan")}, "within"),
+        (WORDS, {"apart": 0.0}, "apart = 0"),
+        (WORDS, {"apart": -1}, "apart = -1"),
+        (WORDS, {"cells": 0}, "cells = 0"),
+        (WORDS, {"cells": 1.5}, "cells = 1.5"),
+        (WORDS, {"cells": 2}, "allow more"),
+        (WORDS, {"largest": 0.1}, "largest"),
+        (WORDS, {"lattice": "fine"}, "lattice"),
+        (WORDS, {"threads": 0}, "threads"),
+        (WORDS, {"lattice": ftlm.lattice(alpha=(0.5, 0.6), beta=(0.58, 0.7))}, "no orders in these intervals"),
+    ],
+)
+def test_what_cannot_be_had_is_said(run, words, options, said):
+    given = {"lattice": LATTICE, "m": 128} | options
+    if "3 u" in words and "lattice" not in options:
+        given["lattice"] = ftlm.lattice(step=0.1)
+    with pytest.raises(ModelError, match=said):
+        ftlm.certify_orders(run, ftlm.equation(words, initial="rest"), **given)
+
+
+def test_neither_initial_terms_nor_stages_under_a_law_have_one(run):
+    with pytest.raises(ModelError, match="initial terms"):
+        ftlm.certify_orders(run, ftlm.equation(WORDS, initial="caputo"), LATTICE, m=128)
+
+
+@pytest.fixture(scope="module")
+def csv(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("certificate") / "machine.csv"
+    table = np.column_stack([0.02 * np.arange(401), run["u"], run["y"]])
+    np.savetxt(path, table, delimiter=",", header="t,u,y", comments="")
+    return path
+
+
+def test_the_command_line_prints_it_behind_the_table(csv, proved):
+    words = [
+        "search", str(csv), "--structure", WORDS, "-u", "u", "-y", "y", "--initial", "rest", "--m", "128",
+        "--step", "0.1", "--lattice", "alpha=1.3:1.8:0.1", "--lattice", "beta=0.5:0.9:0.1", "--coefficients",
+        "least-squares",
+    ]  # fmt: skip
+    ranked = ["--criterion", "equation-error", "--norm", "l2"]
+    told = CliRunner().invoke(app, [*words, *ranked, "--certify", "0.05"])
+    assert told.exit_code == 0, told.output
+    assert "candidates:" in told.output
+    assert "certificate: no orders with alpha from 1.3 to 1.8" in told.output
+    told = CliRunner().invoke(app, [*words, *ranked, "--certify", "0.05", "--json"])
+    assert json.loads(told.output)["y"]["certificate"]["at_least"] == pytest.approx(proved.at_least, rel=1e-3)
+    plain = CliRunner().invoke(app, [*words, *ranked, "--json"])
+    assert "certificate" not in json.loads(plain.output)["y"]
+    for options, said in [
+        ([], "no certificate over all orders for criterion"),
+        (["--criterion", "equation-error"], "norm"),
+        ([*ranked, "--coefficients", "multi-innovation"], "coefficients"),
+    ]:
+        refused = CliRunner().invoke(app, [*words, *options, "--certify", "0.05"])
+        assert refused.exit_code == 2
+        assert said in refused.stderr
+    refused = CliRunner().invoke(app, [*words, *ranked, "--certify", "5"])
+    assert refused.exit_code == 2
+    assert "--certify is outside" in refused.stderr
