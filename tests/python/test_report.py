@@ -805,5 +805,5 @@ def test_coefficients_have_units_and_an_offset_its_number():
 
 
 def test_a_result_without_a_page_cannot_be_made():
-    with pytest.raises(TypeError, match="abstract method '?_page"):
+    with pytest.raises(TypeError, match=r"abstract method '?_page"):
         type("Bare", (Reported,), {})()
