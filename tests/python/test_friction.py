@@ -330,6 +330,7 @@ def test_friction_is_recovered_with_offsets_a_run(tmp_path) -> None:
     reason = "y has no equation error: friction acts on it, and the sign of a measured velocity is that of its noise"
     assert reason in page
     assert '<data value="nan">' not in page
+    assert "equation error</th>" not in page
     again = found.model.compare(runs)
     assert str(again).count("equation error") == 1
     assert reason in str(again)

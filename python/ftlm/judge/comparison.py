@@ -457,13 +457,21 @@ def errors_table(
             add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error, without)
         for name, equation, output in runs:
             add(f"{label}: {name}", equation, output, without)
+    reasons = [f"{words}." for words in without_equation_error(unequated)]
+    own = 1 + len(_FIGURES)
+    if unequated and all(cell is None for row in rows for cell in row[1:own]):
+        # Four columns of nothing would push what is known off a narrow screen.
+        kept: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
+        single = (("", 1), ("output error (free run)", 4))
+        return Table(title, ("output", *_FIGURES), kept, groups=single, headings=headings, note=" ".join(reasons))
     note = (
         "The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
         "close to one another; only the free run shows what the model knows."
     )
-    note = " ".join([note, *(f"{words}." for words in without_equation_error(unequated))])
     groups = (("", 1), ("equation error", 4), ("output error (free run)", 4))
-    return Table(title, ("output", *_FIGURES, *_FIGURES), rows, groups=groups, headings=headings, note=note)
+    return Table(
+        title, ("output", *_FIGURES, *_FIGURES), rows, groups=groups, headings=headings, note=" ".join([note, *reasons])
+    )
 
 
 def filter_state(exponent: float) -> str:

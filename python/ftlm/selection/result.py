@@ -97,7 +97,7 @@ class Selection(Reported):
         chosen = [v if n == self.winner.numbers else math.nan for n, v in zip(along, unseen, strict=True)]
         return line_chart(
             [float(n) for n in along], [("where fitted", seen), ("where unseen", unseen), ("chosen", chosen)],
-            title="What each number is worth", x_label="numbers estimated", y_label="fit in %",
+            title="What each number is worth", x_label="numbers estimated", y_label="fit in %", dots=("chosen",),
             caption=f"The best candidate with each number of estimates; chosen is one with {self.winner.numbers}.",
         )  # fmt: skip
 
