@@ -4,18 +4,24 @@
 coefficients (promise P9), the same with three free orders, and one run of 50 000 samples, then of 500 000, with a free
 order (P10). Each in a process of its own, modules imported before (P8); the rival of the first is SciPy's least_squares
 on the two numbers of the link, all that is linear projected out by run (less than the five numbers that both runs
-share), from twenty starts.
+share), from twenty starts. ``psf`` and ``lqr`` fit the five on one run and judge them on the other one, in bold.
+``jax --jax PYTHON`` sets jax-sysid's linear model of order 4 beside, from one start, fitted on both runs and on each:
+with the signals as they were measured (its states may be the link's and the filter's), then with the hubs' angles
+through the deflections' filter, so that all signals passed it. The times after the slash are of two more starts in the
+same process, less what a fit takes with a single step of each optimiser: setting up and compiling.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import resource
 import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "python")
 
 import ftlm
 from arm_measured import arm_run
-from lsim_link import projected
+from lsim_link import STOCK, projected, response
 from results import append, heading
 
 FILTERED = ("theta12", "theta22")
@@ -60,17 +66,61 @@ def peak() -> float:
 
 def told(name: str, seconds: float, before: float, fit: str) -> None:
     """One row."""
-    print(f"| {name} | {seconds:.2f} | {seconds / transform() / 1000:.0f} | {peak():.0f} | {before:.0f} | {fit} |")
+    row(name, [seconds], (peak(), before), fit)
 
 
-def arm(name: str) -> None:
-    """Both runs of the arm."""
-    runs = [arm_run("psf"), arm_run("lqr")]
+def row(name: str, seconds: Sequence[float], memory: tuple[float, float], fit: str) -> None:
+    """One row; processor times with and without what is left out of the second."""
+    spent, ffts = " / ".join(f"{s:.2f}" for s in seconds), " / ".join(f"{s / transform() / 1000:.0f}" for s in seconds)
+    print(f"| {name} | {spent} | {ffts} | {memory[0]:.0f} | {memory[1]:.0f} | {fit} |")
+
+
+def percents(fits: dict[str, float], used: Sequence[str]) -> str:
+    """Fits by run, in bold where the run was not fitted to."""
+    return ", ".join(f"{n} {v:.1f} %" if n in used else f"{n} **{v:.1f} %**" for n, v in fits.items())
+
+
+def arm(name: str, used: Sequence[str] = ("psf", "lqr")) -> None:
+    """Fitted on both runs of the arm, or on one of them, and judged on each."""
+    runs = {n: arm_run(n) for n in ("psf", "lqr")}
     structure = ftlm.equation(WORDS[name], sensor_filter=ftlm.SensorFilter.low_pass(FILTERED))
     identify, before, found = ftlm.identify, peak(), []
-    seconds = spent(lambda: found.append(identify(runs, structure, threads=1)))
+    seconds = spent(lambda: found.append(identify([runs[n] for n in used], structure, threads=1)))
     numbers = ", ".join(f"{n} {v:.4g}" for n, v in found[0].joint_values.items())
-    told(name, seconds, before, f"{found[0].fit_percent['theta22']:.2f} %: {numbers}")
+    fits = {n: found[0].model.compare(run).fit_percent["theta22"] for n, run in runs.items()}
+    case = name if len(used) > 1 else f"{name} on {used[0]}"
+    told(case, seconds, before, f"{found[0].fit_percent['theta22']:.2f} %: {percents(fits, used)}; {numbers}")
+
+
+def state_space(python: str) -> None:
+    """The linear model of jax-sysid on the same runs, inputs and judged runs, by an interpreter that has it."""
+    script = Path(__file__).with_name("state_space.py")
+    runs = {n: arm_run(n) for n in ("psf", "lqr")}
+    for way in ("as measured", "hub angles filtered"):
+        kept = {}
+        for name, run in runs.items():
+            signals = [np.asarray(run[n]) for n, _ in TERMS]
+            if way != "as measured":
+                signals = [s if n in FILTERED else s[0] + response(STOCK[-1:], STOCK, s - s[0], run.step)
+                           for s, (n, _) in zip(signals, TERMS, strict=True)]  # fmt: skip
+            kept |= {f"{name}.y": run["theta22"][:, None], f"{name}.u": np.stack(signals, axis=1)}
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "runs.npz"
+            np.savez(file, **kept)
+            for used in ("psf+lqr", "psf", "lqr"):
+                command = [python, str(script), str(file), used]
+                made = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+                said = json.loads(made.splitlines()[-1])
+                if "absent" in said:
+                    print(f"| jax-sysid | | | | | {said['absent']} |")
+                    return
+                first, setting_up = said["seconds"][0], said["setting_up"]
+                fits = percents(said["fits"]["one"], used.split("+"))
+                best = percents(said["fits"]["best"], used.split("+"))
+                words = f"{fits}; best of {len(said['seconds'])} starts {best}; {said['numbers']} numbers"
+                case = f"jax-sysid, order 4, {way}, on {used}"
+                again = float(np.mean(said["seconds"][1:]))
+                row(case, [first, again - setting_up], (said["peak"], said["before"]), words)
 
 
 def rival() -> None:
@@ -116,21 +166,26 @@ def long(samples: int) -> None:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("cases", nargs="*", default=["five", "rival", "three", "long", "longest"])
+    parser.add_argument("cases", nargs="*", default=["five", "rival", "jax", "psf", "lqr", "three", "long", "longest"])
     parser.add_argument("--samples", type=int, default=50_000, help="of the long run, up to 1 048 576")
+    parser.add_argument("--jax", default=sys.executable, help="interpreter of an environment with jax-sysid")
     parser.add_argument("--alone", action="store_true", help="measure in this process")
     parser.add_argument("--write", action="store_true", help="append to RESULTS.md")
     asked = parser.parse_args()
     if asked.alone:
         for case in asked.cases:
-            cases = {"long": lambda: long(asked.samples), "longest": lambda: long(LONGEST), "rival": rival}
+            cases = {
+                "long": lambda: long(asked.samples), "longest": lambda: long(LONGEST), "rival": rival,
+                "jax": lambda: state_space(asked.jax), "psf": lambda: arm("five", ["psf"]),
+                "lqr": lambda: arm("five", ["lqr"]),
+            }  # fmt: skip
             cases.get(case, lambda case=case: arm(case))()
         return
     lines = [heading(), "", "| case | processor s | thousand FFTs | peak MB | before | found |", "| --- " * 6 + "|"]
     print("\n".join(lines), flush=True)
     alone = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
     for case in asked.cases:
-        command = [sys.executable, __file__, case, "--samples", str(asked.samples), "--alone"]
+        command = [sys.executable, __file__, case, "--samples", str(asked.samples), "--jax", asked.jax, "--alone"]
         made = subprocess.run(command, capture_output=True, text=True, check=True, env=alone).stdout.strip()
         print(made, flush=True)
         lines.append(made)

@@ -18,7 +18,7 @@ Term = tuple[str, int]
 STOCK = (1.0, 22.6195, 157.9137)
 
 
-def _response(numerator: Sequence[float], denominator: Sequence[float], u: np.ndarray, step: float) -> np.ndarray:
+def response(numerator: Sequence[float], denominator: Sequence[float], u: np.ndarray, step: float) -> np.ndarray:
     """From rest, the input linear between its samples."""
     b, a, _ = cont2discrete((numerator, denominator), step, method="foh")
     return np.asarray(lfilter(b[0], a, u))
@@ -34,9 +34,9 @@ def columns(
         u = signals[name] - (signals[name][0] if order else 0.0)
         power = np.array([1.0] + [0.0] * order)
         if name in filtered:
-            out.append(_response(power, link, u, step))
+            out.append(response(power, link, u, step))
         else:
-            out.append(_response(STOCK[-1] * power, np.polymul(link, STOCK), u, step))
+            out.append(response(STOCK[-1] * power, np.polymul(link, STOCK), u, step))
     impulse = np.zeros(len(u))
     impulse[0] = 1.0
     for denominator in (link, STOCK):
@@ -44,7 +44,7 @@ def columns(
         free = lfilter([1.0], np.real(np.poly(np.exp(poles * step))), impulse)
         out += [free, np.r_[0.0, free[:-1]]]
     if offset:
-        out.append(_response([1.0], link, np.ones(len(u)), step))
+        out.append(response([1.0], link, np.ones(len(u)), step))
     return np.array(out).T
 
 

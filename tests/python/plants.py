@@ -185,3 +185,15 @@ def resonant_plant(seed: int, *, wrong: bool = False) -> ftlm.Run:
     return ftlm.Run.from_arrays(
         step=step, inputs={"u": command}, outputs={"y": noisy}, name=f"{'wrong' if wrong else 'plant'} {seed}"
     )
+
+
+def written_lag(rows: int, period: float, **more: float) -> str:
+    """A lag of first order under a square wave as a text file, in volts and degrees; further columns are constants."""
+    t = np.arange(rows) * 0.05
+    u = np.sign(np.sin(2 * np.pi * t / period))
+    truth = ftlm.Model(ftlm.equation("D y = -2 y + 3 u"))
+    run = truth.simulate(ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": 0 * t}))
+    y = run["y"] + 0.01 * np.random.default_rng(1).standard_normal(rows)
+    ends = "".join(f",{value:g}" for value in more.values())
+    lines = [f"{a:.2f},{b:g},{c:.6f}{ends}" for a, b, c in zip(t, u, y, strict=True)]
+    return "\n".join([",".join(["time [s]", "u [V]", "y [deg]", *more]), *lines])

@@ -11,13 +11,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import ftlm
+import plants
 from ftlm.app import desk as desks
 from ftlm.app import serve, view
 from ftlm.app.child import Task, TaskError
@@ -104,13 +104,7 @@ def page(tmp_path, loop):
 @pytest.fixture(scope="module")
 def content():
     """A lag of first order, in volts and degrees."""
-    t = np.arange(300) * 0.05
-    u = np.sign(np.sin(2 * np.pi * t / 5))
-    truth = ftlm.Model(ftlm.equation("D y = -2 y + 3 u"))
-    run = truth.simulate(ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": 0 * t}))
-    y = run["y"] + 0.01 * np.random.default_rng(1).standard_normal(t.size)
-    rows = [f"{a:.2f},{b:g},{c:.6f}" for a, b, c in zip(t, u, y, strict=True)]
-    return "\n".join(["time [s],u [V],y [deg]", *rows]).encode()
+    return plants.written_lag(300, 5.0).encode()
 
 
 @pytest.fixture(scope="module")

@@ -12,10 +12,10 @@ import subprocess
 import sys
 from urllib.parse import urlsplit
 
-import numpy as np
 import pytest
 
 import ftlm
+import plants
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 HOSTILE = "<img src=x onerror=window.hacked=1>"
@@ -25,13 +25,7 @@ SLOW = "D^a1 y = p1 D^m1 y + p2 D^m2 y + p3 D^m3 y + p4 D^m4 y + p5 D^m5 y + p6 
 @pytest.fixture(scope="module")
 def content():
     """A lag of first order; one column bears markup as its name."""
-    t = np.arange(200) * 0.05
-    u = np.sign(np.sin(2 * np.pi * t / 4))
-    truth = ftlm.Model(ftlm.equation("D y = -2 y + 3 u"))
-    run = truth.simulate(ftlm.Run.from_arrays(step=0.05, inputs={"u": u}, outputs={"y": 0 * t}))
-    y = run["y"] + 0.01 * np.random.default_rng(1).standard_normal(t.size)
-    rows = [f"{a:.2f},{b:g},{c:.6f},0" for a, b, c in zip(t, u, y, strict=True)]
-    return "\n".join([f"time [s],u [V],y [deg],{HOSTILE}", *rows])
+    return plants.written_lag(200, 4.0, **{HOSTILE: 0})
 
 
 class Served:

@@ -93,13 +93,17 @@ def broken_files():
     yield json.dumps(good | {"controller": pid | {"kp": "1"}}).encode(), "Expected `float`"
     yield json.dumps(good | {"controller": pid | {"type": "bang"}}).encode(), "Invalid value 'bang'"
     yield json.dumps(good | {"controller": pid, "schema": 2}).encode(), "upgrade ftlm"
+    yield (
+        json.dumps(good | {"controller": {"type": "mpc"}, "schema": 2, "written_by": "ftlm 9"}).encode(),
+        "a controller of a later version of ftlm, .ftlm 9.: it has schema 2, and .* reads up to 1; upgrade",
+    )
     yield json.dumps(good | {"controller": pid | {"rate": -1.0}}).encode(), "damaged: rate"
     yield json.dumps(good | {"controller": pid | {"order": 10**6}}).encode(), "damaged: order"
     yield json.dumps(good | {"controller": pid, "more": 1}).encode(), "unknown field `more`"
     yield b" " * (1 << 21), "no controller is larger"
 
 
-@pytest.mark.parametrize("case", range(10))
+@pytest.mark.parametrize("case", range(11))
 def test_what_is_no_controller_is_refused(case, tmp_path):
     data, words = list(broken_files())[case]
     path = tmp_path / "c.json"

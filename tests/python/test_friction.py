@@ -326,7 +326,15 @@ def test_friction_is_recovered_with_offsets_a_run(tmp_path) -> None:
     page = found.report(tmp_path / "cart.html").read_text()
     assert "sgn" in page
     assert "Coulomb friction" in page
+    # What is not known is no row of four times "undefined": the reason stands there.
+    reason = "y has no equation error: friction acts on it, and the sign of a measured velocity is that of its noise"
+    assert reason in page
+    assert '<data value="nan">' not in page
+    assert "equation error</th>" not in page
     again = found.model.compare(runs)
+    assert str(again).count("equation error") == 1
+    assert reason in str(again)
+    assert "nan" not in str(again)
     assert again.fit_percent["y"] == pytest.approx(found.fit_percent["y"], abs=1e-9)
 
 

@@ -699,7 +699,10 @@ HOSTILE = {
         lambda d: d.update(estimate={"method": "x", "runs": [], "values": {}, "covariance": [[1.0]]})
     ),
     "NaN": altered(lambda d: d["equations"][0].update(order=math.nan)),
-    "later schema": altered(lambda d: d.update(schema=3)),
+    "later schema": altered(lambda d: d.update(schema=9)),
+    "later schema with what is in it": altered(lambda d: d.update(schema=9, moons={"of": "a later version"})),
+    "later schema, and who wrote it": altered(lambda d: d.update(schema=10**30, written_by="ftlm 7.1", equations=4)),
+    "schema of more than it holds": altered(lambda d: d.update(schema=3)),
     "schema 0": altered(lambda d: d.update(schema=0)),
     "schema in text": altered(lambda d: d.update(schema="1")),
     "alpha out of range": altered(lambda d: d["equations"][0].update(order=11.0)),
@@ -737,7 +740,13 @@ def test_hostile_model_files_are_refused(kind, tmp_path):
         ftlm.load_model(path)
     message = str(refused.value)
     assert message.startswith(str(path))
-    expected = {"too large": "1048577 bytes", "later schema": "schema 3, this version reads up to 2; upgrade ftlm"}
+    later = f"has schema 9, and this version, {ftlm.__version__}, reads up to 8; upgrade ftlm"
+    expected = {
+        "too large": "1048577 bytes", "later schema": later, "later schema with what is in it": later,
+        "later schema, and who wrote it": f"is a model of a later version of ftlm, 'ftlm 7.1': it has schema {10**30}",
+        "schema of more than it holds": "says that it has schema 3, and what it holds has schema 2; give a file",
+        "unknown key": "is no ftlm model: Object contains unknown field `extra`",
+    }  # fmt: skip
     assert expected.get(kind, "") in message
 
 

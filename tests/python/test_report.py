@@ -17,6 +17,7 @@ from ftlm import report
 from ftlm.paint import axes
 from ftlm.paint import text as words
 from ftlm.paint.figure import LINE
+from ftlm.paint.page import Reported
 from ftlm.paint.text import number
 
 HOSTILE = "</script><script>alert(1)</script>\"><svg onload=alert(1)> & 'x'"
@@ -801,3 +802,8 @@ def test_coefficients_have_units_and_an_offset_its_number():
     assert "0.25000" in html
     assert html.count('class="term"') == 4
     assert "<mi>c</mi>" in str(report.equation_html(model.equations[0], offset=" + c"))
+
+
+def test_a_result_without_a_page_cannot_be_made():
+    with pytest.raises(TypeError, match=r"abstract method '?_page"):
+        type("Bare", (Reported,), {})()

@@ -13,6 +13,7 @@ import lagrange
 from ftlm import _core, rig
 from ftlm.cli import app
 from ftlm.rig.rig import CURRENT_LIMIT, ENCODER_SCALE, STRAIN_SCALE
+from ftlm.rig.virtual import VirtualBoard
 
 
 @pytest.fixture(scope="module")
@@ -184,6 +185,26 @@ def test_a_record_says_everything_and_loads_bit_for_bit(tmp_path):
     assert json.loads(path.read_text(encoding="utf-8").split("\n")[0].removeprefix("# ftlm-run 1 "))["about"] == about
 
 
+def test_numbers_of_numpy_are_numbers(tmp_path):
+    """A seed from an array of seeds, a time from a table: the run and what is told of it are those of Python's own."""
+    with_numpy = rig.record(
+        input="chirp", duration=np.int64(1), limit=np.float32(2), rate=np.int32(200), seed=np.int64(3),
+        amplitude=(np.float64(0.25), np.int8(0)), band=(np.float64(1), np.int16(5)), ramp=np.float64(0.5),
+        out=tmp_path / "a.csv",
+    )  # fmt: skip
+    plain = rig.record(
+        input="chirp", duration=1, limit=2, rate=200, seed=3, amplitude=(0.25, 0), band=(1, 5), ramp=0.5,
+        out=tmp_path / "b.csv",
+    )  # fmt: skip
+    assert np.array_equal(with_numpy["theta12"], plain["theta12"])
+    assert with_numpy.about["seed"] == 3
+    assert type(with_numpy.about["seed"]) is int
+    assert with_numpy.about["input"] == plain.about["input"]
+    assert VirtualBoard(seed=np.uint8(3)).seed == 3
+    with pytest.raises(ftlm.ModelError, match=r"seed = 0\.5 is not a whole number from 0"):
+        VirtualBoard(seed=0.5)
+
+
 def test_equal_seeds_give_equal_runs(square):
     again = rig.record(input="square", duration=4.0, seed=3)
     other = rig.record(input="square", duration=4.0, seed=4)
@@ -311,7 +332,17 @@ def test_the_stock_filter_of_a_record_is_that_of_a_model():
         ({"watchdog": 5.0}, "outside [0.01, 1]"),
         ({"rig": "q9"}, "'q9' is not known"),
         ({"parameters": "effectiv"}, "did you mean 'effective'?"),
-        ({"seed": -1}, "whole number"),
+        ({"seed": -1}, "seed = -1 is not a whole number from 0"),
+        ({"seed": True}, "seed = True is not a whole number from 0"),
+        ({"seed": np.True_}, "is not a whole number from 0"),
+        ({"seed": 3.0}, "seed = 3.0 is not a whole number from 0"),
+        ({"seed": np.float64(3)}, "is not a whole number from 0"),
+        ({"seed": "3"}, "seed = '3' is not a whole number from 0"),
+        ({"amplitude": True}, "not a current in A"),
+        ({"amplitude": (0.1, 0.1, 0.1)}, "not a current in A"),
+        ({"amplitude": (0.1, "x", 0.1)}, "not a current in A"),
+        ({"duration": True}, "not a time above 0"),
+        ({"period": True}, "not a time of at least two samples"),
         ({"sensor_filter": "none"}, "'stock' or None"),
     ],
 )

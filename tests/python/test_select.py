@@ -19,8 +19,8 @@ from ftlm.selection.automatic import automatic
 from ftlm.selection.candidates import Change, Inside, Variant, named
 from ftlm.selection.glance import contenders
 from ftlm.selection.growth import Fitted, Work, _judged, duration, listed
-from ftlm.selection.result import _percent
-from ftlm.selection.select import _as_good
+from ftlm.selection.result import percent
+from ftlm.selection.select import _as_good, _ranked, _reason
 from ftlm.selection.trial import Folds, Trial, fit, judged, least_unseen, masked
 
 RICH = "D^2 y = d D^mu y + a y + b0 u + b1 D^gamma u"
@@ -429,10 +429,72 @@ def test_predictions_are_alike_where_folds_do_not_tell_them_apart():
     assert not _as_good(trial(-4.5380, -4.5058, bic=-6666.5), best)
 
 
+def stretches(name, fits, numbers=3):
+    """A candidate with these fits in percent on stretches of a run."""
+    return Trial(
+        name, ftlm.equation("D y = a y + b u"), numbers, bic=0.0,
+        validation={f"run {k}": {"y": fit} for k, fit in enumerate(fits)},
+        scores=tuple(math.log(1 - max(fit, -100.0) / 100) for fit in fits),
+    )  # fmt: skip
+
+
+def test_none_wins_that_fails_where_another_does_not():
+    """Three stretches in four do not make good what is lost on the fourth, and the reason says so."""
+    failing, steady = stretches("failing", (92, 92, 92, -3e7), 6), stretches("steady", (80, 80, 80, 60), 5)
+    assert failing.score < steady.score
+    assert _ranked([failing, steady]) == [steady, failing]
+    assert failing.least == -3e7
+    said = _reason(steady, steady, [steady, failing])
+    assert "steady (5 numbers, 75.00 % where unseen), which predicts best" in said
+    assert said.endswith(
+        "failing leaves 25 % less on the mean and is not chosen: it fails on y of run 3, with < -1000 % where the "
+        "chosen one has 60.00."
+    )
+    # It is none of the best with more numbers either.
+    assert "more (6)" not in said
+    # Where each fails somewhere the mean decides, and the reason tells where.
+    other = stretches("other", (-50, 80, 80, 60))
+    assert _ranked([other, failing]) == [failing, other]
+    assert "It fails on y of run 3, with < -1000 % where other has 60.00, which fails elsewhere." in _reason(
+        failing, failing, [failing, other]
+    )
+    # One that grows without bound fails nobody, nor do stretches that nobody predicts, of noise alone.
+    grown = replace(stretches("grown", (80, 80, 80, 60)), grows=True)
+    assert _ranked([grown, failing]) == [failing, grown]
+    quiet = [stretches("one", (90, 90, 90, -1)), stretches("two", (89, 89, 89, 3))]
+    assert _ranked(quiet) == quiet
+    # Candidates of other outputs have other parts.
+    apart = replace(steady, validation={"run 0": {"z": 80.0}}, scores=(math.log(0.2),))
+    assert _ranked([apart, failing]) == [failing, apart]
+
+
+def test_the_first_rows_of_a_run_in_motion_are_judged_with_its_own_initial_terms():
+    """Motion from before the start dies away within the block that is left out: its later rows tell nothing of it."""
+    rng, step, rows = np.random.default_rng(5), 0.02, 400
+    u = np.repeat(rng.choice([-1.0, 1.0], rows // 20), 20)
+    keep = math.exp(-4.0 * step)
+    y = signal.lfilter([0.0, 1.0 - keep], [1.0, -keep], u) + 2.0 * keep ** np.arange(rows)
+    run = ftlm.Run.from_arrays(
+        step=step, inputs={"u": u}, outputs={"y": y + 0.01 * rng.standard_normal(rows)}, name="lag"
+    )
+    structure, folds = ftlm.equation("D y = a y + b u"), Folds.of(run, "blocks")
+    joint = fit(folds.runs, structure, [])
+    assert joint.initial == "caputo"
+    found = judged("lag", structure, folds, joint)
+    # What it leaves over is the noise, on the first block as on the others.
+    assert found.least > 97.0
+    assert least_unseen(joint, folds) == -np.inf
+    # A whole run always is, and what is known of it at least stays known.
+    whole = Folds.of([run, run.slice(0, 4)], "runs")
+    assert least_unseen(fit(whole.runs, structure, []), whole) > -np.inf
+
+
 def test_the_page_and_the_figures(chosen, tmp_path):
     page = chosen.report(tmp_path / "choice.html").read_text("utf-8")
     assert "What each number is worth" in page
     assert "not told from 0" in page
+    # What is chosen is a dot on the line, not a line of one point that nobody sees.
+    assert "are not finite" not in page
     with pytest.raises(ftlm.DataError, match="exists"):
         chosen.report(tmp_path / "choice.html")
     data = json.loads(json.dumps(chosen.to_dict()))
@@ -440,6 +502,7 @@ def test_the_page_and_the_figures(chosen, tmp_path):
     assert len(data["candidates"]) == len(chosen.trials)
     frame = chosen.to_frame()
     assert list(frame["chosen"]).count(True) == 1
+    assert frame["least"].iloc[chosen.chosen] == min(f["y"] for f in chosen.winner.validation.values())
 
 
 def test_the_command(tmp_path):
@@ -470,6 +533,6 @@ def test_the_command(tmp_path):
 
 
 def test_a_fit_below_all_measure_keeps_its_column():
-    assert [_percent(v) for v in (99.123, -12.3, -1e15, -math.inf, math.nan)] == [
+    assert [percent(v) for v in (99.123, -12.3, -1e15, -math.inf, math.nan)] == [
         "99.12", "-12.30", "< -1000", "< -1000", "nan",
     ]  # fmt: skip

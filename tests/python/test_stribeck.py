@@ -273,7 +273,7 @@ def test_a_file_keeps_it(tmp_path) -> None:
     with pytest.raises(DataError, match="a speed is positive"):
         ftlm.load_model(path)
     path.write_text(text.replace('"schema": 7', '"schema": 8'))
-    with pytest.raises(DataError, match="reads up to 7"):
+    with pytest.raises(DataError, match="what it holds has schema 7"):
         ftlm.load_model(path)
 
 

@@ -217,6 +217,12 @@ def flexible_link(
     ------
     ModelError
         An argument that is not known, or not used by that form.
+
+    Notes
+    -----
+    Time is in seconds. Where gamma_1 may differ from mu_2 the law of coefficients ties numbers whose dimensions differ
+    by time to the power of gamma_1 - mu_2, the known -1 among them: it is another law for a run told in milliseconds.
+    Under ``"velocities"`` the unit does not matter.
     """
     if stage not in (1, 2, "both"):
         raise ModelError(f"stage = {stage!r} is not known; use 1, 2 or 'both'")

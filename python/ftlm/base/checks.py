@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import operator
 import os
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 
@@ -61,9 +62,12 @@ def whole_number(value: object) -> int | None:
 
 
 def check_seed(seed: object) -> int:
-    """Return the seed of random numbers as an int."""
-    number = whole_number(seed)
-    if number is None or number < 0:
+    """Return the seed of random numbers as an int: any integer, NumPy's too, and neither a truth value nor 3.0."""
+    try:
+        number = -1 if isinstance(seed, bool) else operator.index(seed)  # type: ignore[arg-type]
+    except TypeError:
+        number = -1
+    if number < 0:
         raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
     return number
 

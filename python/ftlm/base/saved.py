@@ -10,6 +10,7 @@ from typing import Generic, Protocol, TypeVar
 
 import msgspec
 
+from ftlm._core import __version__
 from ftlm.base.checks import shown, words_of
 from ftlm.base.errors import DataError
 
@@ -26,6 +27,14 @@ class Versioned(Protocol):
 T = TypeVar("T", bound=Versioned)
 
 
+class Head(msgspec.Struct):
+    """What every such file says of itself, whatever else a later version put into it."""
+
+    format: str
+    schema: int
+    written_by: str = ""
+
+
 @dataclass(frozen=True)
 class Saved(Generic[T]):
     """A kind of file.
@@ -38,6 +47,8 @@ class Saved(Generic[T]):
         What to give instead of another file.
     kind
         Its record.
+    latest
+        The last schema that this version reads.
     most
         Largest size that is read [bytes].
     """
@@ -45,6 +56,7 @@ class Saved(Generic[T]):
     what: str
     source: str
     kind: type[T]
+    latest: int
     most: int = 1 << 20
 
     def read(self, path: str | os.PathLike[str]) -> T:
@@ -53,7 +65,7 @@ class Saved(Generic[T]):
         Raises
         ------
         DataError
-            A file that cannot be read, is too large, or is none of this kind.
+            A file that cannot be read, is too large, is none of this kind, or is of a later version.
         """
         if not isinstance(path, (str, os.PathLike)):
             raise DataError(f"path = {shown(path)} is no path of a file; give {self.source}")
@@ -70,6 +82,7 @@ class Saved(Generic[T]):
         try:
             return msgspec.json.decode(content, type=self.kind)
         except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            self._check_later(file, content)
             raise DataError(f"{file} is no ftlm {self.what}: {words_of(error, LONGEST)}; give {self.source}") from error
 
     def _content(self, file: Path) -> bytes:
@@ -83,14 +96,33 @@ class Saved(Generic[T]):
             )
         return file.read_bytes()
 
-    @staticmethod
-    def check_schema(path: str | os.PathLike[str], read: Versioned, latest: int) -> None:
-        """Refuse what a later version wrote.
+    def _check_later(self, file: Path, content: bytes) -> None:
+        """Say of a file that cannot be read whether a later version can."""
+        try:
+            head = msgspec.json.decode(content, type=Head)
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            return
+        if head.format == f"ftlm-{self.what}" and head.schema > self.latest:
+            raise self._later(file, head.schema, head.written_by)
+
+    def _later(self, path: str | os.PathLike[str], schema: int, writer: str = "") -> DataError:
+        by = f", {shown(writer, LONGEST)}" if writer else ""
+        return DataError(
+            f"{path} is a {self.what} of a later version of ftlm{by}: it has schema {shown(schema)}, and this version, "
+            f"{__version__}, reads up to {self.latest}; upgrade ftlm"
+        )
+
+    def check_schema(self, path: str | os.PathLike[str], read: Versioned, of: int) -> None:
+        """Refuse what a later version wrote, and what says so and has nothing of it.
 
         Raises
         ------
         DataError
-            A schema beyond the latest that this version reads.
+            A schema beyond the latest that this version reads, or beyond that of what is in the file.
         """
-        if not 1 <= read.schema <= latest:
-            raise DataError(f"{path} has schema {read.schema}, this version reads up to {latest}; upgrade ftlm")
+        if read.schema > self.latest:
+            raise self._later(path, read.schema, getattr(read, "written_by", ""))
+        if not 1 <= read.schema <= of:
+            raise DataError(
+                f"{path} says that it has schema {read.schema}, and what it holds has schema {of}; give {self.source}"
+            )

@@ -134,7 +134,7 @@ class ControllerFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 #: A controller of thirty states has a few tens of kilobytes.
-CONTROLLER = Saved("controller", "a file that ftlm control wrote", ControllerFile)
+CONTROLLER = Saved("controller", "a file that ftlm control wrote", ControllerFile, SCHEMA)
 
 
 def save_controller(

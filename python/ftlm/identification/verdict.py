@@ -82,6 +82,8 @@ class Validation(Comparison):
     ----------
     output_error, equation_error, per_run, simulated, measured, step, m, initial, warnings, times, sampled, offsets
         See :class:`ftlm.Comparison`.
+    unequated
+        See there.
     verdict
         Whether to trust the model after this.
     """

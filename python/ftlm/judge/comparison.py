@@ -74,6 +74,8 @@ class Comparison:
         Unknown constants of the equations, one mapping a run: output -> ``"constant"`` [unit of D^alpha y] (and
         ``"ramp"``, that a second) -> value. Estimated anew on each run; empty for a model without an offset, and for
         an output whose run has a history beside it, which hides it.
+    unequated
+        Outputs without an equation error, by name, and why: it is not known where friction acts or samples are missing.
     """
 
     output_error: dict[str, Metrics]
@@ -88,6 +90,7 @@ class Comparison:
     times: list[Floats] = field(default_factory=list)
     sampled: bool = True
     offsets: tuple[dict[str, dict[str, float]], ...] = field(default=())
+    unequated: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def fit_percent(self) -> dict[str, float]:
@@ -127,15 +130,19 @@ class Comparison:
         lines = [f"{'output':<{max(width, 8)}}{'':<16}{'error':>12}{'RMSE':>12}{'NR':>10}{'fit %':>12}"]
         for name in self.output_error:
             both = (("equation error", self.equation_error[name]), ("output error", self.output_error[name]))
-            for label, f in both:
+            for label, f in both[1 if name in self.unequated else 0 :]:
                 lines.append(
                     f"{name:<{max(width, 8)}}{label:<16}{f.error:>12.5g}{f.rmse:>12.5g}{f.nr:>10.4g}{f.fit:>12.4g}"
                 )
         if self.sampled:
             count = max(sum(read(y).size for y in parts) for parts in self.measured.values())
-            lines.append(f"output error over {count} samples, equation error over {self.m} block pulses a run")
+            known = (
+                f", equation error over {self.m} block pulses a run" if set(self.measured) - set(self.unequated) else ""
+            )
+            lines.append(f"output error over {count} samples{known}")
         else:
             lines.append(f"over {self.m} block pulses a run")
+        lines += without_equation_error(self.unequated)
         lines += offsets_in_words(self)
         lines += [f"warning: {w}" for w in self.warnings]
         return "\n".join(lines)
@@ -144,6 +151,9 @@ class Comparison:
         return comparison_html(self)
 
 
+#: Why an output has no equation error.
+RUBBED = "friction acts on it, and the sign of a measured velocity is that of its noise, most of all at rest"
+UNREAD = "not every sample of it was read, and the straight lines between the others are no measurement"
 #: Of an offset beside a history.
 HIDDEN = "not told apart from what the run did before its start; begin the run at rest to learn it"
 
@@ -243,6 +253,11 @@ def _checked(model: Solved, runs: Run | Sequence[Run], m: int | None) -> tuple[R
     return several, m
 
 
+def without_equation_error(why: Mapping[str, str]) -> list[str]:
+    """Outputs that have no equation error, in words."""
+    return [f"{name} has no equation error: {reason}" for name, reason in why.items()]
+
+
 def offsets_of(model: Solved, initial: Mapping[str, Mapping[float, float]]) -> dict[str, dict[str, float]]:
     """Constants of the equations from the powers of t that they integrate to: c t^alpha / Gamma(alpha + 1).
 
@@ -314,12 +329,16 @@ def _comparison(
 ) -> Comparison:
     """All runs together."""
     equation_error, output_error = _figures(parts)
+    # The runs' own figures may be known where those of all of them are not.
+    rubbed = {e.output for e in model.equations if e.friction is not None}
+    unequated = {o: RUBBED if o in rubbed else UNREAD for o, f in equation_error.items() if f is UNKNOWN}
     return Comparison(
         output_error, equation_error, [(run.name, *_figures([p])) for run, p in zip(runs, parts, strict=True)],
         {o: [p.simulated[o] for p in parts] for o in model.outputs},
         {o: [p.measured[o] for p in parts] for o in model.outputs}, [p.step for p in parts], m,
         [p.initial for p in parts], tuple(near_identity(model.structure, equation_error, output_error)), times, sampled,
         tuple(offsets_of(model, p.initial) for p in parts) if model.structure.offset != "none" else (),
+        unequated,
     )  # fmt: skip
 
 
@@ -417,26 +436,42 @@ def errors_table(
     """
     rows: list[list[Cell]] = []
     headings: dict[int, str] = {}
+    unequated: dict[str, str] = {}
 
-    def add(heading: str, equation: Mapping[str, Metrics], output: Mapping[str, Metrics]) -> None:
+    def add(
+        heading: str, equation: Mapping[str, Metrics], output: Mapping[str, Metrics], without: Container[str]
+    ) -> None:
         headings[len(rows)] = heading
         for name in output:
             unit = (units or {}).get(name, "")
             label = symbol_html(name) + (Markup(" [{}]").format(unit) if unit else Markup(""))
-            rows.append([label, *astuple(equation[name]), *astuple(output[name])])
+            known = equation[name] is not UNKNOWN
+            rows.append(
+                [label, *(astuple(equation[name]) if known else [None] * len(_FIGURES)), *astuple(output[name])]
+            )
 
     for label, comparison in compared:
-        runs = comparison.per_run
+        runs, without = comparison.per_run, comparison.unequated
+        unequated |= without
         if len(runs) > 1:
-            add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error)
+            add(f"{label}: {len(runs)} runs together", comparison.equation_error, comparison.output_error, without)
         for name, equation, output in runs:
-            add(f"{label}: {name}", equation, output)
+            add(f"{label}: {name}", equation, output, without)
+    reasons = [f"{words}." for words in without_equation_error(unequated)]
+    own = 1 + len(_FIGURES)
+    if unequated and all(cell is None for row in rows for cell in row[1:own]):
+        # Four columns of nothing would push what is known off a narrow screen.
+        kept: list[list[Cell]] = [[row[0], *row[own:]] for row in rows]
+        single = (("", 1), ("output error (free run)", 4))
+        return Table(title, ("output", *_FIGURES), kept, groups=single, headings=headings, note=" ".join(reasons))
     note = (
         "The equation error uses the measured output on the right-hand side and flatters a model whose orders are "
         "close to one another; only the free run shows what the model knows."
     )
     groups = (("", 1), ("equation error", 4), ("output error (free run)", 4))
-    return Table(title, ("output", *_FIGURES, *_FIGURES), rows, groups=groups, headings=headings, note=note)
+    return Table(
+        title, ("output", *_FIGURES, *_FIGURES), rows, groups=groups, headings=headings, note=" ".join([note, *reasons])
+    )
 
 
 def filter_state(exponent: float) -> str:

@@ -211,7 +211,7 @@ class ModelFile(msgspec.Struct, forbid_unknown_fields=True):
 
 
 #: A model is a few kilobytes.
-MODEL = Saved("model", "a file written by save()", ModelFile)
+MODEL = Saved("model", "a file written by save()", ModelFile, FIT_SCHEMA)
 
 
 def schema_of(
@@ -239,8 +239,8 @@ def write_model(model: Solved, path: str | os.PathLike[str], *, force: bool) -> 
 def read_model(path: str | os.PathLike[str]) -> Solved:
     """Read the record of a model; the errors are those of :func:`ftlm.load_model`."""
     read = MODEL.read(path)
-    latest = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)
-    MODEL.check_schema(path, read, latest)
+    of = schema_of(read.equations, read.limits, read.offset, read.sensor_filter, read.estimate)
+    MODEL.check_schema(path, read, of)
     try:
         return read.solved()
     except ModelError as error:

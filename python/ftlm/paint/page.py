@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -138,11 +139,12 @@ class Page:
     lead: str
 
 
-class Reported:
+class Reported(ABC):
     """A result that is its own page."""
 
+    @abstractmethod
     def _page(self) -> Page:
-        raise NotImplementedError
+        """What its page says."""
 
     def report(self, path: str | os.PathLike[str], *, force: bool = False) -> Path:
         """Write the result as one HTML file that opens offline.

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.arrays import Floats
+from ftlm.base.checks import real_number, shown
 from ftlm.base.errors import DataError, ModelError
 from ftlm.files.load import column_names, load
 from ftlm.rig.rig import CURRENT_LIMIT, LONGEST
@@ -66,14 +67,15 @@ class Excitation:
         """
         rows = round(duration * rate) + 1
         t = np.arange(rows) / rate
-        if not (isinstance(self.ramp, (int, float)) and 0 <= self.ramp <= duration):
-            raise ModelError(f"ramp = {self.ramp!r} s is outside [0, {duration:g}] s, the length of the run")
+        ramp = finite(self.ramp)
+        if ramp is None or not 0 <= ramp <= duration:
+            raise ModelError(f"ramp = {shown(self.ramp)} s is outside [0, {duration:g}] s, the length of the run")
         if self.shape == "csv":
             currents = self._file(t)
         else:
             currents = self._shapes(t, rate, duration) * np.array(self._amplitudes())
-        if self.ramp > 0:
-            currents = currents * np.minimum(1.0, t / self.ramp)[:, None]
+        if ramp > 0:
+            currents = currents * np.minimum(1.0, t / ramp)[:, None]
         currents[-1] = 0.0
         for k, limit in enumerate(CURRENT_LIMIT):
             over = np.flatnonzero(np.abs(currents[:, k]) > limit * (1 + 1e-12))
@@ -86,23 +88,24 @@ class Excitation:
 
     def _amplitudes(self) -> tuple[float, float]:
         given = self.amplitude if isinstance(self.amplitude, (tuple, list)) else (self.amplitude, self.amplitude)
-        if len(given) != 2 or not all(isinstance(a, (int, float)) and math.isfinite(a) and a >= 0 for a in given):
-            raise ModelError(f"amplitude = {self.amplitude!r} is not a current in A, or a pair of them")
-        for k, (value, limit) in enumerate(zip(given, CURRENT_LIMIT, strict=True)):
+        pair = [a for a in map(finite, given) if a is not None and a >= 0]
+        if len(given) != 2 or len(pair) != 2:
+            raise ModelError(f"amplitude = {shown(self.amplitude)} is not a current in A, or a pair of them")
+        for k, (value, limit) in enumerate(zip(pair, CURRENT_LIMIT, strict=True)):
             if value > limit:
                 raise ModelError(
                     f"amplitude = {value:g} A of motor {k + 1} is over the limit of {limit:g} A; use a smaller one"
                 )
-        return float(given[0]), float(given[1])
+        return pair[0], pair[1]
 
     def _period(self, rate: float) -> float:
         usual = {"sine": 2 * math.pi / _SINE, "prbs": 0.1, "multisine": 10.0}.get(self.shape, 2.0)
-        period = usual if self.period is None else self.period
-        if not (isinstance(period, (int, float)) and math.isfinite(period) and period * rate >= 2):
-            raise ModelError(f"period = {self.period!r} s is not a time of at least two samples ({2 / rate:g} s)")
+        period = usual if self.period is None else finite(self.period)
+        if period is None or not period * rate >= 2:
+            raise ModelError(f"period = {shown(self.period)} s is not a time of at least two samples ({2 / rate:g} s)")
         if self.shape == "multisine" and period > LONGEST:
             raise ModelError(f"period = {period:g} s of a multisine is longer than the longest run, {LONGEST:g} s")
-        return float(period)
+        return period
 
     def _shapes(self, t: Floats, rate: float, duration: float) -> Floats:
         period = self._period(rate)
@@ -144,10 +147,12 @@ class Excitation:
 
     def _band(self, rate: float) -> tuple[float, float]:
         band = self.band
-        good = isinstance(band, (tuple, list)) and len(band) == 2 and all(isinstance(b, (int, float)) for b in band)
-        if not good or not 0 < band[0] < band[1] <= rate / 2:
-            raise ModelError(f"band = {band!r} Hz is not two rising frequencies up to half the rate, {rate / 2:g} Hz")
-        return float(band[0]), float(band[1])
+        ends = [b for b in map(finite, band) if b is not None] if isinstance(band, (tuple, list)) else []
+        if len(ends) != 2 or len(band) != 2 or not 0 < ends[0] < ends[1] <= rate / 2:
+            raise ModelError(
+                f"band = {shown(band)} Hz is not two rising frequencies up to half the rate, {rate / 2:g} Hz"
+            )
+        return ends[0], ends[1]
 
     def _file(self, t: Floats) -> Floats:
         if self.file is None:
@@ -167,4 +172,20 @@ class Excitation:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         told = asdict(self) | {"file": None if self.file is None else Path(self.file).name}
-        return {k: list(v) if isinstance(v, tuple) else v for k, v in told.items() if v is not None}
+        return {k: _plain(v) for k, v in told.items() if v is not None}
+
+
+def finite(value: object) -> float | None:
+    """A finite real number, NumPy's too, as a float; None for anything else, a truth value among it."""
+    try:
+        number = real_number("", value)
+    except ModelError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _plain(value: object) -> object:
+    """For JSON, which knows neither tuples nor NumPy's numbers."""
+    if isinstance(value, (tuple, list)):
+        return [_plain(v) for v in value]
+    return value.item() if isinstance(value, np.generic) else value

@@ -14,14 +14,14 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import check_choice, shown
+from ftlm.base.checks import check_choice, check_seed, shown
 from ftlm.base.errors import DataError, FtlmError, ModelError, RigFault
 from ftlm.base.output import RUN, check_free
 from ftlm.data.asked import Asked
 from ftlm.data.names import is_run_name
 from ftlm.data.run import Run, built
 from ftlm.fit.streaming import Streaming
-from ftlm.rig.excitation import INPUTS, Excitation
+from ftlm.rig.excitation import INPUTS, Excitation, finite
 from ftlm.rig.parameters import ArmParameters
 from ftlm.rig.quanser import QuanserBoard
 from ftlm.rig.recording import Partial, partial_of, saved, units_of
@@ -118,8 +118,9 @@ def record(
         Ctrl-C, SIGTERM, or what `progress` raised, after the way out and when what was recorded is in the file; its
         notes say what went wrong on the way out.
     """
+    seed = check_seed(seed)
+    duration, limit, rate = check_times(duration, limit, rate)
     excitation = Excitation(input, amplitude, period, band, ramp, seed, file)
-    check_times(duration, limit, rate, seed)
     commands = excitation.commands(rate, duration)
     asked = Experiment(
         rig, duration, limit, rate, seed, parameters, offset, paced, sensor_filter, watchdog, arm, card,
@@ -380,28 +381,21 @@ def _check_target(target: Path, *, force: bool) -> None:
         )
 
 
-def check_times(duration: float, limit: float, rate: float, seed: int) -> None:
-    """Refuse times, a rate or a seed that no run can have."""
-
-    def number(value: object) -> bool:
-        try:
-            return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-        except OverflowError:
-            return False
-
-    if not number(limit) or not 0 < limit <= LONGEST:
+def check_times(duration: float, limit: float, rate: float) -> tuple[float, float, float]:
+    """Times and a rate as floats; those that no run can have are refused."""
+    longest, length, samples = finite(limit), finite(duration), finite(rate)
+    if longest is None or not 0 < longest <= LONGEST:
         raise ModelError(f"limit = {shown(limit)} s is outside (0, {LONGEST:g}] s; give the longest time of a run")
-    if not number(duration) or duration <= 0:
+    if length is None or length <= 0:
         raise ModelError(f"duration = {shown(duration)} s is not a time above 0; give the length of the run")
-    if duration > limit:
-        way_out = "raise limit= (--limit)" if duration <= LONGEST else f"no run is longer than {LONGEST:g} s"
-        raise ModelError(f"duration = {duration:g} s is over the limit of {limit:g} s; {way_out}")
-    if not number(rate) or rate <= 0:
+    if length > longest:
+        way_out = "raise limit= (--limit)" if length <= LONGEST else f"no run is longer than {LONGEST:g} s"
+        raise ModelError(f"duration = {length:g} s is over the limit of {longest:g} s; {way_out}")
+    if samples is None or samples <= 0:
         raise ModelError(f"rate = {shown(rate)} Hz is not a positive number of samples per second")
-    if duration * rate < 2:
-        raise ModelError(f"duration = {duration:g} s holds fewer than three samples at {rate:g} Hz; make it longer")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ModelError(f"seed = {shown(seed)} is not a whole number from 0")
+    if length * samples < 2:
+        raise ModelError(f"duration = {length:g} s holds fewer than three samples at {samples:g} Hz; make it longer")
+    return length, longest, samples
 
 
 def _column_of(name: str) -> int:

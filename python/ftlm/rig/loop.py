@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ftlm.base.arrays import Floats
-from ftlm.base.checks import words_of
+from ftlm.base.checks import check_seed, words_of
 from ftlm.base.errors import DataError, ModelError
 from ftlm.data.run import Run
 from ftlm.fit.streaming import Streaming
@@ -95,9 +95,10 @@ def control(
     if duration is None:
         if given.ndim == 1:
             raise ModelError("a reference that is held needs duration= [s]; or give it as rows, one a sample")
-        check_times(LONGEST, LONGEST, rate, seed)
+        _, _, rate = check_times(LONGEST, LONGEST, rate)
         duration = (len(given) - 1) / rate
-    check_times(duration, limit, rate, seed)
+    duration, limit, rate = check_times(duration, limit, rate)
+    seed = check_seed(seed)
     told: dict[str, Any] = {"controller": _told(controller)}
 
     def loop(board: Board) -> Loop:

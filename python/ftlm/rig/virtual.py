@@ -12,6 +12,7 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
+from ftlm.base.checks import check_seed
 from ftlm.base.errors import RigFault
 from ftlm.rig import watchdog
 from ftlm.rig.fault import EXPIRED, check_rate, check_watchdog, unset
@@ -66,6 +67,7 @@ class VirtualBoard:
         self._seconds = 0.0
         self._beat = 0
         self._started = False
+        self.seed = check_seed(self.seed)
         self._random = np.random.default_rng(self.seed)
         self._rate = 0.0
 

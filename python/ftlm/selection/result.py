@@ -29,7 +29,8 @@ class Selection(Reported):
     Parameters
     ----------
     trials
-        Every candidate that was judged, by how well it predicts what it was not fitted to; failed ones last.
+        Every candidate that was judged, by how well it predicts what it was not fitted to; those that fail on a part of
+        it on which another one does not come after, those that cannot be fitted last.
     chosen
         Which of them was chosen.
     best
@@ -62,19 +63,27 @@ class Selection(Reported):
         for place, trial in enumerate(self.trials):
             mark = "chosen: " if place == self.chosen else ""
             if trial.failed is not None:
-                out.append([f"{trial.name}: {trial.failed}", trial.numbers, None, None, None, ""])
+                out.append([f"{trial.name}: {trial.failed}", trial.numbers, None, None, None, None, ""])
                 continue
             name = mark + trial.name + (GROWS if trial.grows else "")
-            out.append([name, trial.numbers, trial.seen, trial.unseen, trial.bic, ", ".join(trial.idle)])
+            out.append([name, trial.numbers, trial.seen, trial.unseen, trial.least, trial.bic, ", ".join(trial.idle)])
         return out
 
     def table(self) -> Table:
         """Candidates as a table of a page."""
-        columns = ("structure", "numbers", "fit where fitted %", "fit where unseen %", "BIC", "not told from 0")
+        columns = (
+            "structure",
+            "numbers",
+            "fit where fitted %",
+            "fit where unseen %",
+            "least %",
+            "BIC",
+            "not told from 0",
+        )
         return Table(
             "Candidates, best prediction first", columns, self._rows(), wrap=True,
-            note="Fits are means over runs and outputs. BIC counts as many samples as the colour of the best residuals "
-            "lets count.",
+            note="Fits are means over runs and outputs, the least is that of the worst run or block left out. BIC "
+            "counts as many samples as the colour of the best residuals lets count.",
         )  # fmt: skip
 
     def figure(self) -> Figure:
@@ -88,7 +97,7 @@ class Selection(Reported):
         chosen = [v if n == self.winner.numbers else math.nan for n, v in zip(along, unseen, strict=True)]
         return line_chart(
             [float(n) for n in along], [("where fitted", seen), ("where unseen", unseen), ("chosen", chosen)],
-            title="What each number is worth", x_label="numbers estimated", y_label="fit in %",
+            title="What each number is worth", x_label="numbers estimated", y_label="fit in %", dots=("chosen",),
             caption=f"The best candidate with each number of estimates; chosen is one with {self.winner.numbers}.",
         )  # fmt: skip
 
@@ -109,6 +118,7 @@ class Selection(Reported):
         rows = [
             {
                 "rank": k + 1, "structure": t.name, "numbers": t.numbers, "seen": t.seen, "unseen": t.unseen,
+                "least": t.least,
                 "score": t.score, "bic": math.nan if t.bic is None else t.bic, "chosen": k == self.chosen,
                 "failed": t.failed or "",
             }
@@ -140,23 +150,26 @@ class Selection(Reported):
 
     def __str__(self) -> str:
         lines = [f"{len(self.trials)} of {self.fitted} fitted candidates judged: {self.validation}"]
-        lines.append(f"{'':2}{'unseen %':>9}{'fitted %':>10}{'numbers':>9}  structure")
+        lines.append(f"{'':2}{'unseen %':>9}{'least %':>9}{'fitted %':>10}{'numbers':>9}  structure")
         for place, trial in enumerate(self.trials[:SHOWN]):
             mark = "> " if place == self.chosen else "  "
-            if trial.failed is not None:
-                lines.append(f"{mark}{'-':>9}{'-':>10}{trial.numbers:>9}  {trial.name}: {trial.failed}")
-            else:
-                told = trial.name + (GROWS if trial.grows else "")
-                lines.append(f"{mark}{_percent(trial.unseen):>9}{_percent(trial.seen):>10}{trial.numbers:>9}  {told}")
+            lines.append(mark + _row(trial))
         if self.chosen >= SHOWN:
-            trial = self.winner
-            lines.append(f"> {_percent(trial.unseen):>9}{_percent(trial.seen):>10}{trial.numbers:>9}  {trial.name}")
+            lines.append("> " + _row(self.winner))
         if len(self.trials) > SHOWN:
             lines.append(f"  … and {len(self.trials) - SHOWN} more")
         lines += [self.reason, *(f"warning: {w}" for w in self.warnings), "", str(self.best)]
         return "\n".join(lines)
 
 
-def _percent(fit: float) -> str:
+def _row(trial: Trial) -> str:
+    """A candidate in a line."""
+    if trial.failed is not None:
+        return f"{'-':>9}{'-':>9}{'-':>10}{trial.numbers:>9}  {trial.name}: {trial.failed}"
+    told = trial.name + (GROWS if trial.grows else "")
+    return f"{percent(trial.unseen):>9}{percent(trial.least):>9}{percent(trial.seen):>10}{trial.numbers:>9}  {told}"
+
+
+def percent(fit: float) -> str:
     """A fit as a table has it: how far below nothing one is that predicts nothing, nobody needs to know."""
     return f"{fit:.2f}" if not fit < HOPELESS else f"< {HOPELESS:.0f}"

@@ -18,7 +18,7 @@ from ftlm.identification.identify import identify
 from ftlm.selection.automatic import automatic
 from ftlm.selection.candidates import Inside, named, signature, worded
 from ftlm.selection.growth import MOST_ALIKE, SAME, Work, grown, listed
-from ftlm.selection.result import Selection
+from ftlm.selection.result import Selection, percent
 from ftlm.selection.store import Request, Store
 from ftlm.selection.trial import Folds, Trial, criterion, spread
 from ftlm.solve.records import prepare
@@ -29,6 +29,8 @@ ALIKE = 2.0
 STRONG = 10.0
 #: Folds from which on the scatter over them says something, and one-sided 95 % quantiles of Student's t from there on.
 FOLDS, STUDENT_95 = 3, (2.92, 2.35, 2.13, 2.02, 1.94, 1.89, 1.86, 1.83, 1.81)
+#: What one leaves over of a part that it fails on, as a score, if it is that much more than another leaves there.
+FAILS, OUTDONE = math.log(0.5), math.log(2.0)
 #: Candidates of a list beyond which somebody has made a mistake.
 MOST = 10_000
 
@@ -48,11 +50,12 @@ def select(
     a term, a free order, a delay, friction or an offset more at a time, each fitted by output error from the last
     optimum, the two most promising by Schwarz's criterion judged by free runs on what they were not fitted to (the
     second where what it leaves over on all runs lets it matter). Where two steps in a row predict no better, it is
-    pruned, one thing less at a time. A list is judged whole, from automatic starts. Chosen is, among those that predict
-    as well as the best (what is left over is within 1 %, or, up to 5 %, three or more folds do not tell the difference
-    from 0 at 95 %, or all samples are very strong evidence), the one with the least Schwarz criterion, samples counted
-    as the colour of the residuals lets them; of those alike in that the one with the fewest numbers, of the lowest
-    order, best where unseen.
+    pruned, one thing less at a time. A list is judged whole, from automatic starts. None is chosen that fails on a run
+    or a block (it leaves more than half of it, and twice what another one leaves) where one fails on fewer. Chosen is,
+    among those that predict as well as the best (what is left over is within 1 %, or, up to 5 %, three or more folds do
+    not tell the difference from 0 at 95 %, or all samples are very strong evidence), the one with the least Schwarz
+    criterion, samples counted as the colour of the residuals lets them; of those alike in that the one with the fewest
+    numbers, of the lowest order, best where unseen.
 
     Parameters
     ----------
@@ -153,11 +156,11 @@ def _chosen(work: Work, folds: Folds) -> Selection:
         key = signature(trial.structure)
         if key not in kept or trial.score < kept[key].score:
             kept[key] = trial
-    ranked = sorted(kept.values(), key=lambda t: (t.failed is not None, t.grows, t.score, t.numbers, t.name))
+    ranked = _ranked(list(kept.values()))
     scatter = min(spread(t.joint) for t in there if t.joint is not None)
     ranked = [t if t.joint is None else replace(t, bic=criterion(t.joint, t.numbers, scatter)) for t in ranked]
     best = ranked[0]
-    near = [k for k, t in enumerate(ranked) if t.failed is None and t.grows == best.grows and _as_good(t, best)]
+    near = [k for k in _peers(ranked) if _as_good(ranked[k], best)]
     # What the grid leaves is a fraction of an order, and to a criterion of thousands of samples a fraction counts.
     for k, trial in zip(near, work.quietly(work.refined, [ranked[k] for k in near]), strict=True):
         ranked[k] = trial
@@ -175,12 +178,42 @@ def _chosen(work: Work, folds: Folds) -> Selection:
             )
     if winner.unseen < 50.0:
         warnings.append(
-            f"the best candidate predicts unseen runs with {winner.unseen:.3g} %: none of them is the machine"
+            f"the best candidate predicts unseen runs with {percent(winner.unseen)} %: none of them is the machine"
         )
+    worse = [f"{name} ({percent(fit)} %)" for name, fit in winner.parts.items() if not fit > 0.0]
+    if worse:
+        warnings.append(f"the chosen structure predicts worse than the mean of what was left out on {', '.join(worse)}")
     return Selection(
         tuple(ranked), ranked.index(winner), found, folds.words, _reason(winner, best, ranked), work.done,
         tuple(warnings),
     )  # fmt: skip
+
+
+def _failures(every: Sequence[Trial]) -> list[list[str]]:
+    """Parts that each predicts badly and another one, that does not grow, leaves far less of."""
+    left = [dict(zip(t.parts, t.scores, strict=False)) for t in every]
+    least: dict[str, float] = {}
+    for scores in (part for part, t in zip(left, every, strict=True) if not t.grows):
+        for name, score in scores.items():
+            least[name] = min(score, least.get(name, math.inf))
+    return [[n for n, v in s.items() if v > FAILS and v > least.get(n, math.inf) + OUTDONE] for s in left]
+
+
+def _ranked(every: Sequence[Trial]) -> list[Trial]:
+    """The best first: what fails nowhere, then by what is left over on the mean.
+
+    A mean of logarithms makes good on three blocks what is lost on the fourth, and a user cannot.
+    """
+    failures = dict(zip(map(id, every), map(len, _failures(every)), strict=True))
+    return sorted(every, key=lambda t: (t.failed is not None, t.grows, failures[id(t)], t.score, t.numbers, t.name))
+
+
+def _peers(ranked: Sequence[Trial]) -> list[int]:
+    """Places of those that grow, and fail, no more than the best does."""
+    best, failures = ranked[0], [len(f) for f in _failures(ranked)]
+    return [
+        k for k, t in enumerate(ranked) if t.failed is None and t.grows == best.grows and failures[k] <= failures[0]
+    ]
 
 
 def _as_good(trial: Trial, best: Trial) -> bool:
@@ -230,7 +263,8 @@ def _as_judged(trial: Trial, folds: Folds) -> Structure:
 
 def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
     """Why the winner is the winner."""
-    lead = f"Chosen: {winner.name} ({winner.numbers} numbers, {winner.unseen:.4g} % where unseen)"
+    lead = f"Chosen: {winner.name} ({winner.numbers} numbers, {percent(winner.unseen)} % where unseen)"
+    peers = [ranked[k] for k in _peers(ranked)]
     if winner is best:
         lead += ", which predicts best"
     else:
@@ -241,8 +275,8 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
             + " and has the least Schwarz criterion of those that predict alike"
         )
     for word, others in (
-        ("fewer", [t for t in ranked if t.failed is None and t.grows == winner.grows and t.numbers < winner.numbers]),
-        ("more", [t for t in ranked if t.failed is None and t.grows == winner.grows and t.numbers > winner.numbers]),
+        ("fewer", [t for t in peers if t.numbers < winner.numbers]),
+        ("more", [t for t in peers if t.numbers > winner.numbers]),
     ):
         if others:
             near = min(others, key=lambda t: t.score)
@@ -250,4 +284,25 @@ def _reason(winner: Trial, best: Trial, ranked: Sequence[Trial]) -> str:
             lead += (
                 f"; the best with {word} ({near.numbers}) leaves {abs(share):.3g} % {'more' if share >= 0 else 'less'}"
             )
-    return lead + "."
+    return lead + "." + _failing(winner, ranked)
+
+
+def _failing(winner: Trial, ranked: Sequence[Trial]) -> str:
+    """Which candidate predicts better on the mean and fails somewhere, and where the winner itself does, in words."""
+    failures = dict(zip(map(id, ranked), _failures(ranked), strict=True))
+    told = ""
+    ahead = [t for t in ranked if failures[id(t)] and t.score < winner.score and t.grows == winner.grows]
+    if ahead:
+        other = min(ahead, key=lambda t: t.score)
+        name, share = failures[id(other)][0], 100 * (1 - math.exp(other.score - winner.score))
+        told += (
+            f" {other.name} leaves {share:.2g} % less on the mean and is not chosen: it fails on {name}, with "
+            f"{percent(other.parts[name])} % where the chosen one has {percent(winner.parts[name])}."
+        )
+    for name in failures[id(winner)]:
+        other = max((t for t in ranked if name in t.parts and not t.grows), key=lambda t: t.parts[name])
+        told += (
+            f" It fails on {name}, with {percent(winner.parts[name])} % where {other.name} has "
+            f"{percent(other.parts[name])}, which fails elsewhere."
+        )
+    return told

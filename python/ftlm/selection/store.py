@@ -32,7 +32,7 @@ from ftlm.selection.trial import Trial
 
 Made = TypeVar("Made")
 #: Number of how a candidate is fitted and judged; answers of different ones must not be joined.
-ALGORITHM = 2
+ALGORITHM = 3
 #: Errors that a candidate may end with; any other is none of its own.
 End: TypeAlias = Literal["ConvergenceError", "DataError", "ModelError"]
 ENDS: dict[End, type[FtlmError]] = {

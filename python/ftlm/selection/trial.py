@@ -54,11 +54,16 @@ class Fold:
         return tuple(masked(r, outputs, self.rows) if r is self.judged else r for r in self.runs)
 
     def fit_percent(self, model: Model) -> dict[str, float]:
-        """Free run of a model on what was left out, in percent by output; from what was seen, where that begins."""
+        """Free run of a model on what was left out, in percent by output; from what was seen, where that begins.
+
+        Of a run in motion at its start the first rows are judged with its own initial terms, as a whole run is.
+        """
         outputs = model.outputs
         if self.rows is None:
             return dict(compare(model, self.judged).fit_percent)
-        before = compare(model, masked(self.judged, outputs, self.rows))
+        # Later rows tell nothing of motion from before the start that has died away by then.
+        moving = self.rows[0] == 0 and model.structure.initial != "rest"
+        before = compare(model, self.judged if moving else masked(self.judged, outputs, self.rows))
         answer = simulate(model, self.judged, tolerance=TOLERANCE, initial=before.initial[0])
         out = {}
         for name in outputs:
@@ -217,6 +222,16 @@ class Trial:
         return float(np.mean(fits)) if fits else math.nan
 
     @property
+    def parts(self) -> dict[str, float]:
+        """Fit in percent on each part that was left out, in words, one after another as scores are."""
+        return {f"{output} of {name}": fit for name, part in self.validation.items() for output, fit in part.items()}
+
+    @property
+    def least(self) -> float:
+        """The least fit in percent on what it was not fitted to."""
+        return min(self.parts.values(), default=math.nan)
+
+    @property
     def looseness(self) -> float:
         """Mean logarithm of the relative standard errors of its numbers; lower is better told."""
         relative = [self.errors.get(n, math.inf) / max(abs(v), 1e-12) for n, v in self.values.items()]
@@ -327,6 +342,9 @@ def least_unseen(joint: JointFit, folds: Folds) -> float:
         if place is None:
             return -math.inf
         first, last = fold.rows or (0, fold.judged.length)
+        if fold.rows is not None and first == 0 and joint.initial != "rest":
+            # Judged with initial terms that all rows tell of, which may leave less there.
+            return -math.inf
         for output, residuals in joint.residuals[place].items():
             if residuals.size != fold.judged.length - 2:
                 return -math.inf
