@@ -73,13 +73,21 @@ impl Kernel {
     #[must_use]
     pub fn with_length(series: &[f64], total: usize) -> Self {
         let plan = fft::plan(fft::fast_length(total));
+        spare(plan.len(), |buffers| Self::planned(plan.clone(), series, buffers))
+    }
+
+    /// [`Kernel::new`] in memory that the caller has at hand.
+    #[must_use]
+    pub(crate) fn made_with(series: &[f64], buffers: &mut Buffers) -> Self {
+        Self::planned(fft::plan(fft::fast_length(2 * series.len())), series, buffers)
+    }
+
+    fn planned(plan: Plan, series: &[f64], Buffers { time, workspace, .. }: &mut Buffers) -> Self {
         let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-        spare(plan.len(), |Buffers { time, workspace, .. }| {
-            time.clear();
-            time.extend_from_slice(series);
-            time.resize(plan.len(), 0.0);
-            plan.forward(time, &mut spectrum, workspace);
-        });
+        time.clear();
+        time.extend_from_slice(series);
+        time.resize(plan.len(), 0.0);
+        plan.forward(time, &mut spectrum, workspace);
         Self { plan, spectrum }
     }
 

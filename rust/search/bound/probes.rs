@@ -44,17 +44,16 @@ impl Probes {
                 Norm::L2 => squares.sum::<f64>().sqrt(),
             }
         };
-        let sizes: Vec<f64> = vectors.iter().map(|[a, b]| dual(&[a, b])).collect();
+        let sizes: Vec<f64> = abreast::map(vectors.iter().collect(), || (), |(), [a, b]| dual(&[a, b]));
 
         let mut columns: Vec<&[f64]> = (0..bank.len()).map(|p| bank.column(p)).collect();
         columns.push(target);
         let flat: Vec<&[f64]> = vectors.iter().flatten().map(Vec::as_slice).collect();
-        let inner = dense::inner_products(&columns, &flat);
+        let (inner, halves) = (dense::inner_products(&columns, &flat), flat.len());
         let gathered = |p: usize| -> Vec<[Wide; 2]> {
             (0..groups)
                 .map(|g| {
-                    let part =
-                        |half: usize| std::array::from_fn(|n| inner[p * flat.len() + 2 * (g * WIDTH + n) + half]);
+                    let part = |half: usize| std::array::from_fn(|n| inner[p * halves + 2 * (g * WIDTH + n) + half]);
                     [part(0), part(1)]
                 })
                 .collect()
@@ -73,7 +72,7 @@ impl Probes {
             || (),
             |(), p| unit * (sum(bank.column(p)) + sum(bank.kernel(p)) * size_of_target),
         );
-        let effects = effects(bank, &own, &vectors, &sizes, norm, unit);
+        let effects = effects(bank, &own, vectors, &sizes, norm, unit);
         let size = (0..groups).map(|g| std::array::from_fn(|n| sizes[g * WIDTH + n])).collect();
         Self {
             groups,
