@@ -14,7 +14,7 @@ from ftlm.errors import ModelError
 from ftlm.fit import joint
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.race import PIONEERS, Laps, distinct, finalists, fine_enough, in_reach, is_rich, same_place
+from ftlm.fit.race import PIONEERS, Laps, distinct, finalists, fine_enough, in_reach, is_rich, same_place, stirred
 from ftlm.fit.simpler import simpler, unlike
 from plants import resonant_plant
 
@@ -137,6 +137,19 @@ def test_where_no_start_has_a_scheme_the_step_is_halved_until_one_has() -> None:
 
     grid, going = fine_enough(staged(1), STARTS, Told(5, 1, None, ends))
     assert (grid.every, len(going)) == (4, 5)
+
+
+def test_of_those_far_behind_who_still_falls_goes_on(grid: Grid) -> None:
+    # One at rest in its valley, one on its way down, one too far behind to be asked.
+    best = grid.descend(Attempt([], [1.5, 1.5], "best", {}), 60)
+    falls = grid.evaluated(Attempt([], [40.0, 1.0], "falls", {}))
+    far = grid.evaluated(Attempt([], [1e3, 1e5], "far", {}))
+    moving, still = stirred(grid, [best, falls, far], 2.0 * falls.level, Laps(3, 1, None))
+    assert [a.origin for a in moving] == ["falls"]
+    assert moving[0].level < 0.9 * falls.level
+    assert [a.origin for a in still] == ["far", "best"]
+    # Those that stay are as they were.
+    assert still == [far, best]
 
 
 # ----------------------------------------------------------------------------------------------------------------------

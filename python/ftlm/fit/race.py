@@ -36,8 +36,10 @@ GLANCE = 2
 MOVED = 0.1
 #: Behind the first, a start goes on while a lap lowers its cost by this share: what has come to rest overtakes nobody.
 ON_THE_WAY = 0.05
-#: All get as many as those ahead where the best is above the noise by this factor.
-ABOVE_FLOOR = 2.0
+#: All get as many as those ahead where the best is above the noise by this factor; of those further behind than
+#: contenders are, by no more than the second factor, who falls by a share in a few evaluations.
+ABOVE_FLOOR, FAR_BEHIND = 2.0, 100.0
+STIR, STIRS = 5, 0.1
 #: Coarse fits that continue on all samples.
 FINALISTS = 3
 #: ... unless their coarse cost exceeds the best one's by this factor; on few samples nobody as far behind goes on.
@@ -163,6 +165,8 @@ def without_history(
     if reached and reached[0].level > ABOVE_FLOOR * floor:
         # Noise alone would leave less: those behind may yet be on the way to where it does.
         rest = on_the_way(coarse, rest, laps)
+        stirring, lost = stirred(coarse, lost, FAR_BEHIND * contenders[0].level, laps)
+        rest += on_the_way(coarse, stirring, laps)
     reached = coarse.finer.ranked(reached + rest) + lost
     if progress is not None:
         progress(len(starts), len(starts))
@@ -259,6 +263,21 @@ def on_the_way(coarse: Grid, behind: Sequence[Attempt], laps: Laps) -> list[Atte
                 (further if at.level < (1.0 - ON_THE_WAY) * attempt.level else ended).append(at)
         going = further
     return ended + going
+
+
+def stirred(
+    coarse: Grid, lost: Sequence[Attempt], farthest: float, laps: Laps
+) -> tuple[list[Attempt], list[Attempt]]:  # fmt: skip
+    """Where those no further behind are after a few evaluations that lower their cost by a share; and the others."""
+    near = [a for a in lost if a.level <= farthest]
+    moving: list[Attempt] = []
+    still = [a for a in lost if a.level > farthest]
+    for attempt, at in zip(near, laps.each(coarse, near, STIR), strict=True):
+        if at is not None and at.level < (1.0 - STIRS) * attempt.level:
+            moving.append(at)
+        else:
+            still.append(attempt)
+    return moving, still
 
 
 def without_vanished(problem: FreeProblem, start: Attempt, ended: Attempt) -> Attempt:
