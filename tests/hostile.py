@@ -160,7 +160,12 @@ class Sound:
     def record(self, m=None, sensor=True):
         m, step = m or self.m(), self.step()
         series = self.sensor(m, step) if sensor and self.random.random() < 0.2 else None
-        return step, self.normal((3, m)), series
+        if self.random.random() < 0.7:
+            return step, self.normal((3, m)), series
+        # In motion: whose sensors held something, where signals began, answers of the filter.
+        answers = self.normal((self.one(1, 2), m)) if series is not None and self.random.random() < 0.5 else None
+        begun = [self.one(True, False) for _ in range(3)], [self.number(-2.0, 2.0) for _ in range(3)], answers
+        return step, self.normal((3, m)), series, begun
 
     def runs(self):
         return [self.record() for _ in range(self.one(1, 1, 2))]
@@ -203,7 +208,7 @@ class Sound:
     def instrumental_variables(self):
         structures = [self.structure(0), self.structure(1)]
         fixed = [[None] * len(s[2]) for s in structures]
-        runs = [(step, means, None) for step, means, _ in self.runs()]
+        runs = [(*run[:2], None) for run in self.runs()]
         return runs, structures, list(self.INPUTS), fixed, self.terms(), self.one(1, 4), 1e-4
 
     def experiments(self, own=False):
@@ -356,13 +361,20 @@ class Sound:
 
     def asked(self):
         """What the search of one equation takes."""
-        runs = [(step, means, None) for step, means, _ in self.runs()]
+        runs = [(*run[:2], None) for run in self.runs()]
         return runs, self.orders(), list(self.INPUTS), [None, None], self.terms(), self.settings()
 
     def search(self):
         return *self.asked(), self.progress()
 
     order_search_new = asked
+
+    def certify(self):
+        low = self.number(0.6, 1.2)
+        alpha = low, self.one(low, low + 0.3)
+        terms = [(0, 0.0, self.number(0.0, low)), (2, 0.0, self.one(0.0, 0.4))]
+        asked = self.number(0.01, 0.9), self.one(5.0, 100.0), self.one(10, 500, 3000), self.one(1, 2), 1 << 28
+        return [self.record(sensor=False)], (0, alpha, terms, self.one(0.05, 0.2)), asked, self.progress()
 
     def portable(self):
         return (self.one(True, False),)
@@ -394,7 +406,7 @@ class Sound:
         weights = [(1.0, 0.0), (0.0, 1.0)]
         laws = [(output, (0.0, [1.0, 0.0]), [(output, (0.0, list(weights[1]))), (2, (0.0, [0.0, 0.0]))])
                 for output in (0, 1)]  # fmt: skip
-        runs = [(step, means, None) for step, means, _ in self.runs()]
+        runs = [(*run[:2], None) for run in self.runs()]
         axes = [[1.05, 1.4, 1.8], [0.0, 0.4, 0.8]]
         return (
             runs, axes, laws, list(self.INPUTS), [[None, None]] * 2, [1.0, 2.0], self.terms(), self.settings()
