@@ -68,8 +68,9 @@ _Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
 _Matrix: TypeAlias = np.ndarray[tuple[int, int], np.dtype[np.float64]]
 _Floats: TypeAlias = NDArray[np.float64]
 
-#: (step [s], signals as rows, series of the sensor filter or None)
+#: (which signals' sensors may have held something, where each signal began, answers of the filter to impulses as rows)
 _Begun: TypeAlias = tuple[Sequence[bool], Sequence[float], _Floats | None]
+#: (step [s], signals as rows, series of the sensor filter or None[, how a run in motion begins])
 _Record: TypeAlias = tuple[float, _Floats, _Floats | None] | tuple[float, _Floats, _Floats | None, _Begun]
 #: (output, alpha, [(signal, order), ...]); signals by row of the record
 _Structure: TypeAlias = tuple[int, float, Sequence[tuple[int, float]]]

@@ -192,6 +192,25 @@ def test_what_a_filter_held_is_told_from_what_came_in():
     np.testing.assert_allclose(left - answer - noise, 0.0, atol=5e-3)
 
 
+@pytest.mark.parametrize("frequency", [1e-9, 1e-3, 1e2, 1e4, 1e8, 1e40, 1e120])
+def test_filters_of_any_speed_leave_numbers(frequency):
+    t = np.arange(300) * 0.01
+    low_pass = ftlm.SensorFilter.low_pass(("v",), frequency=frequency)
+    words = ftlm.equation("D^1.5 y = a y + p D^2 v", sensor_filter=low_pass, initial="caputo")
+    run = ftlm.Run.from_arrays(step=0.01, inputs={}, outputs={"v": np.cos(t) + 2.0, "y": np.sin(t)})
+    left, found = without_held(run, words)["v"], answers(low_pass, 2, 100, 0.01)
+    assert np.abs(left).max() < 3.1
+    if frequency > 1e5:
+        # What it held is gone before the second sample.
+        np.testing.assert_array_equal(left, run["v"])
+        assert found is None
+    else:
+        # All of an impulse comes out in the end, and no more.
+        assert found is not None
+        assert np.sum(found[0]) * 0.01 <= 1.2
+        assert np.abs(found[0]).max() <= 101.0
+
+
 def test_a_filters_answers_to_impulses_are_those_of_its_states():
     sensor_filter = ftlm.SensorFilter(("v",), ((6.0, 0.0),), ((2.0, 3.0), (5.0, 2.0), (7.0, 1.0), (3.0, 0.0)))
     m, step, fine = 40, 0.05, 20

@@ -23,6 +23,8 @@ from ftlm.solve.motion import decided
 #: what came in is as good as a level and a slope; and over so many samples a number at least.
 SHOWN = 1.0
 SAMPLES = 2
+#: A filter whose fastest pole turns so often in a sample interval has forgotten what it held before anybody sees it.
+FORGOTTEN = 1e3
 #: Answers of a filter that are kept: those of the grids at hand.
 KEPT = 4
 
@@ -31,13 +33,13 @@ def without_held(run: Run, structure: Structure, name: str | None = None) -> Run
     """Return the run less the filter's free motion in its signals, or in one, that drive behind it.
 
     From rest the filter held nothing. Left as they are: outputs that drive no other equation, held or delayed commands,
-    and filters whose free motions are more than answers to impulses.
+    and filters whose free motions are more than answers to impulses or gone before the second sample.
     """
     sensor = structure.sensor_filter
     if sensor is None or not structure.behind_filter:
         return run
     names = [n for n in ([name] if name else structure.signals) if n in run and _drives(run, structure, n)]
-    if not names or not sensor.holds_answers:
+    if not names or not sensor.holds_answers or _fastest(sensor) * run.step > FORGOTTEN:
         return run
     states = structure.filter_states(decided(run, structure))
     if not states:
@@ -63,7 +65,7 @@ def _held(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Fl
     """The free motion of the filter at the samples of a signal: the first one is all free motion."""
     system, gain = _states(sensor)
     size = system.shape[0]
-    fastest = float(np.max(np.abs(np.linalg.eigvals(system)), initial=0.0))
+    fastest = _fastest(sensor)
     shown = round(SHOWN / (fastest * step)) if fastest > 0 else 0
     count = min(max(shown, SAMPLES * (states + 2)), samples.size)
     # A level and a slope that come in are two states more, which nothing moves but the slope the level.
@@ -85,11 +87,12 @@ def _held(samples: Floats, step: float, sensor: SensorFilter, states: int) -> Fl
 
 @lru_cache(maxsize=KEPT)
 def answers(sensor: SensorFilter, states: int, m: int, step: float) -> Floats | None:
-    """Pulse means of a filter's answers to an impulse and to derivatives of one, shape (states, m); None with zeros.
+    """Pulse means of a filter's answers to an impulse and to derivatives of one, shape (states, m).
 
-    Pulses would have an impulse last for one of them, and its derivative for two.
+    Pulses would have an impulse last for one of them, and its derivative for two. None of a filter with zeros, or that
+    forgets within a pulse.
     """
-    if not sensor.holds_answers or not states:
+    if not sensor.holds_answers or not states or _fastest(sensor) * step > FORGOTTEN:
         return None
     system, gain = _states(sensor)
     size = system.shape[0]
@@ -116,6 +119,11 @@ def _states(sensor: SensorFilter) -> tuple[Floats, float]:
     system = np.diag(np.ones(size - 1), 1)
     system[-1] = [-powers.get(k, 0.0) / powers[size] for k in range(size)]
     return system, sum(c for c, _ in sensor.numerator) / powers[size]
+
+
+def _fastest(sensor: SensorFilter) -> float:
+    """How fast the fastest pole of a filter without zeros is [rad/s]."""
+    return float(np.max(np.abs(np.linalg.eigvals(_states(sensor)[0])), initial=0.0))
 
 
 def _motions(system: Floats, begun: Floats, count: int, state: int) -> Floats:
