@@ -7,7 +7,6 @@ import pytest
 from scipy.signal import lsim
 
 import ftlm
-from ftlm.base.statistics import triangle
 from ftlm.solve.limit import Limit, extrapolated
 from ftlm.solve.refined import refined
 from ftlm.solve.sampled import FIRST_REFINEMENT, sampled
@@ -26,8 +25,8 @@ def told(samples: list[np.ndarray]) -> tuple[np.ndarray, float]:
     limit = Limit()
     for each in samples:
         limit.add(each)
-    column, change = limit.best
-    return limit.rows[-1][column], float(np.max(change))
+    found = limit.told()
+    return found.samples, float(np.max(found.change))
 
 
 def test_three_powers_of_the_step_are_taken_away():
@@ -38,13 +37,58 @@ def test_three_powers_of_the_step_are_taken_away():
     np.testing.assert_allclose(extrapolated(*[grids((2,), 2)[1], [grids((2,), 2)[0]]])[1], TRUTH, atol=1e-14)
 
 
-@pytest.mark.parametrize("powers", [(2, 3, 4), (2, 2.4), (1.5,), (1,), (2, 3, 3.5), (0.5,)])
+@pytest.mark.parametrize(
+    "powers", [(2, 3, 4), (2, 2.4), (1.5,), (1,), (2, 3, 3.5), (0.5,), (2.1, 2.4, 3), (1.3, 2), (2, 2.05)]
+)
 def test_the_change_bounds_the_error_whatever_its_powers(powers):
     # A kink leaves powers between those that are taken away.
     for count in range(3, 9):
         found, change = told(grids(powers, count))
         error = float(np.max(np.abs(found - TRUTH)) / np.max(np.abs(found)))
         assert error <= 2.5 * change + 1e-14
+
+
+def test_a_power_that_no_column_has_is_told_by_four_grids():
+    # The factor by which its error shrinks is the last two moves'; a fourth grid says whether it is one.
+    found, change = told(grids((1.37,), 4))
+    np.testing.assert_allclose(found, TRUTH, atol=1e-12)
+    assert change < 1e-12
+
+
+def test_a_logarithm_of_the_step_takes_fewer_grids():
+    # Orders that meet leave h^2 ln h, which the next power of the triangle does not take away.
+    samples = [TRUTH + SHAPES[0] * h**2 * (1.0 - np.log(h)) for h in 0.5 ** np.arange(2, 9)]
+    every = [told(samples[: count + 1]) for count in range(2, 7)]
+    for found, change in every:
+        assert np.max(np.abs(found - TRUTH)) / np.max(np.abs(found)) <= 2.5 * change
+    assert [change < 1e-6 for _, change in every].index(True) == 2
+    rows: list[np.ndarray] = []
+    moved = []
+    for each in samples:
+        rows, before = extrapolated(each, rows), rows
+        moved.append([float(np.max(np.abs(a - b))) for a, b in zip(rows[1:], before[1:], strict=False)])
+    # Not even the finest of these grids was enough for the triangle.
+    assert min(moved[5]) > 1e-6
+
+
+def test_numbers_beside_samples_go_where_these_go():
+    # Two outputs of different powers, and a number of each that is one of its samples.
+    samples = [np.concatenate([a, b]) for a, b in zip(grids((1.37,), 4), grids((1.8,), 4), strict=True)]
+    limit = Limit()
+    for each in samples:
+        limit.add(each, each[[1, 0, 0], [5, 3, 4]])
+    found = limit.told((1, 0, 0))
+    np.testing.assert_allclose(found.beside, TRUTH[0, [5, 3, 4]], atol=1e-12)
+    np.testing.assert_array_equal(found.beside, found.samples[[1, 0, 0], [5, 3, 4]])
+
+
+def test_one_sample_that_moves_tells_no_factor():
+    # Its moves are in a ratio whatever they are: here the same one twice, and then not.
+    wild = [np.zeros((1, 50)) for _ in range(4)]
+    for each, value in zip(wild, (1.0, 0.7, 0.55, 0.475), strict=True):
+        each[0, 7] = value
+        each[0, 8] = 1.0
+    assert told(wild)[1] > 0.02
 
 
 def test_two_grids_tell_no_change_and_three_do():
@@ -115,12 +159,3 @@ def test_a_filtered_signal_with_corners_feeds_through_as_it_was_read():
     found = refined(ftlm.Model(structure), run, {}, tolerance=1e-7)
     assert np.max(np.abs(found.outputs[0] - exact)) <= 1e-6 * np.max(np.abs(exact))
     assert found.refinement <= 32
-
-
-def test_rows_are_turned_into_a_triangle():
-    rng = np.random.default_rng(1)
-    parts = [[rng.standard_normal(rows) for _ in range(5)] for rows in (2300, 7)]
-    table = np.concatenate([np.stack(p, axis=1) for p in parts])
-    found = triangle(parts)
-    assert found.shape == (5, 5)
-    np.testing.assert_allclose(found.T @ found, table.T @ table, rtol=1e-12, atol=1e-9)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ftlm.base.arrays import Floats
 
@@ -16,11 +17,34 @@ POWERS = (2, 3, 4)
 #: A column is taken for the power that it still has where halving the step divided what it moves by this share of that
 #: power's factor at least.
 SEEN = 0.5
+#: Where no power is known, halving the step divided what moves by this factor at least (by the root of two, and a
+#: little less), in as many samples as if so many alone moved: one number is told by theirs.
+LEAST_RATIO, FEW = 1.4, 8.0
 
 
 def _moved(new: Floats, old: Floats) -> Floats:
     moved, size = np.max(np.abs(new - old), axis=1), np.max(np.abs(new), axis=1)
     return np.asarray(np.where(moved == 0.0, 0.0, moved / size))
+
+
+@dataclass(frozen=True)
+class Told:
+    """What grids tell of the limit.
+
+    Parameters
+    ----------
+    samples
+        The samples there.
+    change
+        By which share of its largest value another halving would move each output; infinite before there were three
+        grids.
+    beside
+        The numbers beside the samples there.
+    """
+
+    samples: Floats
+    change: Floats
+    beside: Floats
 
 
 @dataclass
@@ -31,18 +55,25 @@ class Limit:
     ----------
     rows
         Of the last grids, finest last: the samples, and those with one power of the step after another taken away.
+    beside
+        The same of numbers beside them, such as initial terms that were fitted on each grid.
     moved
         By which share of its largest value halving the step moved each output in each of these columns, for the last
         two halvings; infinite for the samples themselves.
+    shares
+        By which share of its last move each output of a column moves yet, on the last two grids; see
+        :func:`still_to_go`.
     measure
         That share, of samples on a grid and on the one before.
     """
 
     rows: list[list[Floats]] = field(default_factory=list)
+    beside: list[list[Floats]] = field(default_factory=list)
     moved: list[list[Floats]] = field(default_factory=list)
+    shares: list[list[Floats | None]] = field(default_factory=list)
     measure: Callable[[Floats, Floats], Floats] = _moved
 
-    def add(self, samples: Floats) -> None:
+    def add(self, samples: Floats, beside: Floats | None = None) -> None:
         """The samples on the next grid; a grid without finite numbers tells nothing, and everything begins anew."""
         before = self.rows[-1] if self.rows else []
         both = bool(before) and bool(np.all(np.isfinite(before[0])) and np.all(np.isfinite(samples)))
@@ -51,8 +82,39 @@ class Limit:
             # Nobody asks for the samples themselves: what was taken away moves less.
             moved = [unknown(samples.shape[0])] * min(len(row), len(before))
             moved[1:] = [self.measure(new, old) for new, old in zip(row[1:], before[1:], strict=False)]
-        self.rows = [*self.rows, row][-2:]
+        numbers = np.zeros(0) if beside is None else beside
+        self.beside = [*self.beside, extrapolated(numbers, self.beside[-1] if both else [])][-3:]
+        self.rows = [*self.rows, row][-3:]
         self.moved = [*self.moved, moved][-2:]
+        three = len(self.rows) == 3
+        shares = [still_to_go(*rows) for rows in zip(*self.rows, strict=False)] if three else []
+        self.shares = [*self.shares, shares][-2:]
+
+    def told(self, owners: Sequence[int] = ()) -> Told:
+        """What another halving would move least; the numbers beside belong to these outputs."""
+        column, change = self.best
+        found = Told(self.rows[-1][column], change, self.beside[-1][column])
+        every = [found, *(self._by_ratio(k, np.array(owners, dtype=int)) for k in range(len(self.rows[-1])))]
+        return min((one for one in every if one is not None), key=lambda one: float(np.max(_known(one.change))))
+
+    def _by_ratio(self, column: int, owners: NDArray[np.intp]) -> Told | None:
+        """The limit of a column whose error shrinks by a factor of its own, if the grid before told one as well.
+
+        Kinks t^eta leave powers in between, and orders that meet logarithms, which no power of the triangle takes away.
+        """
+        if len(self.shares) < 2 or not all(column < len(shares) for shares in self.shares):
+            return None
+        (older, old, new), second, third = (
+            (row[column] for row in self.rows),
+            *(row[column] for row in self.beside[-2:]),
+        )
+        before, now = (shares[column] for shares in self.shares)
+        if before is None or now is None:
+            return None
+        with np.errstate(invalid="ignore", over="ignore"):
+            samples = new + now[:, None] * (new - old)
+            change = self.measure(samples, old + before[:, None] * (old - older))
+        return Told(samples, change, third + now[owners] * (third - second))
 
     @property
     def best(self) -> tuple[int, Floats]:
@@ -82,6 +144,23 @@ def extrapolated(fine: Floats, coarse: Sequence[Floats]) -> list[Floats]:
             factor = 2.0**power
             row.append((factor * row[-1] - before) / (factor - 1.0))
     return row
+
+
+def still_to_go(older: Floats, old: Floats, new: Floats) -> Floats | None:
+    """By which share of its last move each output moves yet, if one move after another is smaller by the same factor.
+
+    That is Aitken's, told by all samples of an output together; None where few of them move, or not ever less.
+    """
+    with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
+        now, before = new - old, old - older
+        size = np.max(np.abs(now), axis=1, keepdims=True, initial=0.0)
+        unit = now / np.where(size > 0.0, size, 1.0)
+        squares = np.sum(unit**2, axis=1)
+        still = squares == 0.0
+        ratio = np.where(still, np.inf, np.sum(unit * before, axis=1) / np.where(still, 1.0, squares * size[:, 0]))
+        if not np.all(ratio >= LEAST_RATIO) or np.any(squares**2 < FEW * np.sum(unit**4, axis=1)):
+            return None
+        return np.asarray(1.0 / (ratio - 1.0))
 
 
 def unknown(outputs: int) -> Floats:

@@ -211,7 +211,7 @@ def long_run(
         pieces.append(Piece(first, end, WHOLE[-1], limit))
     del grids
     change = _refined(pieces, answers, tolerance, largest_m)
-    best = np.concatenate([p.limit.rows[-1][p.limit.best[0]] for p in pieces], axis=1)
+    best = np.concatenate([p.limit.told().samples for p in pieces], axis=1)
     outputs, terms = weighed(best)
     return Sampled(outputs, terms, pieces[-1].every, change)
 
@@ -219,7 +219,7 @@ def long_run(
 def _refined(pieces: Sequence[Piece], answers: Answers, tolerance: float, largest_m: int) -> Floats:
     """Halve the step on the pieces that still move, until all together do not, or pulses run out; what is left."""
     while True:
-        changes = [p.limit.best[1] for p in pieces]
+        changes = [p.limit.told().change for p in pieces]
         left = np.asarray(sum(c[: answers.count] for c in changes))
         restless = [
             p for p, c in zip(pieces, changes, strict=True)

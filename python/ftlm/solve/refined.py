@@ -10,7 +10,7 @@ from ftlm.data.run import Run
 from ftlm.data.solved import Solved
 from ftlm.solve.friction import begun
 from ftlm.solve.instants import has_own_times
-from ftlm.solve.limit import Limit, extrapolated
+from ftlm.solve.limit import Limit
 from ftlm.solve.long import long_run
 from ftlm.solve.records import MAX_M, record
 from ftlm.solve.sampled import (
@@ -54,26 +54,20 @@ def refined(
     if long is not None:
         return long
     times = run.time if on_grid and has_own_times(run, model.structure) else own_times(model, run)
-    limit, rows = Limit(), list[list[Floats]]()
-    terms: Terms = {}
-    best: Floats = np.zeros(0)
-    change: Floats = np.zeros(0)
-    lost = 0
+    limit, lost = Limit(), 0
     while True:
         last = 2 * every * own > largest_m
         samples, terms = _tried(model, run, every, initial, times, last=lost == 1)
         finite = bool(np.all(np.isfinite(samples)))
-        limit.add(samples)
-        column, change = limit.best
-        best = limit.rows[-1][column]
-        flat: Floats = np.array([v for powers in terms.values() for v in powers.values()])
-        rows = [extrapolated(flat, rows[-1] if len(limit.rows[-1]) > 1 else [])]
+        owners = [i for i, o in enumerate(model.outputs) for _ in terms[o]]
+        limit.add(samples, np.array([v for o in model.outputs for v in terms[o].values()]))
+        told = limit.told(owners)
         # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
         lost = 0 if finite or every == FIRST_REFINEMENT else lost + 1
-        if last or lost == 2 or np.all(change <= tolerance):
+        if last or lost == 2 or np.all(told.change <= tolerance):
             break
         every *= 2
-    return Sampled(best, _like(terms, rows[-1][column]), every, change)
+    return Sampled(told.samples, _like(terms, told.beside), every, told.change)
 
 
 def _like(terms: Terms, values: Floats) -> dict[str, dict[float, float]]:
