@@ -223,7 +223,7 @@ class Grid:
             for k, run in enumerate(self.runs)
         ]  # fmt: skip
 
-    @property
+    @cached_property
     def finer(self) -> Grid:
         """The same on half the step."""
         return replace(self, every=2 * self.every)

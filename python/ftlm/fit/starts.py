@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
 from ftlm import _core
+from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.base.memory import memory_limit
 from ftlm.data.equations import Equation
@@ -17,6 +19,7 @@ from ftlm.data.limits import FreeInput
 from ftlm.data.orders import SEARCHED_ORDER
 from ftlm.data.readings import bridged, read
 from ftlm.data.run import Run
+from ftlm.data.samples import locked
 from ftlm.data.settings import Settings
 from ftlm.data.structures import Hints, Structure
 from ftlm.fit.grid import Attempt
@@ -39,12 +42,14 @@ START_STEP = 0.2
 START_CANDIDATES = 200_000
 #: Prefilters of the start's lattice in units of the frequency below which 90 % of an output's power lies; None: none.
 PREFILTERS = (1.0, 2.0, 4.0, 8.0, None)
+#: Series of prefilters that are kept: those of a few runs.
+KEPT_LOW_PASSES = 32
 #: Steps of the lattices on which a row is followed downhill, and how often it may move on each.
 ZOOM_STEPS = (0.1, 0.05)
 ZOOM_ROUNDS = 8
-#: Rows of each prefilter's table, and how many of them become starts: the first, then those that differ by APART in
-#: some order.
-ROWS_PER_FILTER = 400
+#: Rows of each prefilter's table that are looked at, all where the first few do not do, and how many of them become
+#: starts: the first, then those that differ by APART in some order.
+FIRST_ROWS, ROWS_PER_FILTER = 25, 400
 STARTS_PER_FILTER = 4
 APART = 0.35
 #: Ratios of a coefficient law at which a start takes one equation's coefficients from another's.
@@ -83,7 +88,7 @@ class Coarse:
 
     threads: int
     memory: int
-    keep: int = ROWS_PER_FILTER
+    keep: int = STARTS_PER_FILTER
 
     def core(self) -> tuple[str, str, int, float, bool, int, int, bool, int, int]:
         """As the core takes it."""
@@ -176,11 +181,12 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, threads: int) -> l
     fastest = math.pi / max(run.duration / m for run in runs)
     # What memory there is is asked for once: these lattices are many, and small.
     coarse = Coarse(threads, memory_limit())
+    unfiltered = [record(run, structure, m) for run in runs]
     for multiple in PREFILTERS:
         if multiple is not None and multiple * frequency >= fastest:
             # Nothing on these pulses lies above it.
             continue
-        records = [prefiltered(record(run, structure, m), multiple and multiple * frequency) for run in runs]
+        records = [prefiltered(rec, multiple and multiple * frequency) for rec in unfiltered]
         origin = "no prefilter" if multiple is None else f"prefilter {multiple * frequency:.3g} rad/s"
         here: list[Attempt] = []
         for axes, apart in lattices:
@@ -188,7 +194,7 @@ def start_attempts(runs: Sequence[Run], problem: FreeProblem, threads: int) -> l
         if natural is not None and multiple in (PREFILTERS[0], None):
             here += lawful_attempts(problem, structure, records, natural, origin, coarse)
         attempts += here
-    return attempts + scanned_attempts(runs, problem, structure, m, attempts)
+    return attempts + scanned_attempts(runs, problem, structure, unfiltered, attempts)
 
 
 def lattice_attempts(
@@ -197,21 +203,34 @@ def lattice_attempts(
 ) -> list[Attempt]:  # fmt: skip
     """Starts from the rows of a lattice that lie apart, the best one followed downhill; none that stood before."""
     attempts: list[Attempt] = []
-    picked: list[list[float]] = []
-    for row in lattice_rows(structure, records, axes, coarse):
-        values = [row.orders[n] for n in problem.orders]
-        far = all(max(abs(a - b) for a, b in zip(values, p, strict=True)) >= apart for p in picked)
-        if picked and not far:
-            continue
-        start = row if picked else zoom(problem, structure, records, row, coarse)
-        picked.append(values)
+    for rank, row in enumerate(_lying_apart(problem, structure, records, axes, apart, coarse)):
+        start = row if rank else zoom(problem, structure, records, row, coarse)
         values = [start.orders[n] for n in problem.orders]
         if any(np.allclose(values, a.orders, atol=1e-9) for a in (*before, *attempts)):
             continue
         attempts.append(Attempt(values, problem.free_from(start.coefficients), origin, {}))
-        if len(picked) >= STARTS_PER_FILTER:
+        if rank + 1 >= STARTS_PER_FILTER:
             break
     return attempts
+
+
+def _lying_apart(
+    problem: FreeProblem, structure: Structure, records: list[Record], axes: Mapping[str, list[float]], apart: float,
+    coarse: Coarse,
+) -> Iterator[Row]:  # fmt: skip
+    """The rows of a lattice, best first, that each differ from all before in some order; many are asked for late."""
+    picked: list[list[float]] = []
+    seen = 0
+    for keep in (FIRST_ROWS, ROWS_PER_FILTER):
+        rows = lattice_rows(structure, records, axes, replace(coarse, keep=keep))
+        for row in rows[seen:]:
+            values = [row.orders[n] for n in problem.orders]
+            if not picked or all(max(abs(a - b) for a, b in zip(values, p, strict=True)) >= apart for p in picked):
+                picked.append(values)
+                yield row
+        seen = len(rows)
+        if seen < keep:
+            return
 
 
 def lawful_attempts(
@@ -243,14 +262,14 @@ def lawful_attempts(
 
 
 def scanned_attempts(
-    runs: Sequence[Run], problem: FreeProblem, structure: Structure, m: int, attempts: Sequence[Attempt]
-) -> list[Attempt]:
+    runs: Sequence[Run], problem: FreeProblem, structure: Structure, records: Sequence[Record],
+    attempts: Sequence[Attempt],
+) -> list[Attempt]:  # fmt: skip
     """Starts whose own terms are scanned over frequency and damping, at whole orders and at the lattice's best ones."""
     if structure.has_order_law or problem.products:
         return []
     orders = [dict(zip(problem.orders, whole_orders(problem), strict=True))]
     orders += [dict(zip(problem.orders, a.orders, strict=True)) for a in attempts[:1] if problem.orders]
-    records = [record(run, structure, m) for run in runs]
     out: list[Attempt] = []
     for point in orders:
         try:
@@ -304,13 +323,17 @@ def prefiltered(rec: Record, frequency: float | None) -> Record:
     """All signals and the initial terms through a second-order low-pass."""
     if frequency is None:
         return rec
-    omega = frequency
-    low_pass = _core.filter_series(
-        [(omega**2, 0.0)], [(1.0, 2.0), (1.4 * omega, 1.0), (omega**2, 0.0)], rec.m, rec.step
-    )
+    low_pass = _low_pass(frequency, rec.m, rec.step)
     means = np.stack([_core.series_multiply(low_pass, np.ascontiguousarray(row), rec.m) for row in rec.means])
     sensor = low_pass if rec.sensor is None else _core.series_multiply(low_pass, rec.sensor, rec.m)
     return replace(rec, means=means, sensor=sensor)
+
+
+@lru_cache(maxsize=KEPT_LOW_PASSES)
+def _low_pass(omega: float, m: int, step: float) -> Floats:
+    """The series of a second-order low-pass of this corner [rad/s]: the same one for every problem inside a race."""
+    denominator = [(1.0, 2.0), (1.4 * omega, 1.0), (omega**2, 0.0)]
+    return locked(_core.filter_series([(omega**2, 0.0)], denominator, m, step))
 
 
 def lattice_rows(

@@ -33,8 +33,8 @@ MAX_M = 1 << 24
 #: A signal that stays below this loses digits of its squares to the end of the range of numbers.
 SMALLEST = 1e-140
 COULOMB = "coulomb_"
-#: Series of sensor filters that are kept: those of the grids at hand.
-KEPT_SERIES = 4
+#: Series of sensor filters that are kept: long ones of the grids at hand, those up to so many pulses of all of a fit.
+KEPT_LONG, SHORT, KEPT_SHORT = 4, 1 << 13, 32
 #: Initial terms as the core takes them.
 InitialTuple: TypeAlias = tuple[bool, list[float]] | tuple[bool, list[float], int] | tuple[bool, list[float], int, int]
 #: Which signals' sensors may have held something, where each signal began, answers of the filter to impulses.
@@ -252,15 +252,19 @@ def records(runs: Sequence[Run], structure: Structure, m: int, *, filtered: bool
 def sensor_series(structure: Structure, m: int, step: float) -> Floats | None:
     """Return the structure's sensor filter as a series, or None."""
     sensor = structure.sensor_filter
-    return None if sensor is None else _series(sensor.numerator, sensor.denominator, m, step)
+    if sensor is None:
+        return None
+    return (_short_series if m <= SHORT else _long_series)(sensor.numerator, sensor.denominator, m, step)
 
 
-@lru_cache(maxsize=KEPT_SERIES)
-def _series(
+def _made(
     numerator: tuple[tuple[float, float], ...], denominator: tuple[tuple[float, float], ...], m: int, step: float
 ) -> Floats:
     """The series of a filter on m pulses; every signal and every run of one step passes the same one."""
     return locked(_core.filter_series(list(numerator), list(denominator), m, step))
+
+
+_long_series, _short_series = lru_cache(maxsize=KEPT_LONG)(_made), lru_cache(maxsize=KEPT_SHORT)(_made)
 
 
 def _check_known(run: Run, structure: Structure) -> None:
