@@ -101,6 +101,21 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
     out
 }
 
+/// Singular values of columns of one length, none smaller than the next: left vectors as columns as long as these, values,
+/// and right vectors row by row, as many of each as the lesser of both sides. O(k²m), one thread.
+///
+/// None where the iteration does not end, which finite numbers do not make happen.
+#[must_use]
+pub fn singular(columns: &[Vec<f64>]) -> Option<(Vec<Vec<f64>>, Vec<f64>, Vec<Vec<f64>>)> {
+    let m = columns.first().map_or(0, Vec::len);
+    let x = Mat::from_fn(m, columns.len(), |i, j| columns[j][i]);
+    let found = x.thin_svd().ok()?;
+    let left = found.U().col_iter().map(|column| column.iter().copied().collect()).collect();
+    let sizes = found.S().column_vector().iter().copied().collect();
+    let right = found.V().col_iter().map(|column| column.iter().copied().collect()).collect();
+    Some((left, sizes, right))
+}
+
 /// Inner products of every left with every right column (all of one length), row-major left × right. O(left·right·m), on
 /// the threads of the pool at hand.
 #[must_use]

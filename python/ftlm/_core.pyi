@@ -194,6 +194,11 @@ def filter_series(
     numerator: Sequence[tuple[float, float]], denominator: Sequence[tuple[float, float]], m: int, step: float
 ) -> _Vector: ...
 
+# -------------------------------------------------------------------------------- tall matrices, their columns as rows
+
+def triangle(given: _Floats) -> _Matrix: ...
+def singular(given: _Floats) -> tuple[_Matrix, _Vector, _Matrix]: ...
+
 # ---------------------------------------------------------------------------------------------------------- estimators
 
 def least_squares(

@@ -2,6 +2,7 @@
 //! call that computes.
 
 mod arrays;
+mod dense;
 mod errors;
 mod estimate;
 mod friction;
@@ -24,6 +25,9 @@ mod _core {
         grunwald_letnikov_weights, haar_inverse, haar_matrix, haar_transform, operational_matrix, point_samples,
         pulse_means, series_divide, series_multiply,
     };
+
+    #[pymodule_export]
+    use super::dense::{singular, triangle};
 
     #[pymodule_export]
     use super::estimate::{

@@ -19,7 +19,7 @@ from scipy.signal import lsim
 import ftlm
 from ftlm.fit import history
 from ftlm.fit.joint import JointFit, fit_output_error
-from ftlm.fit.uncertainty import _factors, covariance_of, deviation
+from ftlm.fit.uncertainty import covariance_of, deviation
 from ftlm.report.model_page import model_page
 
 
@@ -74,18 +74,6 @@ def test_a_flat_direction_has_the_interval_that_sixty_digits_give(apart: float, 
     # Dropped directions left 0.04 where 60 digits give 0.04 / apart.
     assert np.sqrt(found[1, 1]) * apart > 0.01
     np.testing.assert_allclose(found / np.outer(spread, spread), exact / np.outer(spread, spread), atol=1e-5)
-
-
-@pytest.mark.parametrize("rows", [1, 3, 300, 511, 512, 1031])
-def test_triangles_of_a_few_samples_have_the_singular_values_of_all(rows: int) -> None:
-    rng = np.random.default_rng(5)
-    wide = rng.standard_normal((5, max(rows, 5)))
-    wide[3] = wide[1] + 1e-9 * wide[3]
-    wide[4] = 0.0
-    directions, sizes, basis = _factors(wide)
-    np.testing.assert_allclose(sizes, np.linalg.svd(wide, compute_uv=False), rtol=1e-6, atol=1e-14 * sizes[0])
-    np.testing.assert_allclose(directions @ np.diag(sizes) @ basis, wide, atol=1e-13)
-    np.testing.assert_allclose(basis @ basis.T, np.eye(5), atol=1e-13)
 
 
 @pytest.mark.parametrize("coloured", [False, True])

@@ -9,6 +9,7 @@ from statistics import NormalDist
 import numpy as np
 
 from ftlm.base.arrays import Floats
+from ftlm.base.tall import dot
 
 #: A first value beyond this many noise standard deviations is not rest.
 REST_SIGMAS = 5.0
@@ -22,8 +23,6 @@ ROUNDING = 3e-5
 BEND = 1.345
 #: Share of true models that a test is allowed to refuse.
 LEVEL = 0.01
-#: Rows that are turned at a time: they stay in a processor's cache.
-ROWS = 1000
 #: Half-widths of a 95 % and of a 99 % interval in standard deviations.
 NORMAL_95 = 1.959963984540054
 NORMAL_99 = NormalDist().inv_cdf(1 - LEVEL / 2)
@@ -54,25 +53,6 @@ def robust_deviation(values: Floats) -> float:
     return float(np.median(np.abs(values))) / MAD if values.size else 0.0
 
 
-def orthonormal(columns: Floats, least: float) -> Floats:
-    """An orthonormal basis of columns of any size; what is left of one below a share ``least`` is rounding."""
-    sizes = np.linalg.norm(columns, axis=0)
-    directions, spread, _ = np.linalg.svd(columns / np.where(sizes > 0, sizes, 1.0), full_matrices=False)
-    kept: Floats = directions[:, spread > least * spread[0]]
-    return kept
-
-
-def triangle(parts: Sequence[Sequence[Floats]]) -> Floats:
-    """Columns, given in parts one below the other, turned so that all rows but as many as they are hold 0.
-
-    A rotation of the rows leaves every inner product as it is, and with it every least squares among the columns.
-    """
-    tables = [np.stack(part, axis=1) for part in parts]
-    blocks = [b for table in tables for b in np.array_split(table, max(len(table) // ROWS, 1))]
-    turned = [np.linalg.qr(block, mode="r") for block in blocks]
-    return np.asarray(np.linalg.qr(np.concatenate(turned), mode="r"))
-
-
 def huber_excess(few: Floats, many: Floats) -> float:
     """By how much Huber's loss of residuals exceeds that of residuals of a larger model, in units of their noise.
 
@@ -100,8 +80,8 @@ def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats
         x = np.where(there, values - np.mean(values[there]) if there.any() else 0.0, 0.0)
         known = there.astype(np.float64)
         for lag in range(min(most, x.size - 1) + 1):
-            sums[lag] += float(x[lag:] @ x[: x.size - lag])
-            pairs[lag] += float(known[lag:] @ known[: x.size - lag])
+            sums[lag] += dot(x[lag:], x[: x.size - lag])
+            pairs[lag] += dot(known[lag:], known[: x.size - lag])
     return sums / np.maximum(pairs, 1.0), pairs
 
 

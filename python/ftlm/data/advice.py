@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.statistics import is_rest, noise_of
+from ftlm.base.tall import orthonormal
 from ftlm.data.measured import Measured
 from ftlm.data.structures import Structure
 
@@ -448,8 +449,7 @@ def _drift(run: Measured, inputs: list[str], outputs: list[str]) -> Iterator[Fin
         scale = np.linalg.norm(basis, axis=1)
         basis = basis[scale > 0] / scale[scale > 0][:, None]
         # What the lags cannot tell from a trend is not called one: both sides are rid of them.
-        q, r = np.linalg.qr(basis.T)
-        q = q[:, np.abs(np.diag(r)) > 1e-8]
+        q = orthonormal(basis.T, 1e-8)
         y_left, t_left = y - q @ (q.T @ y), t - q @ (q.T @ t)
         if float(t_left @ t_left) < TREND_LEFT * float(t @ t):
             continue

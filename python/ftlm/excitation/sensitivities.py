@@ -10,7 +10,7 @@ import numpy as np
 
 from ftlm.base.arrays import Complex, Floats
 from ftlm.base.errors import ModelError
-from ftlm.base.statistics import orthonormal
+from ftlm.base.tall import orthonormal, singular
 from ftlm.data.equations import Term
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
@@ -107,11 +107,11 @@ def _inverse(rows: Floats) -> Floats:
     """Inverse of the information of derivatives over their noise; infinite variances where a number is not seen."""
     size = np.linalg.norm(rows, axis=1)
     scaled = rows / np.where(size > 0, size, 1.0)[:, None]
-    left, sizes, _ = np.linalg.svd(scaled, full_matrices=False)
+    _, sizes, right = singular(scaled.T)
     lost = np.finfo(np.float64).eps * np.sqrt(rows.shape[1])
     if np.any(size == 0) or sizes[-1] <= lost * sizes[0]:
         return np.diag(np.full(len(rows), np.inf))
-    half = left / sizes / size[:, None]
+    half = right.T / sizes / size[:, None]
     return np.asarray(half @ half.T)
 
 

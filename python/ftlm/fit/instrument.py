@@ -9,6 +9,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
+from ftlm.base.tall import length, orthonormal, projections
 from ftlm.data.run import Run
 from ftlm.fit.extrapolation import feasible
 from ftlm.fit.grid import Attempt, Grid
@@ -21,6 +22,8 @@ STEPS = 40
 HALVINGS = 6
 #: A step that moves no number by this share of its standard error ends them.
 STILL = 1e-3
+#: What is left of an instrument below this share is rounding.
+ALIKE = 1e-12
 #: Least pulses a sample interval: the estimates are those of one grid.
 EVERY = 2
 
@@ -86,9 +89,8 @@ def _moment(measured: Grid, clean: Grid, values: Floats) -> tuple[Attempt, Float
 def _size(moment: tuple[Attempt, Floats, Floats]) -> float:
     """What of the residuals lies in the span of the instruments."""
     attempt, _, instruments = moment
-    sizes = np.linalg.norm(instruments, axis=1)
-    basis = np.linalg.qr((instruments / np.where(sizes > 0, sizes, 1.0)[:, None]).T)[0]
-    return float(np.linalg.norm(basis.T @ np.asarray(attempt.outcome["residuals"])))
+    basis = orthonormal(instruments.T, ALIKE)
+    return length(projections(basis, np.asarray(attempt.outcome["residuals"])))
 
 
 def _covariance(grid: Grid, attempt: Attempt, influence: Floats) -> Floats:

@@ -19,6 +19,7 @@ from ftlm.base.arrays import Floats
 from ftlm.base.errors import ConvergenceError, DataError, FtlmError
 from ftlm.base.progress import Course
 from ftlm.base.statistics import NORMAL_95, noise_of
+from ftlm.base.tall import length
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss
@@ -444,8 +445,8 @@ def nearer(best: Attempt, grid: Grid, limit: Floats, clock: Clock, *, settled: b
     if settled:
         with contextlib.suppress(FtlmError):
             told = np.asarray(best.outcome["residuals"]) + columns @ way
-            bent = np.linalg.norm(np.asarray(grid.evaluated(ahead).outcome["residuals"]) - told)
-            if bent <= REFINED * np.linalg.norm(columns @ way):
+            bent = length(np.asarray(grid.evaluated(ahead).outcome["residuals"]) - told)
+            if bent <= REFINED * length(columns @ way):
                 return limit
     costs = []
     for attempt in (ahead, best):

@@ -18,6 +18,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
+from ftlm.base.tall import dot, projections, singular
 from ftlm.base.threads import pool
 from ftlm.data.run import Run
 from ftlm.fit.extrapolation import feasible
@@ -159,7 +160,7 @@ class Valley:
                 return math.inf
             left = _left(there, i)
             with np.errstate(over="ignore"):
-                worst = max(worst, abs(self.rise(i, float(left @ left)) / width - 1.0))
+                worst = max(worst, abs(self.rise(i, dot(left, left)) / width - 1.0))
         return worst
 
     def end(self, i: int, side: float, width: float, stop: threading.Event | None = None) -> Search:
@@ -487,7 +488,7 @@ def _slope(attempt: Attempt, i: int) -> float:
     """Half the derivative of the sum of squares with respect to one number; 0 where it is beyond the numbers."""
     # Near where a free run has no value its derivatives overflow: they tell no step.
     with np.errstate(over="ignore", invalid="ignore"):
-        slope = float(np.asarray(attempt.outcome["jacobian"])[i] @ np.asarray(attempt.outcome["residuals"]))
+        slope = dot(np.asarray(attempt.outcome["jacobian"])[i], np.asarray(attempt.outcome["residuals"]))
     return slope if math.isfinite(slope) else 0.0
 
 
@@ -498,16 +499,16 @@ def _span(attempt: Attempt, i: int) -> tuple[Any, Floats]:
     length = np.abs(others).max(axis=1, initial=0.0)
     length = np.where(length > 0, length, 1.0)
     length = length * np.maximum(np.linalg.norm(others / length[:, None], axis=1), 1.0)
-    left, sizes, right = np.linalg.svd(others / length[:, None], full_matrices=False)
+    tall, sizes, square = singular((others / length[:, None]).T)
     kept = sizes > FLAT * sizes.max(initial=0.0)
-    return (left[:, kept], sizes[kept], right[kept]), length
+    return (square.T[:, kept], sizes[kept], tall.T[kept]), length
 
 
 def _left(attempt: Attempt, i: int) -> Floats:
     """Residuals once all other numbers follow by one linear step."""
     residuals = np.asarray(attempt.outcome["residuals"])
     (_, _, right), _ = _span(attempt, i)
-    return np.asarray(residuals - right.T @ (right @ residuals))
+    return np.asarray(residuals - right.T @ projections(right.T, residuals))
 
 
 def _tangent(attempt: Attempt, i: int) -> Floats:
@@ -515,5 +516,5 @@ def _tangent(attempt: Attempt, i: int) -> Floats:
     (left, sizes, right), length = _span(attempt, i)
     along = np.asarray(attempt.outcome["jacobian"])[i]
     with np.errstate(over="ignore"):
-        others = -(left @ ((right @ along) / sizes)) / length
+        others = -(left @ (projections(right.T, along) / sizes)) / length
     return np.insert(others, i, 1.0)

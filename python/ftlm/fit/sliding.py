@@ -10,6 +10,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.statistics import noise_of
+from ftlm.base.tall import solved
 from ftlm.data.equations import Equation
 from ftlm.data.readings import read
 from ftlm.data.run import Run
@@ -112,7 +113,7 @@ def _best(item: Equation, parts: Sequence[_Part], signs: Sequence[Floats]) -> di
         if not np.all(np.isfinite(matrix[:, kept])):
             return {}
         x = np.zeros(matrix.shape[1])
-        x[kept] = np.linalg.lstsq(matrix[:, kept] / sizes[kept], wanted, rcond=None)[0] / sizes[kept]
+        x[kept] = solved(matrix[:, kept] / sizes[kept], wanted, None) / sizes[kept]
         if any(x[k] * side < 0.0 for k, side in bound.items()):
             continue
         left = float(np.sum((wanted - matrix @ x) ** 2))

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ftlm.base.tall import dot, length
 from ftlm.data.readings import bridged
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
@@ -23,9 +24,9 @@ def twin_words(runs: Sequence[Run], structure: Structure) -> str | None:
             if one.signal == other.signal or one.order != other.order:
                 continue
             first, second = (np.concatenate([bridged(run[t.signal]) for run in runs]) for t in (one, other))
-            size = float(first @ first)
-            ratio = float(first @ second) / size if size > 0 else 0.0
-            if np.linalg.norm(second - ratio * first) <= ROUNDED * np.linalg.norm(second):
+            size = dot(first, first)
+            ratio = dot(first, second) / size if size > 0 else 0.0
+            if length(second - ratio * first) <= ROUNDED * length(second):
                 return (
                     f"{other.signal} is {ratio:.6g} times {one.signal} on every run, which no run tells apart: leave "
                     f"out the term of {other.coefficient} or that of {one.coefficient}, fix one of them, or add a run "

@@ -7,6 +7,7 @@ import numpy as np
 from ftlm.base.arrays import Floats
 from ftlm.base.colour import colour_covariances, coloured
 from ftlm.base.statistics import BEND, is_white, robust_deviation
+from ftlm.base.tall import singular
 from ftlm.data.readings import read
 from ftlm.fit.grid import Attempt, Grid
 
@@ -14,9 +15,6 @@ from ftlm.fit.grid import Attempt, Grid
 LAG_POWER = 1.0 / 3.0
 #: Least share of the noise that a fit is taken to leave in its residuals.
 LEAST_LEFT = 0.2
-#: Samples that are reduced to one triangle at a time: of more, linear algebra is shared out among threads, which costs
-#: many times the work where other threads are busy.
-AT_A_TIME = 256
 
 
 def covariance(attempt: Attempt, grid: Grid) -> Floats:
@@ -63,7 +61,8 @@ def covariance_of(jacobian: Floats, series: list[Floats], squares: float) -> Flo
     scaled = jacobian / np.where(spread > 0, spread, 1.0)[:, None]
     if count < parameters:
         scaled = np.hstack([scaled, np.zeros((parameters, parameters - count))])
-    directions, sizes, rows = _factors(scaled)
+    left, sizes, right = singular(scaled.T)
+    directions, rows = right.T, left.T
     rounding = np.finfo(np.float64).eps * np.sqrt(max(count, 1)) * float(sizes.max(initial=0.0))
     seen = sizes > rounding
     # How far rounding may turn a seen direction into an unseen one.
@@ -84,26 +83,6 @@ def covariance_of(jacobian: Floats, series: list[Floats], squares: float) -> Flo
     result[unseen, :] = result[:, unseen] = np.nan
     result[unseen, unseen] = np.inf
     return result
-
-
-def _factors(wide: Floats) -> tuple[Floats, Floats, Floats]:
-    """Singular values and vectors of a matrix with a row a parameter, by triangles of a few samples at a time.
-
-    Orthogonal all the way, so that small singular values have the digits that those of the whole have.
-    """
-    parameters, count = wide.shape
-    blocks = count // max(AT_A_TIME, 2 * parameters)
-    if blocks < 2:
-        directions, sizes, rows = np.linalg.svd(wide, full_matrices=False)
-        return directions, sizes, rows
-    # Samples in equal blocks; those that are short of one are 0, which changes no triangle.
-    length = -(-count // blocks)
-    tall = np.vstack([wide.T, np.zeros((blocks * length - count, parameters))]).reshape(blocks, length, parameters)
-    bases, triangles = np.linalg.qr(tall)
-    outer, triangle = np.linalg.qr(triangles.reshape(blocks * parameters, parameters))
-    directions, sizes, turned = np.linalg.svd(triangle.T)
-    inner = outer.reshape(blocks, parameters, parameters) @ turned.T
-    return directions, sizes, np.ascontiguousarray((bases @ inner).reshape(blocks * length, parameters)[:count].T)
 
 
 def deviation(slopes: Floats, spread: Floats) -> Floats:

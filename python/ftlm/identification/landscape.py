@@ -9,6 +9,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError, ModelError
+from ftlm.base.tall import dot, projections, singular
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
@@ -119,7 +120,7 @@ class Around:
         size = np.linalg.norm(others, axis=1, keepdims=True)
         spanned = refit and bool(others.size)
         scaled = others / np.where(size > 0, size, 1.0)
-        return cls(grid, best, at, np.linalg.svd(scaled, full_matrices=False)[2] if spanned else None)
+        return cls(grid, best, at, singular(scaled.T)[0].T if spanned else None)
 
     @property
     def centre(self) -> Floats:
@@ -130,8 +131,8 @@ class Around:
         """Sum of squares that is left of an attempt's residuals once all other numbers follow."""
         residuals = np.asarray(attempt.outcome["residuals"])
         if self.basis is not None:
-            residuals = residuals - self.basis.T @ (self.basis @ residuals)
-        return float(residuals @ residuals)
+            residuals = residuals - self.basis.T @ projections(self.basis.T, residuals)
+        return dot(residuals, residuals)
 
     def cost(self, x: float, y: float) -> float:
         """The same where the two numbers are moved; infinite where that has no finite free run."""

@@ -12,7 +12,8 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.colour import autoregression
 from ftlm.base.errors import FtlmError
-from ftlm.base.statistics import LEVEL, ROUNDING, chi_squared, orthonormal
+from ftlm.base.statistics import LEVEL, ROUNDING, chi_squared
+from ftlm.base.tall import dot, orthonormal, projections, singular
 from ftlm.data.equations import Term
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
@@ -136,15 +137,15 @@ def offset_test(
     basis = orthonormal(others.T, 1e-12) if others.size else np.zeros((residuals.size, 0))
     for _ in range(2):
         left = left - basis @ (basis.T @ left)
-    directions, spread, _ = np.linalg.svd(left, full_matrices=False)
+    directions, spread, _ = singular(left)
     told = directions[:, spread > TOLD_APART]
     count = told.shape[1]
-    total = float(residuals @ residuals)
+    total = dot(residuals, residuals)
     if count == 0 or not total > 0:
         return OffsetTest(0.0, 0, 0.0, 0.0)
-    along = told.T @ residuals
+    along = projections(told, residuals)
     # Where the numbers come from a fit with an offset, part of what it does lies along their sensitivities.
-    noise = residuals - told @ along - basis @ (basis.T @ residuals)
+    noise = residuals - told @ along - basis @ projections(basis, residuals)
     spread = _coloured(told, noise, blocks, residuals.size - basis.shape[1] - count)
     statistic = float(along @ np.linalg.pinv(spread) @ along)
     explained = told @ along
@@ -198,7 +199,7 @@ def _coloured(directions: Floats, noise: Floats, blocks: list[list[tuple[int, in
             # Noise is what 1/A makes of white noise; its transpose runs through the directions backwards.
             turned = [_core.series_divide(np.ascontiguousarray(d[place][::-1]), divisor) for d in directions.T]
             stacked = np.stack(turned)
-            total += power * (stacked @ stacked.T)
+            total += power * np.einsum("ik,jk->ij", stacked, stacked)
     return total
 
 

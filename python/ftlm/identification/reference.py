@@ -12,6 +12,7 @@ from ftlm.base.arrays import Floats
 from ftlm.base.checks import nearest
 from ftlm.base.colour import autoregression, is_constant
 from ftlm.base.errors import DataError, ModelError
+from ftlm.base.tall import solved
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.identification.estimate import Fit
@@ -76,7 +77,7 @@ def driven_by(runs: Sequence[Run], structure: Structure, reference: str) -> tupl
     for name in inputs:
         measured = np.concatenate([run[name] for run in runs])
         # Every coefficient too many takes a share of the noise with it: the least Bayesian criterion.
-        fits = [columns @ np.linalg.lstsq(columns, measured, rcond=1e-10)[0] for columns in laws]
+        fits = [columns @ solved(columns, measured, 1e-10) for columns in laws]
         costs = [_criterion(measured - fit, columns.shape[1]) for fit, columns in zip(fits, laws, strict=True)]
         best = int(np.argmin(costs))
         answers[name] = np.split(fits[best], ends)

@@ -11,6 +11,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.statistics import ROUNDING, is_white, robust_deviation
+from ftlm.base.tall import dot
 from ftlm.data.advice import dead, excitation_for
 from ftlm.data.readings import read
 from ftlm.data.run import Run
@@ -178,7 +179,7 @@ def _outliers(runs: Sequence[Run], joint: JointFit, output: str) -> str | None:
             first = f"first at row {int(rows[0]) + 1} of {run.name}"
         far += rows.size
     count = every.size
-    share = float(np.sum(every[np.abs(every) > FAR * usual] ** 2) / max(float(every @ every), 1e-300))
+    share = float(np.sum(every[np.abs(every) > FAR * usual] ** 2) / max(dot(every, every), 1e-300))
     if usual == 0.0 or (share < DECISIVE and far < max(FEWEST_OUTLIERS, OUTLIERS * count)):
         return None
     verb, held = ("lies", "holds") if far == 1 else ("lie", "hold")

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ftlm.base.arrays import Floats
-from ftlm.base.statistics import chi_squared, orthonormal, triangle
+from ftlm.base.statistics import chi_squared
+from ftlm.base.tall import dot, orthonormal, projections, triangle
 from ftlm.judge.metrics import finite
 
 #: Future samples of the input that are looked at: an answer within a few samples hides among many.
@@ -154,7 +155,7 @@ class Regressors:
                 break
         if not parts:
             return None
-        turned = triangle(parts)
+        turned = triangle(np.concatenate([triangle(np.stack(part, axis=1)) for part in parts]))
         count = sum(part[-1].size for part in parts)
         return cls(turned[:, :width], turned[:, width], turned[:, width + 1 : -1], turned[:, -1], count)
 
@@ -165,7 +166,7 @@ class Regressors:
         if self.rows < 2 * (past.shape[1] + future.shape[1]):
             return None
         basis = orthonormal(past, SPANNED)
-        left = self.residuals - basis @ (basis.T @ self.residuals)
+        left = self.residuals - basis @ projections(basis, self.residuals)
         own = np.linalg.norm(future, axis=0)
         future = future - basis @ (basis.T @ future)
         future = future - basis @ (basis.T @ future)
@@ -176,7 +177,7 @@ class Regressors:
             if not kept.size:
                 continue
             seen = orthonormal(kept, SPANNED)
-            explained, total = float(np.sum((seen.T @ left) ** 2)), float(left @ left)
+            explained, total = float(np.sum((seen.T @ left) ** 2)), dot(left, left)
             rest = (total - explained) / (self.rows - basis.shape[1] - seen.shape[1])
             if not rest > 0:
                 continue

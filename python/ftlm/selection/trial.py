@@ -11,6 +11,7 @@ import numpy as np
 
 from ftlm.base.errors import DataError, FtlmError, ModelError
 from ftlm.base.statistics import colour
+from ftlm.base.tall import length
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.several import as_runs
@@ -70,7 +71,7 @@ class Fold:
             measured, free = (r[name][self.rows[0] : self.rows[1]] for r in (self.judged, answer))
             known = np.isfinite(measured)
             missed, size = measured[known] - free[known], measured[known] - np.mean(measured[known])
-            share = float(np.linalg.norm(missed)) / max(float(np.linalg.norm(size)), 1e-300)
+            share = length(missed) / max(length(size), 1e-300)
             out[name] = 100.0 * (1.0 - share)
         return out
 
@@ -349,8 +350,8 @@ def least_unseen(joint: JointFit, folds: Folds) -> float:
             if residuals.size != fold.judged.length - 2:
                 return -math.inf
             left, there = residuals[max(first - 1, 0) : last - 1], fold.judged[output][first:last]
-            size = float(np.linalg.norm(there - np.nanmean(there)))
-            share = scale[output] * float(np.linalg.norm(read(left))) / max(size, 1e-300)
+            size = length(there - np.nanmean(there))
+            share = scale[output] * length(read(left)) / max(size, 1e-300)
             scores.append(math.log(min(max(share, 1e-12), 1.0 - LOST / 100.0)))
     return float(np.mean(scores))
 

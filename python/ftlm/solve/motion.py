@@ -17,6 +17,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.statistics import ROUNDING, chi_squared, huber_excess, is_rest, noise_of
+from ftlm.base.tall import length
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import History, Initial, Structure
@@ -61,7 +62,7 @@ def history(run: Run, structure: Structure) -> History:
         if name in run:
             samples = read(run[name])
             # A level that is no offset is a part of the past; one that is takes no power of its own.
-            size = float(np.linalg.norm(samples - (0.0 if structure.offset == "none" else np.mean(samples))))
+            size = length(samples - (0.0 if structure.offset == "none" else np.mean(samples)))
             if size:
                 visible = max(visible, size / max(noise_of(run[name]), np.finfo(np.float64).eps * size))
     quarters = QUARTERS + math.ceil(math.log(visible / REFERENCE) / math.log(FACTOR))

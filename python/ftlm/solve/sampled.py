@@ -16,6 +16,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import ModelError
+from ftlm.base.tall import solved
 from ftlm.data.equations import Equation
 from ftlm.data.filters import SensorFilter
 from ftlm.data.run import Run
@@ -197,7 +198,7 @@ def fitted(
     usable = np.isfinite(sizes) & (sizes > 0)
     scaled = basis[:, usable] / sizes[usable]
     x = np.zeros(len(names))
-    x[usable] = np.linalg.lstsq(scaled, (weight * (measured - driven)).ravel(), rcond=SPANNED)[0] / sizes[usable]
+    x[usable] = solved(scaled, (weight * (measured - driven)).ravel(), SPANNED) / sizes[usable]
     terms: dict[str, dict[float, float]] = {o: {} for o in model.outputs}
     total = driven.copy()
     for (output, power), value, column in zip(names, x.tolist(), columns, strict=True):

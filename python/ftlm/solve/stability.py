@@ -236,7 +236,7 @@ def right_zeros(polynomial: Polynomial, angle: float = math.pi / 2) -> tuple[flo
         sizes = np.exp(exponents - shift)
         turns = np.exp(1j * (powers * angle + np.where(values < 0, math.pi, 0.0)))
         total = np.sum(sizes, axis=0)
-        return np.asarray(turns @ sizes / total), total
+        return np.asarray(np.einsum("j,jk->k", turns, sizes) / total), total
 
     points, _ = curve(log_omega)
     while log_omega.size < MOST_POINTS:
