@@ -116,6 +116,11 @@ class Sound:
     def operational_matrix(self):
         return *self.block_pulse_matrix(), {"dense": self.one(True, False)}
 
+    def triangle(self):
+        return (self.normal((self.one(1, 2, 4), self.m())),)
+
+    singular = triangle
+
     def series_multiply(self):
         m = self.m()
         return self.samples(m), self.samples(m), m, {"naive": self.one(True, False)}

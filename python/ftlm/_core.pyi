@@ -61,7 +61,9 @@ __all__ = [
     "search_stage",
     "series_divide",
     "series_multiply",
+    "singular",
     "trace_errors",
+    "triangle",
 ]
 
 _Vector: TypeAlias = np.ndarray[tuple[int], np.dtype[np.float64]]
