@@ -182,61 +182,112 @@ impl<'a> System<'a> {
 
     /// What a unit of each initial term, an equation and an exponent, does to every output while nothing else drives.
     pub(crate) fn units(&self, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
-        self.units_by(&mut series::Solver::new(&self.matrix)?, units)
+        let mut solver = series::Solver::new(&self.matrix)?;
+        match self.factored(&mut solver, units)? {
+            Some(mut by) => Ok(units.iter().map(|&unit| by.unit(unit)).collect()),
+            None => self.one_by_one(&mut solver, units),
+        }
     }
 
-    pub(crate) fn units_by(
-        &self,
-        solver: &mut series::Solver<'_>,
-        units: &[(usize, f64)],
-    ) -> Result<Vec<Vec<Vec<f64>>>> {
-        let (m, n) = (self.record.m(), self.matrix.len());
-        if units.is_empty() {
-            return Ok(Vec::new());
+    /// The free run at rest, and [`System::units`].
+    #[allow(clippy::type_complexity)]
+    pub(crate) fn rest_and_units(&self, units: &[(usize, f64)]) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
+        let mut solver = series::Solver::new(&self.matrix)?;
+        match self.factored(&mut solver, units)? {
+            Some(mut by) => Ok((by.rest(), units.iter().map(|&unit| by.unit(unit)).collect())),
+            None => Ok((solver.solve(&self.rhs)?, self.one_by_one(&mut solver, units)?)),
         }
-        let alone = |i: usize, exponent: f64| {
-            let mut rows = vec![vec![0.0; m]; n];
-            rows[i] = self.record.driving_term(exponent);
-            rows
-        };
+    }
+
+    /// The inverse of the matrix for products with so many units; none where there are none, or where it grows by so much
+    /// that products would lose the digits of its beginning.
+    fn factored(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Option<Factored<'_, 'a>>> {
+        if units.is_empty() {
+            return Ok(None);
+        }
         let inverse = solver.inverse()?;
         if inverse.iter().flatten().any(|series| grows(series)) {
-            return units
-                .iter()
-                .map(|&(i, exponent)| {
-                    let term = alone(i, exponent);
-                    if self.is_beside(i, exponent) {
-                        Ok(term)
-                    } else {
-                        solver.solve(&term)
-                    }
-                })
-                .collect();
+            return Ok(None);
         }
-        let kernels: Vec<Vec<Kernel>> =
-            inverse.iter().map(|row| row.iter().map(|s| Kernel::new(s)).collect()).collect();
-        let mut buffers = Buffers::default();
-        let mut through = |kernel: &Kernel, term: &[f64]| {
-            let mut out = vec![0.0; m];
-            kernel.apply(term, &mut out, &mut buffers);
-            out
-        };
-        Ok(units
+        let kernels = inverse.iter().map(|row| row.iter().map(|s| Kernel::new(s)).collect()).collect();
+        let behind = (0..inverse.len()).map(|_| None).collect();
+        // Without a filter its spectra are all that is asked for.
+        let inverse = if self.record.is_filtered() { inverse } else { Vec::new() };
+        Ok(Some(Factored { system: self, inverse, kernels, behind, buffers: Buffers::default() }))
+    }
+
+    fn one_by_one(&self, solver: &mut series::Solver<'_>, units: &[(usize, f64)]) -> Result<Vec<Vec<Vec<f64>>>> {
+        units
             .iter()
             .map(|&(i, exponent)| {
+                let term = self.alone(i, exponent);
                 if self.is_beside(i, exponent) {
-                    return alone(i, exponent);
+                    Ok(term)
+                } else {
+                    solver.solve(&term)
                 }
-                let term = self.record.driving_term(exponent);
-                kernels.iter().map(|row| through(&row[i], &term)).collect()
             })
-            .collect())
+            .collect()
+    }
+
+    /// The right-hand side of one initial term.
+    fn alone(&self, i: usize, exponent: f64) -> Vec<Vec<f64>> {
+        let mut rows = vec![vec![0.0; self.record.m()]; self.matrix.len()];
+        rows[i] = self.record.driving_term(exponent);
+        rows
     }
 
     /// What these right-hand sides make of the outputs.
     pub(crate) fn solve(&self, rhs: &[Vec<f64>]) -> Result<Vec<Vec<f64>>> {
         let borrowed: Vec<&[f64]> = rhs.iter().map(Vec::as_slice).collect();
         series::solve(&self.matrix, &borrowed)
+    }
+}
+
+/// The inverse of a system's matrix, and of one that stands behind a filter together with it: one product a right-hand side.
+struct Factored<'s, 'a> {
+    system: &'s System<'a>,
+    inverse: Vec<Vec<Vec<f64>>>,
+    kernels: Vec<Vec<Kernel>>,
+    /// By equation, what its error does to every output behind the record's filter, once that is asked for.
+    behind: Vec<Option<Vec<Kernel>>>,
+    buffers: Buffers,
+}
+
+impl Factored<'_, '_> {
+    fn rest(&mut self) -> Vec<Vec<f64>> {
+        let (rhs, m) = (&self.system.rhs, self.system.record.m());
+        let mut outputs = vec![vec![0.0; m]; self.kernels.len()];
+        let mut product = vec![0.0; m];
+        for (output, row) in outputs.iter_mut().zip(&self.kernels) {
+            for (kernel, driver) in row.iter().zip(rhs) {
+                kernel.apply(driver, &mut product, &mut self.buffers);
+                output.iter_mut().zip(&product).for_each(|(y, v)| *y += v);
+            }
+        }
+        outputs
+    }
+
+    fn unit(&mut self, (i, exponent): (usize, f64)) -> Vec<Vec<f64>> {
+        let (system, m) = (self.system, self.system.record.m());
+        if system.is_beside(i, exponent) {
+            return system.alone(i, exponent);
+        }
+        let buffers = &mut self.buffers;
+        let mut through = |kernel: &Kernel, term: &[f64]| {
+            let mut out = vec![0.0; m];
+            kernel.apply(term, &mut out, buffers);
+            out
+        };
+        let Some(term) = system.record.unfiltered_term(exponent) else {
+            let term = system.record.driving_term(exponent);
+            return self.kernels.iter().map(|row| through(&row[i], &term)).collect();
+        };
+        let inverse = &self.inverse;
+        let behind = self.behind[i].get_or_insert_with(|| {
+            inverse.iter().map(|row| Kernel::new(&system.record.behind_filter(row[i].clone()))).collect()
+        });
+        behind.iter().map(|kernel| through(kernel, &term)).collect()
     }
 }
 

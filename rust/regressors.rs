@@ -265,7 +265,15 @@ impl Record {
         }
     }
 
-    fn behind_filter(&self, powers: Vec<f64>) -> Vec<f64> {
+    /// What drives a free run as t^e does before the filter that makes something smooth of it; none where the record's
+    /// signals passed none, and of what is an answer of the filter.
+    pub(crate) fn unfiltered_term(&self, exponent: f64) -> Option<Vec<f64>> {
+        let passes = self.filter.is_some() && self.answer(exponent).is_none();
+        passes.then(|| power_pulses(exponent, self.m(), self.step))
+    }
+
+    /// What the filter that the record's signals passed makes of a series.
+    pub(crate) fn behind_filter(&self, powers: Vec<f64>) -> Vec<f64> {
         match &self.filter {
             None => powers,
             Some(filter) => series::multiply(filter, &powers, self.m()),

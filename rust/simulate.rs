@@ -136,9 +136,7 @@ pub fn respond_and_units(
     units: &[(usize, f64)],
 ) -> Result<(Vec<Vec<f64>>, Vec<Vec<Vec<f64>>>)> {
     let system = checked(equations, record, &as_terms(equations.len(), units)?)?;
-    let mut solver = series::Solver::new(&system.matrix)?;
-    let driven = solver.solve(&system.rhs)?;
-    Ok((driven, system.units_by(&mut solver, units)?))
+    system.rest_and_units(units)
 }
 
 /// Units as initial terms, by equation.

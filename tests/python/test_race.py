@@ -90,16 +90,16 @@ def staged(enough: int) -> Staged:
 
 def test_starts_compete_on_the_first_grid_where_it_tells_where_they_lead() -> None:
     calls: list[tuple[int, int]] = []
-    grid, going = fine_enough(staged(1), STARTS, Told(5, 1, None, calls=calls))
-    assert (grid.every, [a.origin for a in going]) == (1, list("01234"))
-    # All glance, and a few run ahead.
+    grid, going, ran = fine_enough(staged(1), STARTS, Told(5, 1, None, calls=calls))
+    # All glance, and a few run ahead: nobody runs a lap twice.
+    assert (grid.every, [a.origin for a in ran], [a.origin for a in going]) == (1, list("012"), list("34"))
     assert calls == [(1, 5), (1, PIONEERS)]
 
 
 def test_few_starts_need_none_to_run_ahead() -> None:
     calls: list[tuple[int, int]] = []
-    grid, going = fine_enough(staged(4), STARTS[:PIONEERS], Told(3, 1, None, calls=calls))
-    assert (grid.every, len(going), calls) == (1, PIONEERS, [(1, PIONEERS)])
+    grid, going, ran = fine_enough(staged(4), STARTS[:PIONEERS], Told(3, 1, None, calls=calls))
+    assert (grid.every, len(going), ran, calls) == (1, PIONEERS, [], [(1, PIONEERS)])
 
 
 @pytest.mark.parametrize(("moved", "begin"), [(0.05, 2), (0.2, 5)])
@@ -115,7 +115,7 @@ def test_starts_go_on_from_a_coarse_grid_only_if_a_finer_one_moves_its_optimum_l
         )  # fmt: skip
 
     calls: list[tuple[int, int]] = []
-    grid, going = fine_enough(staged(2), STARTS, Told(5, 1, None, ends, calls))
+    grid, going, _ = fine_enough(staged(2), STARTS, Told(5, 1, None, ends, calls))
     assert grid.every == 2
     # Where it tells, one for each optimum that it has; where it does not, all from where they started.
     assert calls[-1] == (2, begin)
@@ -127,7 +127,7 @@ def test_a_start_that_a_coarse_grid_does_not_carry_begins_on_the_finer_one() -> 
     def ends(grid: Grid, attempt: Attempt, evaluations: int) -> Attempt | None:
         return None if grid.every == 1 and attempt.origin == "4" else attempt
 
-    grid, going = fine_enough(staged(2), STARTS, Told(5, 1, None, ends))
+    grid, going, _ = fine_enough(staged(2), STARTS, Told(5, 1, None, ends))
     assert (grid.every, [a.origin for a in going]) == (2, list("01234"))
 
 
@@ -135,7 +135,7 @@ def test_where_no_start_has_a_scheme_the_step_is_halved_until_one_has() -> None:
     def ends(grid: Grid, attempt: Attempt, evaluations: int) -> Attempt | None:
         return None if grid.every < 4 else attempt
 
-    grid, going = fine_enough(staged(1), STARTS, Told(5, 1, None, ends))
+    grid, going, _ = fine_enough(staged(1), STARTS, Told(5, 1, None, ends))
     assert (grid.every, len(going)) == (4, 5)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ftlm.base.errors import FtlmError, ModelError
 from ftlm.base.threads import pool
+from ftlm.data.run import Run
 from ftlm.data.structures import History
 from ftlm.fit.clock import Clock
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
@@ -17,8 +18,9 @@ from ftlm.fit.problem import FreeProblem
 from ftlm.fit.simpler import LowerOrder, Simpler, Whole, held, lower_orders, simpler, unlike, whole
 from ftlm.fit.starts import delayed_attempts, power_frequency
 
-#: Samples a run of the coarse fits that compare starts; the best ones continue on all samples.
-COARSE_SAMPLES = 1200
+#: Samples of the coarse fits that compare starts, of all runs together, and of each at least; the best ones continue on
+#: all samples.
+COARSE_SAMPLES, LEAST_SAMPLES = 1200, 400
 #: So many samples become one without asking what that shows; half a turn of what holds 90 % of the power is to be as
 #: many at least; a part of a record stands for it if its outputs deviate by this share of the whole's.
 THINNEST, SHOWN, AS_LIVELY = 10, 1.0, 0.7
@@ -102,8 +104,8 @@ def without_history(
     problem, runs = alike.problem, alike.runs
     starts = delayed_attempts(runs, problem, threads)
     laps = Laps(len(starts), threads, progress)
-    coarse, glanced = fine_enough(thinned(alike), starts, laps)
-    reached = laps.run(coarse, glanced, FIRST_LAP)
+    coarse, glanced, ran = fine_enough(thinned(alike), starts, laps)
+    reached = sorted(ran + laps.run(coarse, glanced, FIRST_LAP), key=lambda a: a.level)
     while coarse.every < FINEST and (not reached or coarse.matters(reached[0])):
         coarse = coarse.finer
         reached = laps.run(coarse, starts, FIRST_LAP)
@@ -204,13 +206,19 @@ def with_history(
     return distinct(ahead + [reached[i] for i in sorted(order[len(going) :])])
 
 
+def coarse_samples(runs: Sequence[Run]) -> int:
+    """Samples of each run that starts compete on: what one run does not tell of where they lead, another does."""
+    return max(COARSE_SAMPLES // len(runs), LEAST_SAMPLES)
+
+
 def thinned(grid: Grid) -> Grid:
     """A grid of as many samples as starts compete on.
 
     Thinned until they no longer show the motion, the samples of a long record tell no start from another: then its
     first part is taken, if that moves as the whole does.
     """
-    decimation = max(1, round(min(run.length - 1 for run in grid.runs) / COARSE_SAMPLES))
+    each = coarse_samples(grid.runs)
+    decimation = max(1, round(min(run.length - 1 for run in grid.runs) / each))
     if decimation <= THINNEST or grid.shares is not None:
         return replace(grid, decimation=decimation)
     outputs = grid.problem.structure.outputs
@@ -218,22 +226,24 @@ def thinned(grid: Grid) -> Grid:
     carried = max(THINNEST, int(math.pi / (SHOWN * fastest)))
     if carried >= decimation:
         return replace(grid, decimation=decimation)
-    firsts = [run.slice(None, (COARSE_SAMPLES * carried + 0.5) * run.step) for run in grid.runs]
+    firsts = [run.slice(None, (each * carried + 0.5) * run.step) for run in grid.runs]
     pairs = [(first[o], run[o]) for first, run in zip(firsts, grid.runs, strict=True) for o in outputs]
     if any(not np.nanstd(part) >= AS_LIVELY * np.nanstd(whole) for part, whole in pairs):
         return replace(grid, decimation=decimation)
     return replace(grid, runs=firsts, decimation=carried)
 
 
-def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> tuple[Grid, list[Attempt]]:
-    """A grid on which starts may compete, as far as a few of them tell, and where they are after a glance.
+def fine_enough(
+    coarse: Grid, starts: Sequence[Attempt], laps: Laps
+) -> tuple[Grid, list[Attempt], list[Attempt]]:  # fmt: skip
+    """A grid on which starts may compete, as far as a few tell, where others are after a glance, those after a lap.
 
     A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its
     own: all start anew on the grid on which those few no longer move.
     """
     first, glanced = coarse, distinct(laps.run(coarse, starts, GLANCE), same_place)
     if len(starts) <= PIONEERS:
-        return coarse, glanced
+        return coarse, glanced, []
     before, pioneers = list[tuple[Grid, Attempt]](), glanced[:PIONEERS]
     while coarse.every < FINEST:
         reached = laps.run(coarse, pioneers, FIRST_LAP)
@@ -247,7 +257,7 @@ def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> tuple[Gr
     else:
         reached = pioneers
     if coarse is first:
-        return coarse, glanced
+        return (coarse, glanced, []) if reached is pioneers else (coarse, glanced[PIONEERS:], reached)
     told = before if reached else []
     near = (grid for grid, best in told if np.allclose(best.values, reached[0].values, rtol=MOVED, atol=0.0))
     if (grid := next(near, None)) is not None:
@@ -255,7 +265,7 @@ def fine_enough(coarse: Grid, starts: Sequence[Attempt], laps: Laps) -> tuple[Gr
         if sum(1 + len(a.alike) for a in glanced) == len(starts):
             # This coarser grid has the same optimum, a little moved: of those that come to one place there one goes on.
             starts = distinct(laps.run(grid, glanced, FIRST_LAP))
-    return coarse, distinct(laps.run(coarse, starts, GLANCE), same_place)
+    return coarse, distinct(laps.run(coarse, starts, GLANCE), same_place), []
 
 
 def on_the_way(coarse: Grid, behind: Sequence[Attempt], laps: Laps) -> list[Attempt]:
