@@ -101,19 +101,37 @@ pub fn triangular_factor(columns: &[Vec<f64>]) -> Vec<f64> {
     out
 }
 
-/// Singular values of columns of one length, none smaller than the next: left vectors as columns as long as these, values,
-/// and right vectors row by row, as many of each as the lesser of both sides. O(k²m), one thread.
+/// Singular values of columns, as many as the lesser of their number and length, none smaller than the next.
+pub struct Singular {
+    /// Left vectors, each as long as the columns.
+    pub left: Vec<Vec<f64>>,
+    /// The values.
+    pub sizes: Vec<f64>,
+    /// Right vectors, each of as many numbers as there are columns.
+    pub right: Vec<Vec<f64>>,
+}
+
+/// Singular values and vectors of columns of one length. O(k²m), one thread.
 ///
 /// None where the iteration does not end, which finite numbers do not make happen.
+///
+/// ```
+/// # fn run() -> Option<()> {
+/// let found = ftlm::dense::singular(&[vec![0.0, 3.0, 0.0], vec![0.0, 0.0, -2.0]])?;
+/// assert!((found.sizes[0] - 3.0).abs() < 1e-15 && (found.sizes[1] - 2.0).abs() < 1e-15);
+/// assert!((found.left[0][1] * found.right[0][0] - 1.0).abs() < 1e-15);
+/// # Some(())
+/// # }
+/// # assert!(run().is_some());
+/// ```
 #[must_use]
-pub fn singular(columns: &[Vec<f64>]) -> Option<(Vec<Vec<f64>>, Vec<f64>, Vec<Vec<f64>>)> {
+pub fn singular(columns: &[Vec<f64>]) -> Option<Singular> {
     let m = columns.first().map_or(0, Vec::len);
     let x = Mat::from_fn(m, columns.len(), |i, j| columns[j][i]);
     let found = x.thin_svd().ok()?;
-    let left = found.U().col_iter().map(|column| column.iter().copied().collect()).collect();
+    let vectors = |of: MatRef<'_, f64>| of.col_iter().map(|column| column.iter().copied().collect()).collect();
     let sizes = found.S().column_vector().iter().copied().collect();
-    let right = found.V().col_iter().map(|column| column.iter().copied().collect()).collect();
-    Some((left, sizes, right))
+    Some(Singular { left: vectors(found.U()), sizes, right: vectors(found.V()) })
 }
 
 /// Inner products of every left with every right column (all of one length), row-major left × right. O(left·right·m), on

@@ -33,11 +33,11 @@ pub fn singular<'py>(
     given: PyReadonlyArray2<'py, f64>,
 ) -> PyResult<(Matrix<'py>, Bound<'py, PyArray1<f64>>, Matrix<'py>)> {
     let tall = finite(&given)?;
-    let (left, sizes, right) = leavable(py, columns(&given), None, move |_| {
+    let found = leavable(py, columns(&given), None, move |_| {
         dense::singular(&tall).ok_or_else(|| Error::Structure {
             what: "singular values are not found".into(),
             remedy: "scale the columns".into(),
         })
     })?;
-    Ok((stacked(py, &left)?, PyArray1::from_vec(py, sizes), stacked(py, &right)?))
+    Ok((stacked(py, &found.left)?, PyArray1::from_vec(py, found.sizes), stacked(py, &found.right)?))
 }

@@ -177,6 +177,32 @@ fn gram_matrices_and_triangular_factors() {
 }
 
 #[test]
+fn singular_values_make_up_the_columns() {
+    let mut random = Random::new(26);
+    for (k, m) in [(1, 1), (3, 2), (4, 300), (9, 9), (13, 2300)] {
+        let columns: Vec<Vec<f64>> = (0..k).map(|_| random.signal(m)).collect();
+        let found = dense::singular(&columns).unwrap();
+        let count = k.min(m);
+        assert_eq!((found.left.len(), found.sizes.len(), found.right.len()), (count, count, count));
+        assert!(found.sizes.windows(2).all(|pair| pair[0] >= pair[1]));
+        for (j, column) in columns.iter().enumerate() {
+            for (i, value) in column.iter().enumerate() {
+                let sum: f64 = (0..count).map(|l| found.left[l][i] * found.sizes[l] * found.right[l][j]).sum();
+                assert!((sum - value).abs() < 1e-13 * found.sizes[0]);
+            }
+        }
+        let inner = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+        for a in 0..count {
+            for b in 0..count {
+                let unit = f64::from(u8::from(a == b));
+                assert!((inner(&found.left[a], &found.left[b]) - unit).abs() < 1e-13);
+                assert!((inner(&found.right[a], &found.right[b]) - unit).abs() < 1e-13);
+            }
+        }
+    }
+}
+
+#[test]
 fn triangular_factors_of_any_size() {
     let mut random = Random::new(25);
     let columns: Vec<Vec<f64>> = (0..4).map(|_| random.signal(1500)).collect();
