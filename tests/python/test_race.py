@@ -11,10 +11,22 @@ import pytest
 
 import ftlm
 from ftlm.errors import ModelError
-from ftlm.fit import joint
+from ftlm.fit import joint, starts
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.race import PIONEERS, Laps, distinct, finalists, fine_enough, in_reach, is_rich, same_place, stirred
+from ftlm.fit.race import (
+    PIONEERS,
+    Laps,
+    coarse_samples,
+    distinct,
+    finalists,
+    fine_enough,
+    in_reach,
+    is_rich,
+    same_place,
+    stirred,
+    thinned,
+)
 from ftlm.fit.simpler import simpler, unlike
 from plants import resonant_plant
 
@@ -241,3 +253,39 @@ def test_what_only_a_coarse_grid_carries_gives_way_to_another_optimum() -> None:
         assert found.joint is not None
         noise.append(found.joint.noise["y"])
     assert noise[1] < 1.0005 * noise[0]
+
+
+# ----------------------------------------------------------------------------------------------------------------------
+# Rows of a lattice that become starts
+
+
+@pytest.mark.parametrize(
+    ("places", "asked", "found"),
+    [((0, 1, 2, 3), [25], [0, 1, 2, 3]), ((0, 30, 60), [25, 400], [0, 30, 60])],
+)
+def test_a_lattice_is_asked_for_more_rows_only_where_the_first_lie_together(places, asked, found, monkeypatch) -> None:
+    # 100 rows at one order, but for some that each lie apart.
+    orders = [1.0 + (places.index(k) if k in places else 0.0) for k in range(100)]
+    rows = [starts.Row({"alpha": v}, {"a": float(k)}) for k, v in enumerate(orders)]
+    calls: list[int] = []
+
+    def lattice_rows(structure, records, axes, coarse):
+        calls.append(coarse.keep)
+        return rows[: coarse.keep]
+
+    monkeypatch.setattr(starts, "lattice_rows", lattice_rows)
+    monkeypatch.setattr(starts, "zoom", lambda problem, structure, records, row, coarse: row)
+    structure = ftlm.equation("D^alpha y = -a y + b u", initial="rest")
+    problem = FreeProblem.of(structure)
+    monkeypatch.setattr(FreeProblem, "free_from", lambda self, coefficients: [coefficients["a"], 1.0])
+    coarse = starts.Coarse(1, 1 << 30)
+    attempts = starts.lattice_attempts(problem, structure, [], {}, starts.APART, "here", [], coarse)
+    assert calls == asked
+    assert [a.coefficients[0] for a in attempts] == found
+
+
+def test_runs_share_the_samples_that_starts_compete_on() -> None:
+    run = ftlm.Run.from_arrays(step=0.1, inputs={"u": np.zeros(2401)}, outputs={"y": np.zeros(2401)})
+    assert [coarse_samples([run] * n) for n in (1, 2, 3, 18)] == [1200, 600, 400, 400]
+    problem = FreeProblem.of(ftlm.equation("D y = -a y + b u", initial="rest"))
+    assert [thinned(Grid(problem, [run] * n, [1.0])).decimation for n in (1, 2, 4)] == [2, 4, 6]

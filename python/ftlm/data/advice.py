@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.statistics import is_rest, noise_of
-from ftlm.base.tall import orthonormal
+from ftlm.base.tall import orthonormal, solved
 from ftlm.data.measured import Measured
 from ftlm.data.structures import Structure
 
+#: What tells rows of a past apart, as a share of all that they do.
+ALIKE = 3e-7
 #: A spectral line below this share of the largest one is not counted as excitation.
 LINE = 0.01
 #: Bins that one line fills through the Blackman-Harris window, whose side lobes are 92 dB down.
@@ -519,11 +521,10 @@ def _feedback(run: Measured, inputs: list[str], outputs: list[str]) -> Iterable[
 
 
 def _innovation(x: Floats, past: Floats) -> Floats:
-    """What a linear prediction from the past leaves, by normal equations: quick, and exact enough for a correlation."""
+    """What a linear prediction from the past leaves, as far as rows of it differ by more than a correlation shows."""
     scale = np.linalg.norm(past, axis=1)
     scaled = past / np.where(scale > 0, scale, 1.0)[:, None]
-    solution = np.linalg.lstsq(scaled @ scaled.T, scaled @ x, rcond=1e-13)[0]
-    return np.asarray(x - scaled.T @ solution)
+    return np.asarray(x - scaled.T @ solved(scaled.T, x, ALIKE))
 
 
 def _robust(x: Floats) -> float:
