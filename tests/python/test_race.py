@@ -255,6 +255,16 @@ def test_what_only_a_coarse_grid_carries_gives_way_to_another_optimum() -> None:
     assert noise[1] < 1.0005 * noise[0]
 
 
+def test_of_two_free_orders_each_is_known_in_a_race_of_its_own_where_noise_would_leave_less() -> None:
+    # A resonance and a dead time that neither has: with both orders free the lowest optimum lies far from the others.
+    run = resonant_plant(27, wrong=True)
+    fits = [ftlm.identify(run, ftlm.equation(f"D^alpha y = d D^{mu} y + a y + b u"), intervals="quadratic").joint
+            for mu in ("1", "mu")]  # fmt: skip
+    assert fits[0] is not None
+    assert fits[1] is not None
+    assert fits[1].noise["y"] < 1.0005 * fits[0].noise["y"]
+
+
 # ----------------------------------------------------------------------------------------------------------------------
 # Rows of a lattice that become starts
 
