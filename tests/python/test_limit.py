@@ -102,6 +102,9 @@ def test_a_grid_without_numbers_tells_nothing():
     after = told(grids((2, 3, 4), 5))
     assert (change, found.tolist()) == (after[1], after[0].tolist())
     assert np.isnan(told([*grids((2,), 3), lost])[0]).all()
+    # In the middle it tells nothing of those after it either.
+    between = told([*grids((2, 3, 4), 3), lost, *grids((2, 3, 4), 2)])
+    assert (between[1], between[0].tolist()) == (np.inf, told(grids((2, 3, 4), 2))[0].tolist())
 
 
 def test_what_does_not_move_has_stood_still():

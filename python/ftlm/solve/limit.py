@@ -20,6 +20,8 @@ SEEN = 0.5
 #: Where no power is known, halving the step divided what moves by this factor at least (by the root of two, and a
 #: little less), in as many samples as if so many alone moved: one number is told by theirs.
 LEAST_RATIO, FEW = 1.4, 8.0
+#: Grids that tell such a factor, and whether it is one.
+GRIDS = 4
 
 
 def _moved(new: Floats, old: Floats) -> Floats:
@@ -60,9 +62,6 @@ class Limit:
     moved
         By which share of its largest value halving the step moved each output in each of these columns, for the last
         two halvings; infinite for the samples themselves.
-    shares
-        By which share of its last move each output of a column moves yet, on the last two grids; see
-        :func:`still_to_go`.
     measure
         That share, of samples on a grid and on the one before.
     """
@@ -70,7 +69,6 @@ class Limit:
     rows: list[list[Floats]] = field(default_factory=list)
     beside: list[list[Floats]] = field(default_factory=list)
     moved: list[list[Floats]] = field(default_factory=list)
-    shares: list[list[Floats | None]] = field(default_factory=list)
     measure: Callable[[Floats, Floats], Floats] = _moved
 
     def add(self, samples: Floats, beside: Floats | None = None) -> None:
@@ -83,18 +81,21 @@ class Limit:
             moved = [unknown(samples.shape[0])] * min(len(row), len(before))
             moved[1:] = [self.measure(new, old) for new, old in zip(row[1:], before[1:], strict=False)]
         numbers = np.zeros(0) if beside is None else beside
-        self.beside = [*self.beside, extrapolated(numbers, self.beside[-1] if both else [])][-3:]
-        self.rows = [*self.rows, row][-3:]
+        self.beside = [*self.beside, extrapolated(numbers, self.beside[-1] if both else [])][-GRIDS:]
+        self.rows = [*self.rows, row][-GRIDS:]
         self.moved = [*self.moved, moved][-2:]
-        three = len(self.rows) == 3
-        shares = [still_to_go(*rows) for rows in zip(*self.rows, strict=False)] if three else []
-        self.shares = [*self.shares, shares][-2:]
 
-    def told(self, owners: Sequence[int] = ()) -> Told:
-        """What another halving would move least; the numbers beside belong to these outputs."""
+    def told(self, owners: Sequence[int] = (), *, enough: float = 0.0) -> Told:
+        """What another halving would move least; the numbers beside belong to these outputs.
+
+        Where it moves a column by no more than what is enough, no other is looked for.
+        """
         column, change = self.best
         found = Told(self.rows[-1][column], change, self.beside[-1][column])
-        every = [found, *(self._by_ratio(k, np.array(owners, dtype=int)) for k in range(len(self.rows[-1])))]
+        if len(self.rows) < GRIDS or np.all(change <= enough):
+            return found
+        known = min(map(len, self.rows))
+        every = [found, *(self._by_ratio(k, np.array(owners, dtype=int)) for k in range(known))]
         return min((one for one in every if one is not None), key=lambda one: float(np.max(_known(one.change))))
 
     def _by_ratio(self, column: int, owners: NDArray[np.intp]) -> Told | None:
@@ -102,13 +103,9 @@ class Limit:
 
         Kinks t^eta leave powers in between, and orders that meet logarithms, which no power of the triangle takes away.
         """
-        if len(self.shares) < 2 or not all(column < len(shares) for shares in self.shares):
-            return None
-        (older, old, new), second, third = (
-            (row[column] for row in self.rows),
-            *(row[column] for row in self.beside[-2:]),
-        )
-        before, now = (shares[column] for shares in self.shares)
+        oldest, older, old, new = (row[column] for row in self.rows)
+        second, third = (row[column] for row in self.beside[-2:])
+        before, now = still_to_go(oldest, older, old), still_to_go(older, old, new)
         if before is None or now is None:
             return None
         with np.errstate(invalid="ignore", over="ignore"):

@@ -61,7 +61,7 @@ def refined(
         finite = bool(np.all(np.isfinite(samples)))
         owners = [i for i, o in enumerate(model.outputs) for _ in terms[o]]
         limit.add(samples, np.array([v for o in model.outputs for v in terms[o].values()]))
-        told = limit.told(owners)
+        told = limit.told(owners, enough=tolerance)
         # A stiff equation may have no stable scheme on a coarse grid; one that has none on two in a row has none.
         lost = 0 if finite or every == FIRST_REFINEMENT else lost + 1
         if last or lost == 2 or np.all(told.change <= tolerance):
