@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -148,11 +149,12 @@ def without_history(
     clock = Clock.of(problem, runs)
     for one in held(problem) if reached else []:
         if len(one.problem.orders) == 1 and reached[0].level > ABOVE_FLOOR * floor:
-            # Of one free order a race of its own costs little, where noise alone would leave less.
-            ended = without_history(replace(alike, problem=one.problem), floor, threads, None)[0]
-            there = [one.embedded(a, problem.orders[one.order]) for a in in_reach(ended)[:FINALISTS]]
-            reached = sorted(reached + laps.run(coarse, there, 1), key=lambda a: a.level)
-            continue
+            # Of one free order a race of its own costs little, where noise alone would leave less; bounds may leave none.
+            with contextlib.suppress(ModelError):
+                ended = without_history(replace(alike, problem=one.problem), floor, threads, None)[0]
+                there = [one.embedded(a, problem.orders[one.order]) for a in in_reach(ended)[:FINALISTS]]
+                reached = sorted(reached + laps.run(coarse, there, 1), key=lambda a: a.level)
+                continue
         # Nor is it to end above what it reaches with one order known: from where it is, and from whole orders.
         near = (*distinct(reached)[:FINALISTS], *distinct(first)[:FINALISTS], *wholes)
         runners = [one.without(a, problem, clock) for a in near]

@@ -14,7 +14,7 @@ from ftlm.data.structures import Structure
 from ftlm.fit.grid import Grid
 from ftlm.fit.joint import COARSE_SHARE, given
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.race import CONTENDER, SECOND_LAP, coarse_samples
+from ftlm.fit.race import COARSE_SAMPLES, CONTENDER, SECOND_LAP
 from ftlm.selection.trial import decided
 
 Item = TypeVar("Item")
@@ -38,7 +38,7 @@ def contenders(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: P
     records that are not thinned, and of bodies that may stick, none is.
     """
     every = list(range(len(starts)))
-    decimation = max(1, round(min(run.length - 1 for run in runs) / coarse_samples(runs)))
+    decimation = max(1, round(min(run.length - 1 for run in runs) / COARSE_SAMPLES))
     if decimation == 1 or len(starts) <= least or any(s.has_friction for s, _ in starts):
         return every
 
