@@ -149,7 +149,7 @@ def without_history(
     clock = Clock.of(problem, runs)
     for one in held(problem) if reached else []:
         if len(one.problem.orders) == 1 and reached[0].level > ABOVE_FLOOR * floor:
-            # Of one free order a race of its own costs little where noise would leave less; bounds may leave no lattice.
+            # A race of one free order costs little where noise alone would leave less; bounds may leave it no lattice.
             with contextlib.suppress(ModelError):
                 ended = without_history(replace(alike, problem=one.problem), floor, threads, None)[0]
                 there = [one.embedded(a, problem.orders[one.order]) for a in in_reach(ended)[:FINALISTS]]
