@@ -116,6 +116,18 @@ pub enum Error {
         /// First index that is not finite.
         index: usize,
     },
+    /// Wherever a fit starts, it ends beyond the range of floating point.
+    #[error("wherever it starts, the free run of {output} ends beyond the range of numbers: it grows; leave out the term that pushes, or bound its coefficient")]
+    Beyond {
+        /// Which output.
+        output: String,
+    },
+    /// Runs that could not be sampled as a fit asked.
+    #[error("runs could not be sampled: {why}; give runs that can be")]
+    Source {
+        /// What their source said.
+        why: String,
+    },
     /// The caller asked to stop.
     #[error("interrupted")]
     Interrupted,
@@ -155,8 +167,8 @@ impl Error {
     #[must_use]
     pub fn kind(&self) -> Kind {
         match self {
-            Self::NotFinite { .. } | Self::Length { .. } => Kind::Data,
-            Self::Diverged { .. } | Self::Singular { .. } => Kind::Convergence,
+            Self::NotFinite { .. } | Self::Length { .. } | Self::Source { .. } => Kind::Data,
+            Self::Diverged { .. } | Self::Singular { .. } | Self::Beyond { .. } => Kind::Convergence,
             Self::Interrupted => Kind::Interrupted,
             Self::Internal { .. } => Kind::Internal,
             _ => Kind::Model,

@@ -13,7 +13,8 @@
 //!    variables; orders and coefficients together by joint output error ([`small`] and [`memory`] serve them);
 //!    [`friction`]: free runs of a body that may stick, and their output error;
 //! 6. [`search`]: the orders themselves, exhaustively over a lattice;
-//! 7. [`simulate`], [`metrics`]: free runs, the two errors, and what they amount to.
+//! 7. [`simulate`], [`metrics`]: free runs, the two errors, and what they amount to; [`statistics`], [`colour`]: what the
+//!    residuals say.
 //!
 //! ```
 //! use ftlm::equation::{Equation, Initial, Structure, Term};
@@ -79,8 +80,10 @@ pub mod small;
 
 pub mod search;
 
+pub mod colour;
 pub mod metrics;
 pub mod simulate;
+pub mod statistics;
 
 #[cfg(feature = "rig")]
 pub mod rig;

@@ -251,6 +251,96 @@ class Sound:
             free, self.one(1, 3, 20), 1e-6, self.one(True, False), self.one(None, _core.Stop()),
         )  # fmt: skip
 
+    # ------------------------------------------------------------------------------------------ the end of a joint fit
+
+    def joint_problem_new(self):
+        law = (0, (0.0, [1.0]), [(0, (0.0, [0.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0]), (1.0, [(1, 1)]))])
+        inputs = [(signal, kind, ends) for signal, kind, ends, _ in self.free_inputs("saturation", "dead_zone")]
+        return ["y"], [law], [(0.5, 2.0)], 2, inputs, True, self.terms(), []
+
+    def sampled(self):
+        """A problem, its runs as they are asked for, their spans, a grid, and a place on it."""
+        given = self.joint_problem_new()
+        runs = [(self.normal((2, 32)), self.normal((1, 33))) for _ in range(self.one(1, 2))]
+
+        def at(every, decimation):
+            return [
+                ((0.05 / every, np.repeat(means, every, axis=1), None), every, samples, None, [1.0], [], None, None)
+                for means, samples in runs
+            ]
+
+        place = [1.2, 1.5, 0.7, *(1.0 for _ in given[4])], []
+        grid = [1.0], 1, 1, None, self.one(True, False)
+        return _core.JointProblem(*given), at, [(0.05, 1.65)] * len(runs), grid, place
+
+    def joint_problem_bounds(self):
+        return self.one_of("JointProblem"), ()
+
+    def joint_problem_feasible(self):
+        problem, *_, (values, _) = self.sampled()
+        return problem, (np.array(values), np.array(values) * self.one(1.0, 1.4))
+
+    def joint_problem_settled(self):
+        problem, at, spans, grid, place = self.sampled()
+        return problem, (at, spans, grid, place, self.one(True, False), self.one(None, _core.Stop()))
+
+    def joint_problem_finished(self):
+        problem, at, spans, grid, place = self.sampled()
+        found, weights, _ = problem.settled(at, spans, grid, place, False)
+        grid = weights, *grid[1:]
+        others, refine = self.one([], [place]), self.one(True, False)
+        return problem, (at, spans, grid, found, others, False, refine, self.one(None, _core.Stop()))
+
+    def joint_problem_clock(self):
+        problem, _, spans, *_ = self.sampled()
+        return problem, (spans,)
+
+    def clocked(self):
+        """A clock, and values of what it tells."""
+        problem, _, spans, _, (values, _) = self.sampled()
+        return problem.clock(spans), np.array(values)
+
+    def joint_clock_unit(self):
+        return self.clocked()[0], ()
+
+    def joint_clock_told(self):
+        clock, values = self.clocked()
+        return clock, (values,)
+
+    joint_clock_untold = joint_clock_told
+
+    def joint_clock_step(self):
+        clock, values = self.clocked()
+        return clock, (values, 0.1 * values)
+
+    def joint_clock_errors(self):
+        clock, values = self.clocked()
+        return clock, (values, np.diag(values**2))
+
+    def covariance_of(self):
+        return self.normal((3, 40)), [self.normal(20), self.normal(20)], self.number(0.1, 50.0)
+
+    def fit_covariance(self):
+        jacobian, series, _ = self.covariance_of()
+        return jacobian, series, self.one(None, np.ones(40))
+
+    def long_run(self):
+        return self.covariance_of()[:2]
+
+    def coloured(self):
+        return [self.normal(50), self.normal(40)], self.one(0, 3, 10)
+
+    autocovariances = coloured
+
+    def colour_covariances(self):
+        return np.array([1.0, self.number(-0.9, 0.9)]), self.number(0.1, 2.0), self.one(1, 8, 100)
+
+    def is_white(self):
+        return self.normal(60), self.one(5, 25)
+
+    def chi_squared(self):
+        return float(self.one(1, 5, 20)), self.one(1.6, 2.3)
+
     def friction_error(self):
         own, force = (0, (0.0, [0.0, 1.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0, 0.0]), (1.0, [(1, 1)]))
         law = (0, (0.0, [1.0, 0.0]), [own, force])

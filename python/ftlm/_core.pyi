@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 __all__ = [
     "SIMD",
     "Guard",
+    "JointClock",
+    "JointProblem",
     "OrderSearch",
     "Points",
     "StageSearch",
@@ -19,15 +21,21 @@ __all__ = [
     "Streaming",
     "VirtualArm",
     "__version__",
+    "autocovariances",
     "block_pulse_kernel",
     "block_pulse_matrix",
     "certify",
+    "chi_squared",
+    "colour_covariances",
+    "coloured",
     "corners",
     "correlation",
+    "covariance_of",
     "delayed",
     "equation_error",
     "explicit_euler",
     "filter_series",
+    "fit_covariance",
     "fractional_derivative",
     "fractional_integral",
     "fractional_memory",
@@ -39,8 +47,10 @@ __all__ = [
     "haar_matrix",
     "haar_transform",
     "instrumental_variables",
+    "is_white",
     "lattice_size",
     "least_squares",
+    "long_run",
     "metrics",
     "multi_innovation",
     "nyquist_margin",
@@ -255,6 +265,89 @@ def output_error(
     stop: Stop | None = None,
 ) -> _Fit: ...
 def grows(alpha: float, own_terms: Sequence[tuple[float, float]]) -> bool: ...
+
+# --------------------------------------------------------------------------------------------------- end of a joint fit
+
+#: the runs with so many pulses a sample interval, of every so manieth sample
+_Sampling: TypeAlias = Callable[[int, int], Sequence[_Experiment]]
+#: (weight of each output, pulses a sample interval, of how many samples one counts, shares by run, whether steady)
+_Grid: TypeAlias = tuple[Sequence[float], int, int, Sequence[_Floats] | None, bool]
+#: (values of everything free, states of each run with friction)
+_Place: TypeAlias = tuple[Sequence[float], Sequence[Sequence[float]]]
+
+class _Finished(TypedDict):
+    weights: list[float]
+    shares: list[_Matrix] | None
+    every: int
+    estimate: list[float]
+    settled: bool
+    covariance: _Matrix
+    noise: list[float]
+    #: residuals over the noise by run, a row an output; NaN where none was read
+    left: list[_Matrix]
+    #: residuals that count less, outliers, and all
+    robust: tuple[int, int, int] | None
+    attempt: dict[str, Any]
+
+@final
+class JointProblem:
+    def __new__(
+        cls,
+        outputs: Sequence[str],
+        laws: Sequence[_FreeEquation],
+        order_bounds: Sequence[tuple[float, float]],
+        coefficients: int,
+        inputs: Sequence[tuple[int, str, tuple[float, float]]],
+        coupled: bool,
+        terms: _Initial,
+        frictions: Sequence[tuple[int, Sequence[_Monomial]]],
+    ) -> JointProblem: ...
+    @property
+    def bounds(self) -> list[tuple[float, float]]: ...
+    def feasible(self, /, at: _Floats, towards: _Floats) -> _Vector: ...
+    def settled(
+        self,
+        /,
+        runs: _Sampling,
+        spans: Sequence[tuple[float, float]],
+        grid: _Grid,
+        start: _Place,
+        huber: bool,
+        stop: Stop | None = None,
+    ) -> tuple[dict[str, Any], list[float], list[_Matrix] | None]: ...
+    def finished(
+        self,
+        /,
+        runs: _Sampling,
+        spans: Sequence[tuple[float, float]],
+        grid: _Grid,
+        found: Mapping[str, Any],
+        others: Sequence[_Place],
+        huber: bool,
+        refine: bool,
+        stop: Stop | None = None,
+    ) -> _Finished: ...
+    def clock(self, /, spans: Sequence[tuple[float, float]]) -> JointClock: ...
+
+@final
+class JointClock:
+    @property
+    def unit(self) -> float: ...
+    def told(self, /, values: _Floats) -> _Vector: ...
+    def untold(self, /, values: _Floats) -> _Vector: ...
+    def step(self, /, values: _Floats, moved: _Floats) -> _Vector: ...
+    def errors(self, /, values: _Floats, covariance: _Floats) -> _Vector: ...
+
+def covariance_of(jacobian: _Floats, series: Sequence[_Floats], squares: float) -> _Matrix: ...
+def fit_covariance(jacobian: _Floats, series: Sequence[_Floats], shares: _Floats | None) -> _Matrix: ...
+def long_run(jacobian: _Floats, series: Sequence[_Floats]) -> _Matrix: ...
+def coloured(series: Sequence[_Floats], most: int) -> tuple[_Vector, float]: ...
+def colour_covariances(through: _Floats, power: float, count: int) -> _Vector: ...
+def autocovariances(series: Sequence[_Floats], most: int) -> tuple[_Vector, _Vector]: ...
+def is_white(series: _Floats, lags: int) -> bool: ...
+def chi_squared(degrees: float, quantile: float) -> float: ...
+
+# ------------------------------------------------------------------------------------------------------------ friction
 
 class _Motion(TypedDict):
     outputs: _Matrix

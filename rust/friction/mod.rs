@@ -23,4 +23,4 @@ mod states;
 pub use dynamics::{Body, Motion};
 pub use fit::{fit, fit_until, Fit, Start};
 pub use law::Law;
-pub use model::{FreeLaw, FrictionModel};
+pub use model::{passing, FreeLaw, FrictionModel};

@@ -46,6 +46,12 @@ impl FreeLaw {
     }
 }
 
+/// Which outputs pass a filter before they are compared.
+#[must_use]
+pub fn passing(experiments: &[Experiment]) -> Vec<bool> {
+    experiments.first().and_then(|e| e.filter.as_ref()).map_or_else(Vec::new, |(_, passes)| passes.clone())
+}
+
 /// What is estimated: equations that follow each other's outputs, some with friction of their own output's velocity.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrictionModel {

@@ -52,6 +52,19 @@ pub fn friction_respond<'py>(
     Ok(dict)
 }
 
+/// (place of the body's equation, fc, fs and vs).
+pub type FrictionArg = (usize, [MonomialArg; 3]);
+
+/// Friction whose numbers may be free.
+pub fn free_laws(frictions: List<FrictionArg>) -> Vec<(usize, FreeLaw)> {
+    let law = |(place, numbers): FrictionArg| {
+        let [coulomb, stribeck, speed] =
+            numbers.map(|(factor, powers)| joint::Monomial { factor, powers: powers.into() });
+        (place, FreeLaw { coulomb, stribeck, speed })
+    };
+    frictions.into_iter().map(law).collect()
+}
+
 #[pyfunction]
 #[pyo3(signature = (
     runs, laws, frictions, order_bounds, names, terms, orders, coefficients, inputs, states, evaluations,
@@ -62,7 +75,7 @@ pub fn friction_error<'py>(
     py: Python<'py>,
     runs: List<ExperimentArg<'py>>,
     laws: List<FreeEquationArg>,
-    frictions: List<(usize, [MonomialArg; 3])>,
+    frictions: List<FrictionArg>,
     order_bounds: List<(f64, f64)>,
     names: List<String>,
     terms: InitialArg,
@@ -75,25 +88,14 @@ pub fn friction_error<'py>(
     stop: Option<&Stop>,
 ) -> PyResult<Bound<'py, PyDict>> {
     let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
-    let frictions = frictions
-        .into_iter()
-        .map(|(place, numbers)| {
-            let [coulomb, stribeck, speed] =
-                numbers.map(|(factor, powers)| joint::Monomial { factor, powers: powers.into() });
-            (place, FreeLaw { coulomb, stribeck, speed })
-        })
-        .collect();
     let model = FrictionModel {
         equations: laws.into_iter().map(free_equation).collect(),
-        frictions,
+        frictions: free_laws(frictions),
         inputs: free_inputs(&inputs)?,
         order_bounds: order_bounds.into(),
         coordinates: coordinates(&names)?,
         initial: initial(terms)?,
-        filtered: experiments
-            .first()
-            .and_then(|e| e.filter.as_ref())
-            .map_or_else(Vec::new, |(_, passes)| passes.clone()),
+        filtered: friction::passing(&experiments),
     };
     let start = Start {
         orders: orders.into(),

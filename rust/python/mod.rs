@@ -6,6 +6,7 @@ mod dense;
 mod errors;
 mod estimate;
 mod friction;
+mod joint;
 mod lists;
 mod operators;
 mod search;
@@ -36,6 +37,12 @@ mod _core {
 
     #[pymodule_export]
     use super::friction::{friction_error, friction_respond};
+
+    #[pymodule_export]
+    use super::joint::{
+        autocovariances, chi_squared, colour_covariances, coloured, covariance_of, fit_covariance, is_white, long_run,
+        JointClock, JointProblem,
+    };
 
     #[pymodule_export]
     use super::simulate::{

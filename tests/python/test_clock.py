@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 import ftlm
-from ftlm.fit.clock import Clock
+from ftlm.fit.clock import clock as clock_of
 from ftlm.fit.grid import Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
 
@@ -70,9 +70,9 @@ def test_a_descent_takes_the_same_steps_in_any_unit(plain):
 
 def test_the_clock_tells_numbers_steps_and_errors():
     problem = FreeProblem.of(ftlm.equation("D^alpha y = d D^mu y + a y + b0 D^gamma u + b1 u", delay={"u": (0.0, 0.3)}))
-    clock = Clock.of(problem, [lag(0, 60.0)])
+    clock = clock_of(problem, [lag(0, 60.0)])
     scale = np.exp(clock.unit)
-    assert scale == pytest.approx(60.0 * np.exp(Clock.of(problem, [lag(0, 1.0)]).unit))
+    assert scale == pytest.approx(60.0 * np.exp(clock_of(problem, [lag(0, 1.0)]).unit))
     values = dict(alpha=1.9, mu=0.7, gamma=0.4, d=-2.0, a=-30.0, b0=4.0, b1=0.0, delay_u=0.1)
     powers = {"d": 1.2, "a": 1.9, "b0": 1.5, "b1": 1.9}
     point = np.array([values[n] for n in problem.names])

@@ -1,4 +1,4 @@
-"""The race of starts: who goes on, on which grid all compete, and who takes the place of one that a wall stopped."""
+"""The race of starts: who goes on, and on which grid all compete."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import ftlm
-from ftlm.errors import ModelError
-from ftlm.fit import joint, starts
+from ftlm.fit import starts
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.race import (
@@ -164,10 +163,6 @@ def test_of_those_far_behind_who_still_falls_goes_on(grid: Grid) -> None:
     assert still == [far, best]
 
 
-# ----------------------------------------------------------------------------------------------------------------------
-# Instead of one that a wall stopped
-
-
 @pytest.fixture(scope="module")
 def grid() -> Grid:
     """First order, driven in exact steps, with a little noise."""
@@ -177,45 +172,6 @@ def grid() -> Grid:
         y[k + 1] = np.exp(-0.2) * y[k] + (1.0 - np.exp(-0.2)) * u[k]
     run = ftlm.Run.from_arrays(step=0.1, inputs={"u": u}, outputs={"y": y + 0.01 * rng.normal(size=81)})
     return Grid(FreeProblem.of(ftlm.equation("D y = -a y + b u", initial="caputo")), [run], [100.0])
-
-
-def test_another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less(grid: Grid) -> None:
-    stuck = grid.evaluated(Attempt([], [1.0, 1.0], "stuck", {}))
-    other = Attempt([], [3.0, 1.0], "other", {})
-    best, there = joint.freed(stuck, grid, [other], "squares")
-    assert best.origin == "other"
-    assert best.coefficients == pytest.approx([2.0, 2.0], rel=0.03)
-    # Its weights are settled: those of what it leaves.
-    assert there.levels(best)["y"] == pytest.approx(1.0, abs=joint.SETTLED)
-    assert there.weights != grid.weights
-    # Nobody else: the same one on the same grid.
-    assert joint.freed(stuck, grid, [], "squares") == (stuck, grid)
-
-
-def test_who_has_no_free_run_or_grows_where_that_may_not_be_takes_no_place(grid: Grid, monkeypatch) -> None:
-    stuck = grid.evaluated(Attempt([], [1.0, 1.0], "stuck", {}))
-
-    def settled(attempt: Attempt, grid: Grid, loss: str) -> tuple[Attempt, Grid]:
-        if attempt.origin == "none":
-            raise ModelError("its free run is not finite")
-        return grid.evaluated(attempt), grid
-
-    monkeypatch.setattr(joint, "with_settled_weights", settled)
-    growing = Attempt([], [-2.0, 1e-9], "growing", {})
-    good, none = Attempt([], [2.0, 2.0], "good", {}), Attempt([], [2.0, 2.0], "none", {})
-    assert joint.freed(stuck, grid, [none], "squares")[0] is stuck
-    assert joint.freed(stuck, grid, [none, good], "squares")[0].origin == "good"
-    # The best of all, not the last.
-    between = Attempt([], [1.5, 1.5], "between", {})
-    assert joint.freed(stuck, grid, [between], "squares")[0].origin == "between"
-    assert joint.freed(stuck, grid, [good, between], "squares")[0].origin == "good"
-    ahead = grid.evaluated(good)
-    assert joint.freed(ahead, grid, [between], "squares")[0] is ahead
-    # It leaves more than one that grows.
-    worst = grid.evaluated(Attempt([], [-3.0, 1.0], "worst", {}))
-    assert joint.freed(worst, grid, [growing], "squares")[0].origin == "growing"
-    assert joint.freed(worst, replace(grid, steady=True), [growing], "squares")[0] is worst
-    assert joint.freed(worst, replace(grid, steady=True), [growing, good], "squares")[0].origin == "good"
 
 
 # ----------------------------------------------------------------------------------------------------------------------

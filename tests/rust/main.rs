@@ -15,6 +15,7 @@ mod friction;
 mod haar;
 mod iv;
 mod joint;
+mod joint_fit;
 mod kernels;
 mod levenberg_marquardt;
 mod limits;

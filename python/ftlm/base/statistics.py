@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from statistics import NormalDist
 
 import numpy as np
 
+from ftlm import _core
 from ftlm.base.arrays import Floats
-from ftlm.base.tall import dot
 
 #: A first value beyond this many noise standard deviations is not rest.
 REST_SIGMAS = 5.0
@@ -74,15 +73,7 @@ def autocovariances(series: Sequence[Floats], most: int) -> tuple[Floats, Floats
 
     Each series is taken about its own mean; they are pooled.
     """
-    sums, pairs = np.zeros(most + 1), np.zeros(most + 1)
-    for values in series:
-        there = ~np.isnan(values)
-        x = np.where(there, values - np.mean(values[there]) if there.any() else 0.0, 0.0)
-        known = there.astype(np.float64)
-        for lag in range(min(most, x.size - 1) + 1):
-            sums[lag] += dot(x[lag:], x[: x.size - lag])
-            pairs[lag] += dot(known[lag:], known[: x.size - lag])
-    return sums / np.maximum(pairs, 1.0), pairs
+    return _core.autocovariances(series, most)
 
 
 def autocorrelations(series: Sequence[Floats], most: int) -> tuple[Floats, Floats]:
@@ -105,8 +96,7 @@ def chi_squared(degrees: int, level: float) -> float:
 
     Good to 0.3 % from five degrees of freedom, to 1 % from one.
     """
-    z = NormalDist().inv_cdf(1 - level)
-    return degrees * (1 - 2 / (9 * degrees) + z * math.sqrt(2 / (9 * degrees))) ** 3
+    return _core.chi_squared(degrees, NormalDist().inv_cdf(1 - level))
 
 
 def chi_squared_99(degrees: int) -> float:
@@ -125,7 +115,4 @@ def colour(series: Floats) -> float:
 
 def is_white(series: Floats, lags: int = 25) -> bool:
     """Ljung-Box test at 1 %: whether autocorrelations up to ``lags`` could be those of white noise."""
-    if series.size <= lags + 1:
-        return True
-    correlations, pairs = autocorrelations([series], lags)
-    return bool(pairs[0] <= lags + 1) or ljung_box(correlations, pairs) <= chi_squared_99(lags)
+    return _core.is_white(series, lags)

@@ -223,10 +223,21 @@ class Grid:
             for k, run in enumerate(self.runs)
         ]  # fmt: skip
 
+    def sampled(self, every: int, decimation: int) -> list[Any]:
+        """The runs on a grid that the core asks for; it weighs them itself."""
+        if (every, decimation) == (self.every, self.decimation) and self.shares is None:
+            return self.experiments
+        return replace(self, every=every, decimation=decimation, shares=None).experiments
+
     @cached_property
     def finer(self) -> Grid:
         """The same on half the step."""
         return replace(self, every=2 * self.every)
+
+    @property
+    def core(self) -> tuple[Sequence[float], int, int, Sequence[Floats] | None, bool]:
+        """Weights, pulses a sample interval, decimation, shares, and whether it is steady, as the core takes them."""
+        return self.weights, self.every, self.decimation, self.shares, self.steady
 
     def descend(
         self, attempt: Attempt, evaluations: int, *, plain: bool = False, held: int | Sequence[int] = (),

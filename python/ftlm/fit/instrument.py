@@ -11,7 +11,6 @@ from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
 from ftlm.base.tall import length, orthonormal, projections
 from ftlm.data.run import Run
-from ftlm.fit.extrapolation import feasible
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.joint import JointFit
 from ftlm.fit.problem import FreeProblem
@@ -52,7 +51,7 @@ def instrumented(joint: JointFit, problem: FreeProblem, runs: Sequence[Run], ans
             break
         level = _size(here)
         for halving in range(HALVINGS):
-            tried = feasible(problem, values, values + 0.5**halving * step)
+            tried = problem.feasible(values, values + 0.5**halving * step)
             try:
                 there = _moment(measured, clean, tried)
             except FtlmError:

@@ -1,13 +1,12 @@
 """Joint output error: all equations, all runs, continuous orders, from an automatic start to intervals.
 
 For white measurement noise the estimate is maximum likelihood. The core minimises from a start
-(Levenberg-Marquardt with an analytic Jacobian); this file finds starts, weighs outputs by their noise, refines the grid
-until it no longer matters, and turns the optimum into numbers with intervals.
+(Levenberg-Marquardt with an analytic Jacobian), weighs outputs by what is left of them, refines the grid until it no
+longer matters, and tells the covariance; this file finds where to start from, and names what comes out.
 """
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -19,22 +18,21 @@ from ftlm.base.arrays import Floats
 from ftlm.base.errors import ConvergenceError, DataError, FtlmError
 from ftlm.base.progress import Course
 from ftlm.base.statistics import NORMAL_95, noise_of
-from ftlm.base.tall import length
+from ftlm.base.threads import stop
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss
 from ftlm.data.structures import Initial, Structure
-from ftlm.fit.clock import Clock
-from ftlm.fit.extrapolation import feasible
+from ftlm.fit.clock import spans
 from ftlm.fit.friction import race_with_friction
 from ftlm.fit.grid import FINEST, Attempt, Grid
 from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.race import SAME_COST, finalists, race
-from ftlm.fit.robust import Robust, huber_shares, same_shares, scales
-from ftlm.fit.steady import Growth, grows, steadied
+from ftlm.fit.robust import Robust
+from ftlm.fit.steady import Growth, steadied
 from ftlm.fit.twins import twin_words
-from ftlm.fit.uncertainty import covariance, deviation
+from ftlm.fit.uncertainty import deviation
 from ftlm.solve.instants import compared_values
 
 #: Share of a fit's course at whose end the race is, and of what is left of that what each of its sweeps takes.
@@ -44,16 +42,6 @@ COARSE_SHARE = 0.01
 #: Evaluations of each finalist on all samples, and of what is left then.
 FINAL_LAP = 60
 LAST_LAP = 120
-#: Descents to settled weights, and to those of a robust loss, which settle by a factor of some four each.
-ROUNDS = 4
-ROBUST_ROUNDS = 15
-#: Weights are settled when no output's residuals differ from their weight by more than this share.
-SETTLED = 0.01
-#: Refinement ends when halving the step moves no estimate, or none extrapolated to step 0, by this share of its
-#: standard error.
-REFINED = 0.1
-#: Logarithm of residuals by which halving the step may raise them before other starts have their way on the finer grid.
-ROSE = 5e-4
 
 
 @dataclass(frozen=True)
@@ -293,10 +281,9 @@ def ended(best: Attempt, grid: Grid, reached: Sequence[Attempt], loss: Loss, *, 
     best, grid, growth = steadied(best, grid, reached)
     if growth is not None and not growth.kept:
         best, grid = with_settled_weights(best, grid, loss)
-    others = finalists(reached) if reached else ()
-    optimum = refined(best, grid, loss, others) if refine else Optimum(best, grid, best.values, settled=True)
+    others = finalists(reached) if reached and refine else ()
     starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
-    return replace(joint_fit(optimum, starts), growth=growth)
+    return replace(finished(best, grid, others, loss, refine=refine), starts=starts, growth=growth)
 
 
 def given(problem: FreeProblem, values: Mapping[str, float]) -> Attempt:
@@ -327,154 +314,42 @@ def winner(contenders: Sequence[Attempt], near: Grid) -> Attempt:
 
 def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -> tuple[Attempt, Grid]:
     """Descend on a grid until the weights are those of the residuals, pooled over runs, and so are robust shares."""
-    last = (ROBUST_ROUNDS if loss == "huber" else ROUNDS) - 1
-    for turn in range(last + 1):
-        attempt = grid.descend(attempt, LAST_LAP, plain=True)
-        levels = scales(grid, attempt) if loss == "huber" else grid.levels(attempt)
-        beyond = [o for o, level in levels.items() if not math.isfinite(level)]
-        if beyond:
-            raise ConvergenceError(
-                f"wherever it starts, the free run of {beyond[0]} ends beyond the range of numbers: it grows; leave "
-                "out the term that pushes, or bound its coefficient"
-            )
-        settled = all(abs(v - 1.0) < SETTLED for v in levels.values())
-        shares = huber_shares(grid, attempt, levels) if loss == "huber" else None
-        if turn == last or (settled and same_shares(grid.shares, shares)):
-            break
-        weights = [w / max(level, 1e-300) for w, level in zip(grid.weights, levels.values(), strict=True)]
-        grid = replace(grid, weights=weights, shares=shares)
-    return attempt, grid
+    outcome, weights, shares = grid.problem.core.settled(
+        grid.sampled, spans(grid.runs), grid.core, _place(attempt), loss == "huber", stop()
+    )
+    numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
+    there = replace(attempt, orders=numbers[0], coefficients=numbers[1], inputs=numbers[2], outcome=outcome)
+    return there, replace(grid, weights=weights, shares=shares)
 
 
-@dataclass(frozen=True)
-class Optimum:
-    """Where a fit ended on its finest grid, and its estimate at step 0."""
-
-    attempt: Attempt
-    grid: Grid
-    estimate: Floats
-    settled: bool
+def _place(attempt: Attempt) -> tuple[list[float], list[list[float]]]:
+    """Numbers of an attempt, and states of its runs where they are known."""
+    known = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
+    return attempt.values.tolist(), known
 
 
-def refined(best: Attempt, grid: Grid, loss: Loss = "squares", others: Sequence[Attempt] = ()) -> Optimum:
-    """Halve the step until that moves the estimate by little of its standard error.
+def finished(best: Attempt, grid: Grid, others: Sequence[Attempt], loss: Loss, *, refine: bool) -> JointFit:
+    """An optimum, its step halved until that moves it by little of its standard error, in words and names.
 
     A coarse grid may lead along a flat valley to where equations end, and there a finer one leads nowhere: then others
     have their way on it as well.
     """
-    estimate, settled = best.values, False
-    clock = Clock.of(grid.problem, grid.runs)
-    before: Attempt | None = None
-    while not settled and grid.every < FINEST:
-        # On a finer grid residuals may shrink to their noise, so weights follow anew.
-        try:
-            finer, fine_grid = with_settled_weights(expected(grid.problem, clock, best, before), grid.finer, loss)
-        except FtlmError:
-            # Where two grids point there may be no free run.
-            finer, fine_grid = with_settled_weights(best, grid.finer, loss)
-        rose = likelihood(finer, fine_grid) > likelihood(best, grid) + ROSE
-        if (finer.outcome["status"] == "wall" and before is None) or (rose and others):
-            other, fine_grid = freed(finer, fine_grid, others, loss)
-            # They have had their way.
-            others = ()
-            if other is not finer:
-                # Two grids have two optima, of which they tell nothing together.
-                before, best, estimate, grid = None, other, other.values, fine_grid
-                continue
-        grid = fine_grid
-        errors = clock.errors(finer.values, covariance(finer, grid))
-        # The scheme is of second order, so two grids tell the limit (Richardson); a third tells whether that is so.
-        # Of a flat valley in which neither stood still, or of two fits that a wall stopped, they tell nothing.
-        still = finer.converged and best.converged
-        limit = finer.values
-        if still:
-            fine, coarse = clock.told(finer.values), clock.told(best.values)
-            limit = clock.untold(feasible(grid.problem, fine, fine + (fine - coarse) / 3.0))
-        ways = (limit, estimate), (finer.values, best.values)
-        moved = [np.abs(clock.told(one) - clock.told(other)) for one, other in ways]
-        settled = any(bool(np.all(way <= REFINED * errors)) for way in moved)
-        before, best, estimate = best, finer, limit
-    return Optimum(best, grid, nearer(best, grid, estimate, clock, settled=settled), settled)
-
-
-def freed(stuck: Attempt, grid: Grid, others: Sequence[Attempt], loss: Loss) -> tuple[Attempt, Grid]:
-    """What an attempt that a wall stopped came to, or another one on its grid if that leaves less."""
-    best, least = (stuck, grid), likelihood(stuck, grid)
-    for other in others:
-        try:
-            there = with_settled_weights(other, grid, loss)
-        except FtlmError:
-            continue
-        if likelihood(*there) < least and not (grid.steady and grows(grid.problem, there[0])):
-            best, least = there, likelihood(*there)
-    return best
-
-
-def likelihood(attempt: Attempt, grid: Grid) -> float:
-    """Minus the logarithm of the likelihood per sample, but for a constant."""
-    levels = grid.levels(attempt).values()
-    return math.fsum(math.log(max(level, 1e-300) / w) for level, w in zip(levels, grid.weights, strict=True))
-
-
-def expected(problem: FreeProblem, clock: Clock, best: Attempt, before: Attempt | None) -> Attempt:
-    """Where to begin on half the step: what moved the optimum from the last grid to this moves it a quarter as far."""
-    if before is None or not (best.converged and before.converged):
-        return best
-    fine, coarse = clock.told(best.values), clock.told(before.values)
-    return at_values(best, problem, clock.untold(feasible(problem, fine, fine + (fine - coarse) / 4.0)))
-
-
-def at_values(attempt: Attempt, problem: FreeProblem, values: Floats) -> Attempt:
-    """An attempt at other values."""
-    orders, coefficients, inputs = problem.split(values.tolist())
-    return replace(attempt, orders=orders, coefficients=coefficients, inputs=inputs)
-
-
-def nearer(best: Attempt, grid: Grid, limit: Floats, clock: Clock, *, settled: bool) -> Floats:
-    """What is nearer to the truth on half the step, the limit that two grids tell or the optimum of the finer one.
-
-    Along the bottom of a flat and curved valley, where numbers cannot be told apart, a straight line leads out of it.
-    Where the residuals follow it there is none, and a limit on which grids agree is nearer.
-    """
-    columns = np.asarray(best.outcome["jacobian"]).T
-    way = clock.step(best.values, clock.told(limit) - clock.told(best.values))
-    if float(np.sum((columns @ way) ** 2)) <= REFINED**2:
-        # Both leave the same.
-        return limit
-    ahead = at_values(best, grid.problem, limit)
-    if settled:
-        with contextlib.suppress(FtlmError):
-            told = np.asarray(best.outcome["residuals"]) + columns @ way
-            bent = length(np.asarray(grid.evaluated(ahead).outcome["residuals"]) - told)
-            if bent <= REFINED * length(columns @ way):
-                return limit
-    costs = []
-    for attempt in (ahead, best):
-        try:
-            costs.append(float(grid.finer.evaluated(attempt).outcome["cost"]))
-        except FtlmError:
-            # No finite free run there.
-            costs.append(math.inf)
-    return limit if costs[0] <= costs[1] else best.values
-
-
-def joint_fit(optimum: Optimum, starts: list[tuple[float, str]]) -> JointFit:
-    """The optimum with its covariance, its noise and its residuals."""
-    best, grid = optimum.attempt, optimum.grid
-    problem = grid.problem
-    low, high = np.array(problem.all_bounds).T
-    orders, coefficients, inputs = problem.split(np.clip(optimum.estimate, low, high).tolist())
-    levels = grid.levels(best) if grid.shares is None else scales(grid, best)
-    residuals = grid.residuals(best)
+    problem, outputs = grid.problem, grid.problem.structure.outputs
+    end = problem.core.finished(
+        grid.sampled, spans(grid.runs), grid.core, best.outcome, [_place(a) for a in others], loss == "huber", refine,
+        stop(),
+    )  # fmt: skip
+    there = end["attempt"]
+    orders, coefficients, inputs = problem.split(end["estimate"])
+    residuals = [dict(zip(outputs, part, strict=True)) for part in end["left"]]
     return JointFit(
         orders=dict(zip(problem.orders, orders, strict=True)),
         coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
         inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)), products=dict(problem.products),
-        covariance=covariance(best, grid), residuals=residuals,
-        robust=None if grid.shares is None else Robust.of(grid, best), shares=grid.shares, on_grid=best.values,
-        noise={o: level / w for (o, level), w in zip(levels.items(), grid.weights, strict=True)},
-        cost=float(best.outcome["cost"]), samples=sum(read(e).size for part in residuals for e in part.values()),
-        refinement=grid.every,
-        settled=optimum.settled, converged=best.converged, starts=starts, initial=problem.structure.initial,
-        initial_terms=sum(len(x) for run in best.outcome["initial"] for x in run),
+        covariance=end["covariance"], residuals=residuals, noise=dict(zip(outputs, end["noise"], strict=True)),
+        robust=None if end["robust"] is None else Robust(*end["robust"]), shares=end["shares"],
+        on_grid=np.array([*there["orders"], *there["coefficients"], *there["inputs"]]), cost=there["cost"],
+        samples=sum(read(e).size for part in residuals for e in part.values()), refinement=end["every"],
+        settled=end["settled"], converged=there["status"] == "converged", starts=[],
+        initial=problem.structure.initial, initial_terms=sum(len(x) for run in there["initial"] for x in run),
     )  # fmt: skip

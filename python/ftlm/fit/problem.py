@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.data.equations import Friction, Stribeck
 from ftlm.data.limits import FreeInput
 from ftlm.data.orders import MAX_ORDER, SEARCHED_ORDER, Order
 from ftlm.data.structures import Hints, Structure
-from ftlm.solve.records import affine
+from ftlm.solve.records import affine, initial_tuple
 
 #: Own bounds of orders where the structure gives none.
 ALPHA_BOUNDS = (0.05, SEARCHED_ORDER)
@@ -41,13 +41,6 @@ class FreeProblem:
     def names(self) -> list[str]:
         """Everything that is free: orders, coefficients, then numbers of inputs."""
         return [*self.orders, *self.coefficients, *(item.name for item in self.inputs)]
-
-    @property
-    def all_bounds(self) -> list[tuple[float, float]]:
-        """Bounds of everything that is free; those of coefficients are infinite, but friction takes energy."""
-        ends = [item.bounds for item in self.inputs]
-        least = {n: 0.0 for f in self._rubs for n in f.names} | {n: sys.float_info.min for n in self._speeds}
-        return [*self.bounds, *((least.get(n, -math.inf), math.inf) for n in self.coefficients), *ends]
 
     @property
     def _rubs(self) -> list[Friction]:
@@ -94,6 +87,27 @@ class FreeProblem:
             bounds = list((ends | inertia).values())
         coefficients = tuple(dict.fromkeys(free))
         return cls(structure, structure.order_names, coefficients, tuple(bounds), products, structure.free_inputs)
+
+    @property
+    def core(self) -> _core.JointProblem:
+        """The problem as the core follows its optima."""
+        structure, signals = self.structure, self.structure.signals
+        states = structure.filter_states(structure.initial)
+        return _core.JointProblem(
+            structure.outputs, self.laws(signals), self.bounds, len(self.coefficients),
+            [(signals.index(item.signal), item.law, item.bounds) for item in self.inputs],
+            structure.coupling == "simulated", initial_tuple(structure.initial, structure.offset, states),
+            self.frictions(),
+        )  # fmt: skip
+
+    @property
+    def all_bounds(self) -> list[tuple[float, float]]:
+        """Bounds of everything that is free; those of coefficients are infinite, but friction takes energy."""
+        return self.core.bounds
+
+    def feasible(self, at: Floats, towards: Floats) -> Floats:
+        """The last point on the way from a feasible one to another that keeps bounds and constraints of orders."""
+        return self.core.feasible(at, towards)
 
     def coordinates(self, start: Sequence[float], *, plain: bool) -> list[str]:
         """Logarithms where the start allows them."""

@@ -21,7 +21,6 @@ from ftlm.base.errors import FtlmError
 from ftlm.base.tall import dot, projections, singular
 from ftlm.base.threads import pool
 from ftlm.data.run import Run
-from ftlm.fit.extrapolation import feasible
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.joint import JointFit
@@ -302,7 +301,7 @@ class Valley:
         with np.errstate(over="ignore", invalid="ignore"):
             towards = values + direction / direction[i] * (value - values[i])
         towards[i] = value
-        point = feasible(self.grid.problem, at, towards)
+        point = self.grid.problem.feasible(at, towards)
         point[i] = value
         return point
 

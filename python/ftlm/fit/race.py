@@ -13,7 +13,7 @@ from ftlm.base.errors import FtlmError, ModelError
 from ftlm.base.threads import pool
 from ftlm.data.run import Run
 from ftlm.data.structures import History
-from ftlm.fit.clock import Clock
+from ftlm.fit.clock import clock
 from ftlm.fit.grid import FINEST, Attempt, Grid, descend
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.simpler import LowerOrder, Simpler, Whole, held, lower_orders, simpler, unlike, whole
@@ -146,7 +146,7 @@ def without_history(
         there = [less.embedded(a, problem) for a in ended[:1]]
         wholes += there if isinstance(less, Whole) else []
         reached = sorted(reached + there, key=lambda a: a.level)
-    clock = Clock.of(problem, runs)
+    unit = clock(problem, runs)
     for one in held(problem) if reached else []:
         if len(one.problem.orders) == 1 and reached[0].level > ABOVE_FLOOR * floor:
             # A race of one free order costs little where noise alone would leave less; bounds may leave it no lattice.
@@ -157,7 +157,7 @@ def without_history(
                 continue
         # Nor is it to end above what it reaches with one order known: from where it is, and from whole orders.
         near = (*distinct(reached)[:FINALISTS], *distinct(first)[:FINALISTS], *wholes)
-        runners = [one.without(a, problem, clock) for a in near]
+        runners = [one.without(a, problem, unit) for a in near]
         runners = distinct(laps.run(coarse, runners, GLANCE, one.problem), same_place)[:FINALISTS]
         ended = laps.run(coarse, runners, FIRST_LAP, one.problem)
         there = [one.embedded(a, problem.orders[one.order]) for a in ended[:1]]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+from ftlm import _core
 from ftlm.base.errors import FtlmError
 from ftlm.data.orders import Order
 from ftlm.data.run import Run
 from ftlm.data.structures import Hints, History
-from ftlm.fit.clock import Clock
 from ftlm.fit.grid import Attempt
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.starts import whole_orders
@@ -140,7 +140,7 @@ class Held:
     order: int
     value: float
 
-    def without(self, attempt: Attempt, whole: FreeProblem, clock: Clock) -> Attempt:
+    def without(self, attempt: Attempt, whole: FreeProblem, clock: _core.JointClock) -> Attempt:
         """A point of the whole problem as a start of this one: coefficients keep their numbers in the clock's unit."""
         told = clock.told(attempt.values)
         told[self.order] = self.value

@@ -17,7 +17,7 @@ import numpy as np
 from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.base.errors import FtlmError
-from ftlm.fit.clock import Clock
+from ftlm.fit.clock import clock
 from ftlm.fit.grid import Attempt, Grid
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.simpler import held as known_orders
@@ -142,13 +142,11 @@ def steadied(best: Attempt, grid: Grid, reached: Sequence[Attempt]) -> tuple[Att
         return best, grid, None
     held = replace(grid, steady=True)
     ends = stable_ends(held, best, reached)
-    clock = Clock.of(problem, grid.runs)
+    unit = clock(problem, grid.runs)
     for one in known_orders(problem):
         # What the equation explains with an order known without growing, it explains with that order free.
         narrow = replace(held, problem=one.problem)
-        inside = stable_ends(
-            narrow, one.without(best, problem, clock), [one.without(a, problem, clock) for a in reached]
-        )
+        inside = stable_ends(narrow, one.without(best, problem, unit), [one.without(a, problem, unit) for a in reached])
         if inside:
             with contextlib.suppress(FtlmError):
                 there = one.embedded(nearest_stable(narrow, inside), problem.orders[one.order])

@@ -12,7 +12,8 @@ const LARGEST: f64 = 300.0;
 
 /// ln of the unit of time, and of each coefficient that stands alone before a term the weights of the free orders in α − ν,
 /// behind its constant; none of others, which keep their number.
-pub(super) struct Clock {
+#[derive(Debug, Clone)]
+pub(crate) struct Clock {
     unit: f64,
     powers: Vec<Option<(f64, Vec<f64>)>>,
 }
@@ -20,7 +21,12 @@ pub(super) struct Clock {
 impl Clock {
     /// The unit of some experiments.
     pub(super) fn of(model: &FreeModel, experiments: &[Experiment]) -> Self {
-        let spans: Vec<f64> = experiments.iter().map(span).collect();
+        Self::of_spans(model, &experiments.iter().map(span).collect::<Vec<_>>())
+    }
+
+    /// The same from ln of the product of each run's sample interval and duration.
+    #[allow(clippy::cast_precision_loss)]
+    pub(crate) fn of_spans(model: &FreeModel, spans: &[f64]) -> Self {
         // A frequency half way, in logarithms, between that of the record and Nyquist's.
         let unit = spans.iter().sum::<f64>() / (2.0 * spans.len().max(1) as f64) - libm::log(std::f64::consts::PI);
         // Under a law between coefficients one number stands before terms of several orders: it keeps its own unit, as its
@@ -30,8 +36,13 @@ impl Clock {
         Self { unit, powers }
     }
 
+    /// ln of the unit of time.
+    pub(crate) fn unit(&self) -> f64 {
+        self.unit
+    }
+
     /// By what a coefficient is to be multiplied at some orders for its number in the unit.
-    pub(super) fn factor(&self, coefficient: usize, orders: &[f64]) -> f64 {
+    pub(crate) fn factor(&self, coefficient: usize, orders: &[f64]) -> f64 {
         self.powers[coefficient].as_ref().map_or(1.0, |(constant, weights)| {
             let power = constant + weights.iter().zip(orders).map(|(w, o)| w * o).sum::<f64>();
             // Of units beyond all measure no number is left.
@@ -40,7 +51,7 @@ impl Clock {
     }
 
     /// Share of itself by which a coefficient falls with one more of a free order, its number in the unit kept.
-    pub(super) fn fall(&self, coefficient: usize, order: usize) -> f64 {
+    pub(crate) fn fall(&self, coefficient: usize, order: usize) -> f64 {
         let weight = |(_, weights): &(f64, Vec<f64>)| weights.get(order).copied().unwrap_or(0.0);
         self.powers[coefficient].as_ref().map_or(0.0, weight) * self.unit
     }

@@ -7,7 +7,7 @@
 //! mean of the pulses on either side of kh, on a grid that may be finer than the samples, plus what the inputs of that
 //! instant feed through. Samples that were not read weigh nothing; samples at times of their own are compared there.
 
-mod clock;
+pub(crate) mod clock;
 mod corners;
 mod curvature;
 pub mod experiment;

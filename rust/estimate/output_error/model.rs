@@ -233,7 +233,7 @@ impl FreeModel {
     }
 
     /// Whether the free run of an equation grows, as far as equations stand alone.
-    pub(super) fn grows(&self, point: &Point) -> bool {
+    pub(crate) fn grows(&self, point: &Point) -> bool {
         let alone = !self.coupled || self.equations.len() == 1;
         alone && self.own_terms(point).iter().any(|(order, own)| grows(*order, own))
     }

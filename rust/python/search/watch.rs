@@ -1,7 +1,7 @@
 //! Runs a computation on a thread of its own, so that Python can stop it and see how far it is.
 
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::mpsc::{channel, RecvTimeoutError};
+use std::sync::mpsc::{channel, Receiver, RecvTimeoutError, Sender};
 use std::time::Duration;
 
 use pyo3::prelude::*;
@@ -139,6 +139,89 @@ pub fn leavable<T: Send + 'static>(
             }
         }
     })
+}
+
+/// What a computing thread asks of Python while it computes: questions go out, answers come in.
+pub struct Desk<Q, A, T> {
+    tell: Sender<Told<Q, T>>,
+    answers: Receiver<Result<A, Error>>,
+}
+
+enum Told<Q, T> {
+    Asks(Q),
+    Ends(Result<T, Error>),
+}
+
+impl<Q, A, T> Desk<Q, A, T> {
+    /// Asks, and waits for the answer.
+    ///
+    /// # Errors
+    /// [`Error::Source`] where Python raised an error of ftlm's own, [`Error::Interrupted`] where it raised another one, or
+    /// nobody is left to answer.
+    pub fn ask(&self, question: Q) -> Result<A, Error> {
+        self.tell.send(Told::Asks(question)).map_err(|_| Error::Interrupted)?;
+        self.answers.recv().unwrap_or(Err(Error::Interrupted))
+    }
+}
+
+/// As [`leavable`], but on a thread of its own whatever it takes, which may ask Python: answers are given on the thread
+/// that called, so that one that is left behind touches no Python. What Python raised comes out where `work` ends by it.
+pub fn served<T: Send + 'static, Q: Send + 'static, A: Send + 'static>(
+    py: Python<'_>,
+    flag: Option<&Stop>,
+    answer: impl Fn(Python<'_>, Q) -> PyResult<A> + Send + Sync,
+    work: impl FnOnce(&stop::Stop, &Desk<Q, A, T>) -> Result<T, Error> + Send + 'static,
+) -> PyResult<T> {
+    let stop = flag.cloned().unwrap_or_default().0;
+    py.detach(|| {
+        let (tell, hear) = channel();
+        let (reply, answers) = channel();
+        let (told, desk) = (stop.clone(), Desk { tell: tell.clone(), answers });
+        // One that is left behind has nobody to send to.
+        std::thread::spawn(move || drop(tell.send(Told::Ends(caught(|| work(&told, &desk))))));
+        let mut raised: Option<PyErr> = None;
+        loop {
+            match hear.recv_timeout(LOOK) {
+                Ok(Told::Ends(Err(Error::Source { why }))) => {
+                    return Err(raised.unwrap_or_else(|| Error::Source { why }.into()));
+                }
+                Ok(Told::Ends(result)) => return result.map_err(PyErr::from),
+                Ok(Told::Asks(question)) => {
+                    let answered = Python::attach(|py| match answer(py, question) {
+                        Err(error) if own(py, &error)? => {
+                            let why = error.value(py).to_string();
+                            raised = Some(error);
+                            Ok(Err(Error::Source { why }))
+                        }
+                        answered => answered.map(Ok),
+                    });
+                    match answered {
+                        Ok(answered) => drop(reply.send(answered)),
+                        Err(error) => {
+                            stop.set();
+                            return Err(error);
+                        }
+                    }
+                }
+                Err(RecvTimeoutError::Timeout) => {
+                    if let Err(error) = Python::attach(|py| py.check_signals()) {
+                        stop.set();
+                        return Err(error);
+                    }
+                    stop.check()?;
+                }
+                Err(RecvTimeoutError::Disconnected) => {
+                    let what = "a computing thread ended without a result".into();
+                    return Err(Error::Internal { what }.into());
+                }
+            }
+        }
+    })
+}
+
+/// Whether an exception is one of ftlm's own, which a computation may go round.
+fn own(py: Python<'_>, error: &PyErr) -> PyResult<bool> {
+    Ok(error.is_instance(py, &py.import("ftlm.errors")?.getattr("FtlmError")?))
 }
 
 /// Candidates done, in all, and left before the end of the record.

@@ -1,0 +1,183 @@
+//! The end of a joint fit: against figures of an independent implementation in NumPy, other starts that take over, and stops.
+
+use ftlm::colour;
+use ftlm::equation::{AffineOrder, Initial};
+use ftlm::error::Error;
+use ftlm::estimate::joint::covariance::long_run;
+use ftlm::estimate::joint::{
+    freed, refined, settled, Grid, Loss, Optimum, Place, Problem, Sampled, Signal, Source, Weights,
+};
+use ftlm::estimate::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
+use ftlm::means::Intersample;
+use ftlm::stop::Stop;
+use serde_json::Value;
+
+use crate::common::{check, list, number, numbers, reference, Random};
+
+fn order(constant: f64, weights: &[f64]) -> AffineOrder {
+    AffineOrder { constant, weights: weights.to_vec() }
+}
+
+fn problem(equation: FreeEquation, order_bounds: &[(f64, f64)], coefficients: usize, initial: Initial) -> Problem {
+    let model = FreeModel {
+        equations: vec![equation],
+        order_bounds: order_bounds.to_vec(),
+        coordinates: vec![Coordinate::Plain; coefficients],
+        inputs: Vec::new(),
+        coupled: true,
+        initial,
+    };
+    Problem::new(vec!["y".into()], model, Vec::new()).unwrap()
+}
+
+fn alone(coefficient: usize) -> Monomial {
+    Monomial { factor: 1.0, powers: vec![(coefficient, 1)] }
+}
+
+/// D^alpha y = d D^mu y + a y + b u, from rest; y is signal 0.
+fn three_terms() -> Problem {
+    let none = || order(0.0, &[0.0, 0.0]);
+    let terms = vec![(0, order(0.0, &[0.0, 1.0]), alone(0)), (0, none(), alone(1)), (1, none(), alone(2))];
+    let equation = FreeEquation { output: 0, order: order(0.0, &[1.0, 0.0]), terms };
+    problem(equation, &[(0.05, 3.0), (0.0, 3.0)], 3, Initial::Rest)
+}
+
+fn sampled(step: f64, outputs: &[Vec<f64>], inputs: &[Vec<f64>]) -> Sampled {
+    let of = |samples: &Vec<f64>, between| Signal { samples: samples.clone(), between };
+    let runs = outputs.iter().zip(inputs).map(|(y, u)| vec![of(y, Intersample::Linear), of(u, Intersample::Hold)]);
+    Sampled::new(step, vec![0], runs.collect()).unwrap()
+}
+
+fn place(orders: &[f64], coefficients: &[f64]) -> Place {
+    let point = Point { orders: orders.to_vec(), coefficients: coefficients.to_vec(), inputs: Vec::new() };
+    Place { point, states: Vec::new() }
+}
+
+fn weighing(weight: f64) -> Weights {
+    Weights { outputs: vec![weight], shares: None }
+}
+
+fn close(what: &str, found: &[f64], told: &[f64], tolerance: f64) {
+    assert_eq!(found.len(), told.len(), "{what}");
+    let size = told.iter().fold(1e-300_f64, |a, v| a.max(v.abs()));
+    let far = found.iter().zip(told).map(|(a, b)| (a - b).abs() / size).fold(0.0, f64::max);
+    check(what, far, tolerance);
+}
+
+fn table(value: &Value) -> Vec<Vec<f64>> {
+    list(value).iter().map(numbers).collect()
+}
+
+#[test]
+fn the_end_of_a_fit_is_that_of_another_implementation() {
+    let told = reference("joint_fit");
+    let (problem, stop, start) = (three_terms(), Stop::default(), numbers(&told["start"]));
+    for case in list(&told["cases"]) {
+        let name = case["name"].as_str().unwrap();
+        let loss = if case["loss"] == "huber" { Loss::Huber } else { Loss::Squares };
+        let (inputs, outputs) = (table(&case["inputs"]), table(&case["outputs"]));
+        let source = sampled(number(&told["step"]), &outputs, &inputs);
+        let grid = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), false).unwrap();
+        let (best, grid) = settled(&place(&start[..2], &start[2..]), grid, loss).unwrap();
+        close(&format!("{name}: settled"), &best.values(), &numbers(&case["settled"]["values"]), 1e-9);
+        close(&format!("{name}: weights"), &grid.weights.outputs, &numbers(&case["settled"]["weights"]), 1e-9);
+        close(&format!("{name}: cost"), &[best.cost], &[number(&case["settled"]["cost"])], 1e-9);
+        let rough = Optimum::unrefined(best.clone(), grid.clone()).unwrap().finished();
+        assert_eq!((rough.every, &rough.estimate), (1, &best.values()));
+        let found = refined(best, grid, loss, &[]).unwrap().finished();
+        assert_eq!(found.every as u64, case["refinement"].as_u64().unwrap());
+        assert_eq!(found.settled, case["stands"].as_bool().unwrap());
+        close(&format!("{name}: estimate"), &found.estimate, &numbers(&case["estimate"]), 1e-9);
+        close(&format!("{name}: on its grid"), &found.attempt.values(), &numbers(&case["on_grid"]), 1e-9);
+        close(&format!("{name}: covariance"), &found.covariance, &table(&case["covariance"]).concat(), 1e-7);
+        close(&format!("{name}: noise"), &found.noise, &[number(&case["noise"])], 1e-9);
+        let robust = found.robust.map(|r| vec![r.lowered as u64, r.outliers as u64, r.samples as u64]);
+        let counted = case["robust"].as_array().map(|of| of.iter().map(|v| v.as_u64().unwrap()).collect());
+        assert_eq!(robust, counted);
+        // The colour of what is left, and what sums of it scatter by.
+        let series: Vec<Vec<f64>> = found.residuals.iter().map(|run| run[0].clone()).collect();
+        let rows: Vec<&[f64]> = series.iter().map(Vec::as_slice).collect();
+        let (filter, power) = colour::coloured(&rows, 6);
+        close(&format!("{name}: filter"), &filter, &numbers(&case["filter"]), 1e-7);
+        close(&format!("{name}: power"), &[power], &[number(&case["power"])], 1e-8);
+        close(
+            &format!("{name}: covariances"),
+            &colour::covariances(&filter, power, 8),
+            &numbers(&case["covariances"]),
+            1e-7,
+        );
+        let inner =
+            |signals: &[Vec<f64>]| -> Vec<f64> { signals.iter().flat_map(|s| s[1..s.len() - 1].to_vec()).collect() };
+        let sums = long_run(&[inner(&inputs), inner(&outputs)], &series).unwrap();
+        close(&format!("{name}: sums"), &sums, &table(&case["sums"]).concat(), 1e-7);
+    }
+}
+
+/// y′ = −2 y + 2 u with a little noise, in exact steps, and D y = −a y + b u, whatever the run starts from.
+fn first_order() -> (Problem, Sampled) {
+    let (step, decay) = (0.02, (-0.04_f64).exp());
+    let mut random = Random::new(3);
+    let (mut y, mut states, mut u) = (0.0, Vec::new(), Vec::new());
+    for (k, noise) in random.signal(400).iter().enumerate() {
+        let command = if (k / 50) % 2 == 0 { 1.0 } else { -1.0 };
+        states.push(y + 0.01 * noise);
+        u.push(command);
+        y = decay * y + (1.0 - decay) * command;
+    }
+    let none = || order(0.0, &[]);
+    let own = Monomial { factor: -1.0, powers: vec![(0, 1)] };
+    let equation =
+        FreeEquation { output: 0, order: order(1.0, &[]), terms: vec![(0, none(), own), (1, none(), alone(1))] };
+    (problem(equation, &[], 2, Initial::Caputo), sampled(step, &[states], &[u]))
+}
+
+#[test]
+fn another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less() {
+    let ((problem, source), stop) = (first_order(), Stop::default());
+    let grid = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), false).unwrap();
+    let at = |a: f64, b: f64| place(&[], &[a, b]);
+    let stuck = grid.evaluated(&at(1.0, 1.0)).unwrap().unwrap();
+    let (best, there) = freed(&stuck, &grid, &[at(3.0, 1.0)], Loss::Squares).unwrap().unwrap();
+    close("coefficients", &best.values(), &[2.0, 2.0], 0.03);
+    // Its weights are settled: those of what it leaves.
+    check("level", (there.levels(&best)[0] - 1.0).abs(), 0.01);
+    assert_ne!(there.weights, grid.weights);
+    // Nobody else: the same one on the same grid. None of those that leave more than it.
+    assert!(freed(&stuck, &grid, &[], Loss::Squares).unwrap().is_none());
+    let ahead = there.evaluated(&best.place).unwrap().unwrap();
+    assert!(freed(&ahead, &there, &[at(1.9, 1.9)], Loss::Squares)
+        .unwrap()
+        .is_none_or(|(a, _)| a.cost < ahead.cost * 1.0001));
+}
+
+#[test]
+fn who_grows_takes_no_place_where_that_may_not_be() {
+    let ((problem, source), stop) = (first_order(), Stop::default());
+    let free = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), false).unwrap();
+    let steady = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), true).unwrap();
+    assert!(problem.grows(&place(&[], &[-2.0, 1.0]).point) && !problem.grows(&place(&[], &[2.0, 1.0]).point));
+    let stuck = steady.evaluated(&place(&[], &[1.0, 1.0])).unwrap().unwrap();
+    let (best, _) = freed(&stuck, &steady, &[place(&[], &[3.0, 1.0])], Loss::Squares).unwrap().unwrap();
+    assert!(best.values()[0] > 0.0);
+    // On a steady grid a descent from where it dies away stays there.
+    let start = place(&[], &[0.01, 1e-9]);
+    let found = steady.descend(&start, 60).unwrap();
+    assert!(!problem.grows(&found.place.point));
+    assert!(free.descend(&start, 60).unwrap().cost <= found.cost * (1.0 + 1e-9));
+}
+
+#[test]
+fn a_stop_is_heard_and_what_does_not_fit_is_refused() {
+    let ((problem, source), stop) = (first_order(), Stop::default());
+    let grid = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), false).unwrap();
+    let start = place(&[], &[1.0, 1.0]);
+    let two = Weights { outputs: vec![1.0, 1.0], shares: None };
+    assert!(matches!(Grid::new((&problem, &source, &stop), two, (1, 1), false).map(|_| ()), Err(Error::Length { .. })));
+    assert!(problem.point(&[1.0]).is_err());
+    assert!(
+        Sampled::new(0.1, vec![2], vec![vec![Signal { samples: vec![0.0; 5], between: Intersample::Linear }]]).is_err()
+    );
+    assert_eq!(source.spans(), [(0.02, 8.0)]);
+    stop.set();
+    assert!(matches!(settled(&start, grid, Loss::Squares).map(|_| ()), Err(Error::Interrupted)));
+}
