@@ -468,7 +468,7 @@ class Sound:
         low = self.number(0.6, 1.2)
         alpha = low, self.one(low, low + 0.3)
         terms = [(0, 0.0, self.number(0.0, low)), (2, 0.0, self.one(0.0, 0.4))]
-        asked = self.number(0.01, 0.9), self.one(5.0, 100.0), self.one(10, 500, 3000), self.one(1, 2), 1 << 28
+        asked = self.number(0.01, 0.9), self.one(5.0, 100.0), self.one(64, 500, 3000), self.one(1, 2), 1 << 28
         return [self.record(sensor=False)], (0, alpha, terms, self.one(0.05, 0.2)), asked, self.progress()
 
     def portable(self):

@@ -157,8 +157,8 @@ def by_output_error(
     orders, coefficients = list(joint.orders.values()), list(joint.coefficients.values())
     identified = structure.with_orders(joint.orders).with_coefficients(problem.named(coefficients))
     moved = problem.number_jacobian(orders, coefficients)
-    with np.errstate(invalid="ignore"):
-        # Of directions that the runs do not see covariances are no numbers; then none of these is given.
+    with np.errstate(invalid="ignore", over="ignore"):
+        # Of directions that the runs do not see covariances are no numbers, or beyond them; then none of these is given.
         spread = moved @ joint.covariance @ moved.T
     return Fit(
         Task(task.runs, structure), "output-error",
