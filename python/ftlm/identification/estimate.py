@@ -158,7 +158,7 @@ def by_output_error(
     identified = structure.with_orders(joint.orders).with_coefficients(problem.named(coefficients))
     moved = problem.number_jacobian(orders, coefficients)
     with np.errstate(invalid="ignore", over="ignore"):
-        # Of directions that the runs do not see covariances are no numbers, or beyond them; then none of these is given.
+        # Of directions that the runs do not see covariances are no numbers, or beyond them; then none is given.
         spread = moved @ joint.covariance @ moved.T
     return Fit(
         Task(task.runs, structure), "output-error",
