@@ -17,7 +17,7 @@ const LEAST_CIRCLE: usize = 4096;
 /// ```
 /// // Every other value the opposite: x_k = −0.9 x_{k−1} and what does not follow from it.
 /// let mut x = vec![1.0];
-/// (1..400).for_each(|k| x.push(-0.9 * x[k - 1] + f64::from(k % 7) / 7.0 - 3.0 / 7.0));
+/// (0..399_u32).for_each(|k| x.push(-0.9 * x[k as usize] + f64::from(k % 7) / 7.0 - 3.0 / 7.0));
 /// let (filter, power) = ftlm::colour::coloured(&[&x], 5);
 /// assert!(filter.len() > 1 && power > 0.0);
 /// ```
