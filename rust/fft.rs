@@ -49,10 +49,10 @@ pub fn fast_length(n: usize) -> usize {
 }
 
 /// Longest transform whose plan is kept for good; a plan holds some 20 bytes a point.
-const KEPT: usize = 1 << 17;
+const KEPT: usize = 1 << 14;
 /// Points of all longer ones together beyond which those asked for longest ago are forgotten: a run on ever finer grids
 /// would leave the plans of all of them behind. What is forgotten too early costs two transforms once more.
-const POINTS: usize = 1 << 22;
+const POINTS: usize = 1 << 20;
 /// Those among so many long ones asked for last are in use: one evaluation of a large problem may hold more points than
 /// these.
 const IN_USE: u64 = 16;

@@ -8,6 +8,7 @@ mod common;
 mod bindings;
 mod boxes;
 mod certificate;
+mod clock;
 mod equation;
 mod estimators;
 mod fractional;

@@ -310,7 +310,7 @@ fn a_filter_on_the_outputs_is_part_of_the_model() {
         experiment.samples[1] = point_samples(&filtered);
         with_signal(&experiment.record, 1, filtered)
     };
-    experiment.record = logged;
+    experiment.record = logged.into();
     let model = two_link(true, Initial::Rest);
     let without =
         fit(&model, std::slice::from_ref(&experiment), &point(&START.0, &START.1), Settings::default()).unwrap();
@@ -332,7 +332,7 @@ fn late(delay: f64, every: usize, noise: f64, seed: u64) -> Experiment {
         let sigma = noise * deviation(&clean);
         experiment.weights[i] = if noise > 0.0 { 1.0 / sigma } else { 1.0 / deviation(&clean) };
         experiment.samples[i] = clean.iter().map(|y| y + sigma * random.normal()).collect();
-        experiment.record = with_signal(&experiment.record, i, means);
+        experiment.record = with_signal(&experiment.record, i, means).into();
     }
     experiment
 }

@@ -10,7 +10,7 @@ import numpy as np
 
 from ftlm.base.arrays import Floats
 from ftlm.base.statistics import chi_squared
-from ftlm.base.tall import dot, orthonormal, projections, triangle
+from ftlm.base.tall import dot, orthonormal, projections, triangle, turned_rows
 from ftlm.judge.metrics import finite
 
 #: Future samples of the input that are looked at: an answer within a few samples hides among many.
@@ -64,12 +64,13 @@ def past_columns(signal: Floats, first: int, reach: int, *, dense: int = DENSE, 
     """
     count = signal.size
     padded = np.concatenate([np.full(count, signal[0]), signal])
-    sums = np.concatenate([[0.0], np.cumsum(padded - signal[0])])
-    columns = [padded[count - lag : 2 * count - lag] - signal[0] for lag in range(first, min(dense, reach) + 1)]
+    moved = padded - signal[0]
+    sums = np.concatenate([[0.0], np.cumsum(moved)])
+    columns = [moved[count - lag : 2 * count - lag] for lag in range(first, min(dense, reach) + 1)]
     start, width = dense + 1, max(2, dense // 4)
     while start + width <= reach:
-        end = np.arange(count, 2 * count) - start + 1
-        columns.append((sums[end] - sums[end - width]) / width)
+        end = count - start + 1
+        columns.append((sums[end : end + count] - sums[end - width : end - width + count]) / width)
         start, width = start + width, int(width * wider) + 1
     return columns
 
@@ -155,7 +156,7 @@ class Regressors:
                 break
         if not parts:
             return None
-        turned = triangle(np.concatenate([triangle(np.stack(part, axis=1)) for part in parts]))
+        turned = triangle(np.concatenate([turned_rows(part) for part in parts]))
         count = sum(part[-1].size for part in parts)
         return cls(turned[:, :width], turned[:, width], turned[:, width + 1 : -1], turned[:, -1], count)
 

@@ -1,5 +1,7 @@
 //! One run to compare with, sample by sample.
 
+use std::sync::Arc;
+
 use crate::error::{check_finite, check_length, Error, Result};
 use crate::impulses::is_impulse;
 use crate::readings::{Jumps, Readings};
@@ -9,8 +11,8 @@ use crate::series;
 /// One run to compare with: pulse means on a grid of which every `every`-th edge is a sample.
 #[derive(Debug, Clone)]
 pub struct Experiment {
-    /// Pulse means of all signals.
-    pub record: Record,
+    /// Pulse means of all signals; those of runs that differ in weights alone are the same.
+    pub record: Arc<Record>,
     /// Pulses a sample interval.
     pub every: usize,
     /// Point samples of each equation's output, one more than there are intervals.
@@ -72,7 +74,7 @@ impl Experiment {
 
     fn unchecked(record: Record, every: usize, samples: Vec<Vec<f64>>, weights: Vec<f64>) -> Self {
         let (filter, instants, shares, own) = (None, Vec::new(), Vec::new(), None);
-        Self { record, every, samples, filter, weights, instants, shares, own, passed: false }
+        Self { record: Arc::new(record), every, samples, filter, weights, instants, shares, own, passed: false }
     }
 
     /// The same experiment, some of its compared samples counting less.
@@ -155,7 +157,7 @@ impl Experiment {
             Some((series, applies))
                 if applies.iter().all(|&a| a) && self.own.is_none() && !self.record.is_filtered() =>
             {
-                Ok(Some(Self { record: self.record.through(series)?, passed: true, ..self.clone() }))
+                Ok(Some(Self { record: Arc::new(self.record.through(series)?), passed: true, ..self.clone() }))
             }
             _ => Ok(None),
         }
