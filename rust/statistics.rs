@@ -73,17 +73,28 @@ pub fn root_mean_square(values: &[f64]) -> f64 {
 /// ```
 #[must_use]
 pub fn robust_deviation(values: &[f64]) -> f64 {
-    let mut sizes: Vec<f64> = values.iter().map(|v| v.abs()).collect();
-    if sizes.is_empty() {
+    if values.is_empty() {
         return 0.0;
     }
-    let middle = sizes.len() / 2;
-    let (below, &mut upper, _) = sizes.select_nth_unstable_by(middle, f64::total_cmp);
-    let median = match values.len() % 2 {
+    median(values.iter().map(|v| v.abs()).collect()) / MAD
+}
+
+/// The middle one of values, or the mean of the two in the middle; not a number of none.
+///
+/// ```
+/// assert_eq!(ftlm::statistics::median(vec![3.0, 1.0, 8.0, 2.0]), 2.5);
+/// ```
+#[must_use]
+pub fn median(mut values: Vec<f64>) -> f64 {
+    let count = values.len();
+    if count == 0 {
+        return f64::NAN;
+    }
+    let (below, &mut upper, _) = values.select_nth_unstable_by(count / 2, f64::total_cmp);
+    match count % 2 {
         0 => f64::midpoint(below.iter().copied().fold(f64::NEG_INFINITY, f64::max), upper),
         _ => upper,
-    };
-    median / MAD
+    }
 }
 
 /// Autocovariances of series at lags from 0 to `most`, and how many pairs each is the mean of. What is no number is not

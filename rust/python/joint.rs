@@ -16,7 +16,7 @@ use super::search::watch::{leavable, served, Desk, Stop};
 use crate::colour;
 use crate::error::{check_length, Error};
 use crate::estimate::joint::covariance as spread;
-use crate::estimate::joint::{self as ends, Attempt, Finished, Grid, Loss, Optimum, Place, Source, Weights};
+use crate::estimate::joint::{self as ends, Attempt, Finished, Grid, Loss, Optimum, Place, Sampling, Source, Weights};
 use crate::estimate::output_error::{Coordinate, Experiment, FreeModel};
 use crate::statistics;
 
@@ -31,7 +31,7 @@ type Spans = List<(f64, f64)>;
 
 /// Runs that Python samples.
 struct Asked<'a, T> {
-    desk: &'a Desk<(usize, usize), Vec<Experiment>, T>,
+    desk: &'a Desk<Sampling, Vec<Experiment>, T>,
     spans: Vec<(f64, f64)>,
 }
 
@@ -40,15 +40,15 @@ impl<T> Source for Asked<'_, T> {
         self.spans.clone()
     }
 
-    fn experiments(&self, every: usize, decimation: usize) -> Result<Vec<Experiment>, Error> {
-        self.desk.ask((every, decimation))
+    fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>, Error> {
+        self.desk.ask(sampling)
     }
 }
 
 /// The answer to a request for runs on a grid.
-fn sampling(runs: &Py<PyAny>) -> impl Fn(Python<'_>, (usize, usize)) -> PyResult<Vec<Experiment>> + Send + Sync + '_ {
-    |py, grid| {
-        let given: List<ExperimentArg<'_>> = runs.call1(py, grid)?.extract(py)?;
+fn sampling(runs: &Py<PyAny>) -> impl Fn(Python<'_>, Sampling) -> PyResult<Vec<Experiment>> + Send + Sync + '_ {
+    |py, sampling| {
+        let given: List<ExperimentArg<'_>> = runs.call1(py, (sampling.every, sampling.decimation))?.extract(py)?;
         given.iter().map(experiment).collect()
     }
 }
@@ -185,7 +185,8 @@ impl JointProblem {
         let problem = Arc::clone(&self.inner);
         let (found, weights) = served(py, stop, sampling(&runs), move |stop, desk| {
             let source = Asked { desk, spans: spans.into() };
-            let grid = Grid::new((&problem, &source, stop), weights, (every, decimation), steady)?;
+            let sampling = Sampling { every, decimation, first: None };
+            let grid = Grid::new((&problem, &source, stop), weights, sampling, steady)?;
             let (found, grid) = ends::settled(&start, grid, loss(huber))?;
             Ok((found, grid.weights))
         })?;
@@ -217,7 +218,8 @@ impl JointProblem {
         let problem = Arc::clone(&self.inner);
         let finished = served(py, stop, sampling(&runs), move |stop, desk| {
             let source = Asked { desk, spans: spans.into() };
-            let grid = Grid::new((&problem, &source, stop), weights, (every, decimation), steady)?;
+            let sampling = Sampling { every, decimation, first: None };
+            let grid = Grid::new((&problem, &source, stop), weights, sampling, steady)?;
             grid.check(&best)?;
             let optimum =
                 if refine { ends::refined(best, grid, loss(huber), &others)? } else { Optimum::unrefined(best, grid)? };

@@ -5,7 +5,7 @@ use ftlm::equation::{AffineOrder, Initial};
 use ftlm::error::Error;
 use ftlm::estimate::joint::covariance::long_run;
 use ftlm::estimate::joint::{
-    freed, refined, settled, Grid, Loss, Optimum, Place, Problem, Sampled, Signal, Source, Weights,
+    freed, refined, settled, Grid, Loss, Optimum, Place, Problem, Sampled, Sampling, Signal, Source, Weights,
 };
 use ftlm::estimate::output_error::{Coordinate, FreeEquation, FreeModel, Monomial, Point};
 use ftlm::means::Intersample;
@@ -53,6 +53,10 @@ fn place(orders: &[f64], coefficients: &[f64]) -> Place {
     Place { point, states: Vec::new() }
 }
 
+fn sampling(every: usize, decimation: usize) -> Sampling {
+    Sampling { every, decimation, first: None }
+}
+
 fn weighing(weight: f64) -> Weights {
     Weights { outputs: vec![weight], shares: None }
 }
@@ -77,7 +81,7 @@ fn the_end_of_a_fit_is_that_of_another_implementation() {
         let loss = if case["loss"] == "huber" { Loss::Huber } else { Loss::Squares };
         let (inputs, outputs) = (table(&case["inputs"]), table(&case["outputs"]));
         let source = sampled(number(&told["step"]), &outputs, &inputs);
-        let grid = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), false).unwrap();
+        let grid = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
         let (best, grid) = settled(&place(&start[..2], &start[2..]), grid, loss).unwrap();
         close(&format!("{name}: settled"), &best.values(), &numbers(&case["settled"]["values"]), 1e-9);
         close(&format!("{name}: weights"), &grid.weights.outputs, &numbers(&case["settled"]["weights"]), 1e-9);
@@ -134,7 +138,7 @@ fn first_order() -> (Problem, Sampled) {
 #[test]
 fn another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less() {
     let ((problem, source), stop) = (first_order(), Stop::default());
-    let grid = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), false).unwrap();
+    let grid = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
     let at = |a: f64, b: f64| place(&[], &[a, b]);
     let stuck = grid.evaluated(&at(1.0, 1.0)).unwrap().unwrap();
     let (best, there) = freed(&stuck, &grid, &[at(3.0, 1.0)], Loss::Squares).unwrap().unwrap();
@@ -153,8 +157,8 @@ fn another_start_takes_the_place_of_one_that_was_stopped_if_it_leaves_less() {
 #[test]
 fn who_grows_takes_no_place_where_that_may_not_be() {
     let ((problem, source), stop) = (first_order(), Stop::default());
-    let free = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), false).unwrap();
-    let steady = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), true).unwrap();
+    let free = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
+    let steady = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), true).unwrap();
     assert!(problem.grows(&place(&[], &[-2.0, 1.0]).point) && !problem.grows(&place(&[], &[2.0, 1.0]).point));
     let stuck = steady.evaluated(&place(&[], &[1.0, 1.0])).unwrap().unwrap();
     let (best, _) = freed(&stuck, &steady, &[place(&[], &[3.0, 1.0])], Loss::Squares).unwrap().unwrap();
@@ -169,10 +173,13 @@ fn who_grows_takes_no_place_where_that_may_not_be() {
 #[test]
 fn a_stop_is_heard_and_what_does_not_fit_is_refused() {
     let ((problem, source), stop) = (first_order(), Stop::default());
-    let grid = Grid::new((&problem, &source, &stop), weighing(100.0), (1, 1), false).unwrap();
+    let grid = Grid::new((&problem, &source, &stop), weighing(100.0), sampling(1, 1), false).unwrap();
     let start = place(&[], &[1.0, 1.0]);
     let two = Weights { outputs: vec![1.0, 1.0], shares: None };
-    assert!(matches!(Grid::new((&problem, &source, &stop), two, (1, 1), false).map(|_| ()), Err(Error::Length { .. })));
+    assert!(matches!(
+        Grid::new((&problem, &source, &stop), two, sampling(1, 1), false).map(|_| ()),
+        Err(Error::Length { .. })
+    ));
     assert!(problem.point(&[1.0]).is_err());
     assert!(
         Sampled::new(0.1, vec![2], vec![vec![Signal { samples: vec![0.0; 5], between: Intersample::Linear }]]).is_err()

@@ -31,6 +31,21 @@ pub struct Attempt {
 }
 
 impl Attempt {
+    /// A place before any descent: none costs more.
+    #[must_use]
+    pub fn unrun(place: Place) -> Self {
+        let (cost, evaluations, status) = (f64::INFINITY, 0, Status::Exhausted);
+        let (residuals, jacobian, initial) = (Vec::new(), Vec::new(), Vec::new());
+        Self { place, cost, residuals, jacobian, initial, evaluations, status }
+    }
+
+    /// Cost per residual: 1 at the noise floor if the weights are right.
+    #[must_use]
+    #[allow(clippy::cast_precision_loss)]
+    pub fn level(&self) -> f64 {
+        2.0 * self.cost / self.residuals.len() as f64
+    }
+
     /// Whether the gradient vanished, but for what pushes out of a bound; a fit stopped at a wall has not.
     #[must_use]
     pub fn converged(&self) -> bool {

@@ -4,14 +4,16 @@ use std::sync::Arc;
 
 use super::attempt::{Attempt, Place};
 use super::problem::Problem;
-use super::source::Source;
+use super::source::{Sampling, Source};
 use crate::error::{check_length, Error, Result};
 use crate::estimate::output_error::{Experiment, Settings};
-use crate::statistics::{robust_deviation, root_mean_square};
+use crate::statistics::{mean, robust_deviation, root_mean_square};
 use crate::stop::Stop;
 
 /// A descent ends where a whole step would lower the cost by a smaller share than this.
 pub const TOLERANCE: f64 = 1e-9;
+/// Discretisation that a fit may leave, in standard deviations of the noise.
+const NOTICED: f64 = 0.3;
 /// Finest grid: pulses a sample interval.
 pub const FINEST: usize = 16;
 
@@ -33,9 +35,8 @@ pub struct Grid<'a> {
     stop: &'a Stop,
     /// What each output weighs.
     pub weights: Weights,
-    /// Pulses a sample interval.
-    pub every: usize,
-    decimation: usize,
+    /// How finely the runs are sampled.
+    pub sampling: Sampling,
     /// Whether a free run that grows is no place to go.
     pub steady: bool,
     /// What was read, by run and output, where something was not.
@@ -51,25 +52,16 @@ impl<'a> Grid<'a> {
     pub fn new(
         (problem, source, stop): (&'a Problem, &'a dyn Source, &'a Stop),
         weights: Weights,
-        (every, decimation): (usize, usize),
+        sampling: Sampling,
         steady: bool,
     ) -> Result<Self> {
         check_length("weights", problem.outputs.len(), weights.outputs.len())?;
-        let experiments = source.experiments(every, decimation)?;
+        let experiments = source.experiments(sampling)?;
         stop.check()?;
         let read = Arc::new(experiments.iter().map(|e| e.shares.clone()).collect());
         let blank = Weights { outputs: Vec::new(), shares: None };
-        let grid = Self {
-            problem,
-            source,
-            stop,
-            weights: blank,
-            every,
-            decimation,
-            steady,
-            read,
-            experiments: Arc::new(experiments),
-        };
+        let grid =
+            Self { problem, source, stop, weights: blank, sampling, steady, read, experiments: Arc::new(experiments) };
         grid.reweighed(weights)
     }
 
@@ -104,8 +96,38 @@ impl<'a> Grid<'a> {
     /// # Errors
     /// Those of the source.
     pub fn finer(&self) -> Result<Self> {
-        let things = (self.problem, self.source, self.stop);
-        Self::new(things, self.weights.clone(), (2 * self.every, self.decimation), self.steady)
+        let sampling = Sampling { every: 2 * self.sampling.every, ..self.sampling };
+        Self::new((self.problem, self.source, self.stop), self.weights.clone(), sampling, self.steady)
+    }
+
+    /// The same runs for another problem of the same outputs.
+    #[must_use]
+    pub fn of(&self, problem: &'a Problem) -> Self {
+        Self { problem, ..self.clone() }
+    }
+
+    /// The same where no descent goes from a free run that dies away to one that grows.
+    #[must_use]
+    pub fn steadily(&self) -> Self {
+        Self { steady: true, ..self.clone() }
+    }
+
+    /// The runs as they are compared with.
+    #[must_use]
+    pub fn experiments(&self) -> &[Experiment] {
+        &self.experiments
+    }
+
+    /// Where the runs come from.
+    #[must_use]
+    pub fn source(&self) -> &'a dyn Source {
+        self.source
+    }
+
+    /// Whom to ask whether to go on.
+    #[must_use]
+    pub fn stop(&self) -> &'a Stop {
+        self.stop
     }
 
     /// The unit of time of the runs.
@@ -121,6 +143,64 @@ impl<'a> Grid<'a> {
     pub fn descend(&self, start: &Place, evaluations: usize) -> Result<Attempt> {
         let settings = Settings { evaluations, tolerance: TOLERANCE };
         self.problem.descend(&self.experiments, start, settings, self.steady, self.stop)
+    }
+
+    /// The same in the coordinates of a problem turned towards a start, see [`super::free::Free::turned`].
+    ///
+    /// # Errors
+    /// See [`Problem::descend`].
+    pub fn descend_in(&self, turned: &Problem, start: &Place, evaluations: usize) -> Result<Attempt> {
+        let settings = Settings { evaluations, tolerance: TOLERANCE };
+        turned.descend(&self.experiments, start, settings, self.steady, self.stop)
+    }
+
+    /// Whether halving the step moves the simulated samples by a share of the residuals that a fit would notice.
+    ///
+    /// What is left over is noise at least; of a structure that is not all of the machine's physics it is more.
+    ///
+    /// # Errors
+    /// Those of the source, [`Error::Interrupted`].
+    pub fn matters(&self, place: &Place) -> Result<bool> {
+        self.noticed(place, &self.finer()?)
+    }
+
+    /// The same, half the step at hand.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`].
+    pub fn noticed(&self, place: &Place, finer: &Self) -> Result<bool> {
+        let (Some(here), Some(there)) = (self.evaluated(place)?, finer.evaluated(place)?) else {
+            // Finite on one grid and not on the other: it matters.
+            return Ok(true);
+        };
+        let moved: Vec<f64> = there.residuals.iter().zip(&here.residuals).map(|(a, b)| (a - b).powi(2)).collect();
+        let left = mean(&there.residuals.iter().map(|e| e * e).collect::<Vec<_>>()).max(1.0);
+        // Squares beyond the numbers belong to a free run that one of the grids does not carry.
+        Ok(!left.is_finite() || mean(&moved) > NOTICED * NOTICED * left)
+    }
+
+    /// Places of attempts in the order of their cost on the grid that they come from or on this finer one, whichever is
+    /// the larger.
+    ///
+    /// The pulse scheme of a stiff equation has a mode that alternates from pulse to pulse. A fit may use it to follow
+    /// noise, at the cost of a free run that no other grid has.
+    ///
+    /// # Errors
+    /// [`Error::Interrupted`].
+    pub fn ranked(&self, attempts: &[&Attempt]) -> Result<Vec<usize>> {
+        let worse = |attempt: &&Attempt| {
+            let there = self.evaluated(&attempt.place)?;
+            Ok(there.map_or(f64::INFINITY, |there| attempt.level().max(there.level())))
+        };
+        let costs: Vec<f64> = attempts.iter().map(worse).collect::<Result<_>>()?;
+        let any = costs.iter().any(|cost| cost.is_finite());
+        let key = |i: usize| (if any { costs[i] } else { 0.0 }, attempts[i].level());
+        let mut order: Vec<usize> = (0..attempts.len()).collect();
+        order.sort_by(|&i, &j| {
+            let ((a, b), (c, d)) = (key(i), key(j));
+            a.total_cmp(&c).then(b.total_cmp(&d))
+        });
+        Ok(order)
     }
 
     /// A place with its residuals and its cost on this grid, without derivatives; none where it has no finite free run.

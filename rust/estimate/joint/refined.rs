@@ -65,7 +65,7 @@ pub fn refined<'a>(best: Attempt, grid: Grid<'a>, loss: Loss, others: &[Place]) 
     let (mut best, mut grid, mut others) = (best, grid, others);
     let (mut estimate, mut still, mut before) = (best.values(), false, None::<Attempt>);
     let mut spread = None;
-    while !still && grid.every < FINEST {
+    while !still && grid.sampling.every < FINEST {
         // On a finer grid residuals may shrink to their noise, so weights follow anew.
         let half = grid.finer()?;
         let start = expected(&half, &clock, &best, before.as_ref())?;
@@ -134,7 +134,7 @@ impl<'a> Optimum<'a> {
             residuals: grid.residuals(&attempt),
             robust: robust.then(|| Robust::of(&grid, &attempt)),
             weights: grid.weights,
-            every: grid.every,
+            every: grid.sampling.every,
             attempt,
             settled,
             covariance,

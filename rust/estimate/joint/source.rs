@@ -10,11 +10,47 @@ pub trait Source {
     /// Sample interval and duration of each run \[s\].
     fn spans(&self) -> Vec<(f64, f64)>;
 
-    /// The runs with so many pulses a sample interval, of every `decimation`-th sample.
+    /// The runs sampled so.
     ///
     /// # Errors
     /// Whatever keeps it from that.
-    fn experiments(&self, every: usize, decimation: usize) -> Result<Vec<Experiment>>;
+    fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>>;
+}
+
+/// How finely runs are sampled.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Sampling {
+    /// Pulses a sample interval.
+    pub every: usize,
+    /// Of how many samples one counts.
+    pub decimation: usize,
+    /// So many sample intervals from the beginning of each run on; none: all.
+    pub first: Option<usize>,
+}
+
+impl Default for Sampling {
+    fn default() -> Self {
+        Self { every: 1, decimation: 1, first: None }
+    }
+}
+
+/// Runs of which starts can be made, too: what was read, and records for estimators on the equation error.
+pub trait Recordings: Source {
+    /// Which signals are inputs of the runs, and which of them hold between samples.
+    fn inputs(&self) -> Vec<Option<Intersample>>;
+
+    /// What was read of a signal by run, at regular times; not a number where nothing was.
+    ///
+    /// # Errors
+    /// Whatever keeps it from that.
+    fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>>;
+
+    /// Each run on so many pulses, every signal behind the sensor filter, equations driven by what was measured, free
+    /// numbers of inputs at these values.
+    ///
+    /// # Errors
+    /// Whatever keeps it from that.
+    fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>>;
 }
 
 /// A signal that was read at regular times.
@@ -30,12 +66,12 @@ pub struct Signal {
 ///
 /// ```
 /// # fn main() -> ftlm::error::Result<()> {
-/// use ftlm::estimate::joint::{Sampled, Signal, Source};
+/// use ftlm::estimate::joint::{Sampled, Sampling, Signal, Source};
 /// use ftlm::means::Intersample;
 /// let y = Signal { samples: vec![0.0, 1.0, 4.0, 9.0], between: Intersample::Linear };
 /// let u = Signal { samples: vec![1.0, 2.0, 2.0, 2.0], between: Intersample::Hold };
 /// let runs = Sampled::new(0.1, vec![0], vec![vec![y, u]])?;
-/// let fine = runs.experiments(2, 1)?;
+/// let fine = runs.experiments(Sampling { every: 2, ..Sampling::default() })?;
 /// assert_eq!(fine[0].record.signal(1), [1.0, 1.0, 2.0, 2.0, 2.0, 2.0]);
 /// # Ok(())
 /// # }
@@ -73,10 +109,12 @@ impl Source for Sampled {
     }
 
     #[allow(clippy::cast_precision_loss)]
-    fn experiments(&self, every: usize, decimation: usize) -> Result<Vec<Experiment>> {
+    fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>> {
+        let Sampling { every, decimation, first } = sampling;
         let decimation = decimation.max(1);
         let of = |run: &Vec<Signal>| {
-            let intervals = (run[0].samples.len() - 1) / decimation;
+            let all = run[0].samples.len() - 1;
+            let intervals = first.map_or(all, |first| first.min(all)) / decimation;
             let rows = intervals * decimation + 1;
             let means = run.iter().map(|s| pulse_means(&s.samples[..rows], intervals * every, s.between));
             let step = self.step * decimation as f64 / every.max(1) as f64;
@@ -86,6 +124,30 @@ impl Source for Sampled {
             let instants = instants.collect();
             let samples = self.outputs.iter().map(|&output| kept(&run[output])).collect();
             Experiment::new(record, every, samples, vec![1.0; self.outputs.len()])?.with_instants(instants)
+        };
+        self.runs.iter().map(of).collect()
+    }
+}
+
+impl Recordings for Sampled {
+    fn inputs(&self) -> Vec<Option<Intersample>> {
+        let signals = self.runs.first().into_iter().flatten().enumerate();
+        signals.map(|(i, signal)| (!self.outputs.contains(&i)).then_some(signal.between)).collect()
+    }
+
+    fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>> {
+        let of = |run: &Vec<Signal>| run.get(signal).map(|signal| signal.samples.clone());
+        let missing = || Error::Structure { what: format!("no signal {signal}"), remedy: "number them from 0".into() };
+        self.runs.iter().map(of).collect::<Option<_>>().ok_or_else(missing)
+    }
+
+    #[allow(clippy::cast_precision_loss)]
+    fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>> {
+        check_length("free numbers of inputs", 0, inputs.len())?;
+        let of = |run: &Vec<Signal>| {
+            let means = run.iter().map(|s| pulse_means(&s.samples, m, s.between)).collect::<Result<_>>()?;
+            let duration = self.step * (run[0].samples.len() - 1) as f64;
+            Record::new(duration / m.max(1) as f64, means, None)
         };
         self.runs.iter().map(of).collect()
     }
