@@ -154,6 +154,44 @@ impl Initial {
         }
     }
 
+    /// Another start under the same offset and filter.
+    ///
+    /// ```
+    /// use ftlm::equation::Initial;
+    /// let ramped = Initial::Caputo.with_offset(2)?.with_states(1);
+    /// assert_eq!(ramped.with_under(Initial::Rest), Initial::Rest.with_offset(2)?.with_states(1));
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[must_use]
+    pub fn with_under(&self, start: Self) -> Self {
+        match self {
+            Self::Offset { ramp, .. } => Self::Offset { under: Box::new(start), ramp: *ramp },
+            Self::Filtered { under, states } => {
+                Self::Filtered { under: Box::new(under.with_under(start)), states: *states }
+            }
+            _ => start,
+        }
+    }
+
+    /// The same start without an offset.
+    ///
+    /// ```
+    /// use ftlm::equation::Initial;
+    /// let ramped = Initial::Caputo.with_offset(2)?.with_states(1);
+    /// assert_eq!(ramped.without_offset(), Initial::Caputo.with_states(1));
+    /// # Ok::<(), ftlm::error::Error>(())
+    /// ```
+    #[must_use]
+    pub fn without_offset(&self) -> Self {
+        match self {
+            Self::Offset { under, .. } => Self::clone(under),
+            Self::Filtered { under, states } => {
+                Self::Filtered { under: Box::new(under.without_offset()), states: *states }
+            }
+            other => other.clone(),
+        }
+    }
+
     /// Whether the record starts at rest: before it all signals were zero.
     #[must_use]
     pub fn at_rest(&self) -> bool {

@@ -40,8 +40,8 @@ mod _core {
 
     #[pymodule_export]
     use super::joint::{
-        autocovariances, chi_squared, colour_covariances, coloured, covariance_of, fit_covariance, is_white, long_run,
-        JointClock, JointProblem,
+        autocovariances, chi_squared, colour_covariances, coloured, covariance_of, fit_covariance, is_white, joint_fit,
+        joint_grids, joint_race, long_run, JointClock, JointProblem, JointRace,
     };
 
     #[pymodule_export]

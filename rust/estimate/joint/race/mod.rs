@@ -1,0 +1,24 @@
+//! The race of starts: short fits on thinned samples, of which the best go on.
+//!
+//! [`run::race`] sends starts over laps, from a glance to those few that go on on all samples. Beside them run the problems
+//! inside a problem, whose optima it reaches, too: a term less ([`simpler`]), an order less ([`lower`]), orders known
+//! ([`known`]) or whole ([`whole`]).
+
+mod behind;
+mod bodies;
+mod fine_enough;
+mod known;
+mod laps;
+mod lower;
+mod run;
+mod simpler;
+mod thinned;
+mod whole;
+
+pub use bodies::on_coarse_grids;
+pub use known::{held, Held};
+pub use laps::{distinct, finalists, in_reach, same_optimum, same_place};
+pub use lower::{lower_order, LowerOrder};
+pub use run::{race, Course, Starts};
+pub use simpler::{simpler, unlike, Simpler};
+pub use whole::{whole, Whole};
