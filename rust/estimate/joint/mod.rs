@@ -17,6 +17,8 @@ mod runner;
 pub mod settled;
 pub mod shares;
 pub mod source;
+pub mod starts;
+mod words;
 
 pub use attempt::{Attempt, Place};
 pub use clock::Clock;

@@ -1,0 +1,88 @@
+//! Numbers in words, as few digits as tell them apart.
+
+/// A number in so many significant digits without zeros behind them, by a power of ten where it is large or small: what
+/// C and Python call the format `g`.
+pub(crate) fn short(value: f64, digits: usize) -> String {
+    if !value.is_finite() {
+        return if value.is_nan() {
+            "nan".into()
+        } else if value > 0.0 {
+            "inf".into()
+        } else {
+            "-inf".into()
+        };
+    }
+    let most = digits.max(1) - 1;
+    // Rounding first: 9.99 in two digits is 10.
+    let rounded = format!("{value:.most$e}");
+    let Some((mantissa, exponent)) = rounded.split_once('e') else { return rounded };
+    let power: i64 = exponent.parse().unwrap_or(0);
+    match usize::try_from(power) {
+        Ok(whole) if whole <= most => trimmed(&format!("{value:.*}", most - whole)).into(),
+        Err(_) if power >= -4 => {
+            let places = usize::try_from(-power).unwrap_or(0) + most;
+            trimmed(&format!("{value:.places$}")).into()
+        }
+        _ => {
+            let sign = if power < 0 { '-' } else { '+' };
+            format!("{}e{sign}{:02}", trimmed(mantissa), power.abs())
+        }
+    }
+}
+
+/// Without zeros behind the point, and without a point before nothing.
+fn trimmed(text: &str) -> &str {
+    if text.contains('.') {
+        text.trim_end_matches('0').trim_end_matches('.')
+    } else {
+        text
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::short;
+
+    #[test]
+    fn numbers_are_written_as_python_writes_them() {
+        let three = [
+            (1e-5, "1e-05"),
+            (0.000_123_456, "0.000123"),
+            (0.000_099_96, "0.0001"),
+            (0.5, "0.5"),
+            (12.34, "12.3"),
+            (12.35, "12.3"),
+            (-2.5, "-2.5"),
+            (0.0, "0"),
+            (-0.0, "-0"),
+            (99.96, "100"),
+            (999.5, "1e+03"),
+            (998.5, "998"),
+            (1000.0, "1e+03"),
+            (123_456.0, "1.23e+05"),
+            (1e20, "1e+20"),
+            (1e100, "1e+100"),
+            (1.5e-300, "1.5e-300"),
+            (f64::INFINITY, "inf"),
+            (f64::NEG_INFINITY, "-inf"),
+            (f64::NAN, "nan"),
+        ];
+        three.iter().for_each(|(value, text)| assert_eq!(short(*value, 3), *text));
+        let six = [
+            (1e-5, "1e-05"),
+            (0.25, "0.25"),
+            (1.0, "1"),
+            (4.0, "4"),
+            (100_000.0, "100000"),
+            (123_456.0, "123456"),
+            (123_456.5, "123456"),
+            (123_457.5, "123458"),
+            (999_999.5, "1e+06"),
+            (1_000_000.0, "1e+06"),
+            (1_234_567.0, "1.23457e+06"),
+            (2.0 / 3.0, "0.666667"),
+            (-1e-4, "-0.0001"),
+        ];
+        six.iter().for_each(|(value, text)| assert_eq!(short(*value, 6), *text));
+    }
+}
