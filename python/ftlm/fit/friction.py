@@ -9,20 +9,26 @@ from dataclasses import replace
 import numpy as np
 from msgspec import UNSET, UnsetType
 
+from ftlm import _core
 from ftlm.base.errors import DataError, FtlmError
+from ftlm.base.memory import memory_limit
 from ftlm.base.statistics import noise_of
+from ftlm.base.threads import stop
 from ftlm.data.equations import Equation, Friction, Term
 from ftlm.data.orders import Order
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.structures import Hints, Structure
-from ftlm.fit.grid import FINEST, Attempt, Grid
-from ftlm.fit.problem import FRICTION_BOUNDS, FreeProblem
-from ftlm.fit.race import COARSE_SAMPLES, FINALISTS, FIRST_LAP, SECOND_LAP, Laps, race
+from ftlm.fit.asked import Asked
+from ftlm.fit.grid import Attempt, Grid
+from ftlm.fit.problem import FreeProblem
 from ftlm.fit.sliding import slid
-from ftlm.fit.starts import whole_orders
 from ftlm.solve.records import COULOMB
 
+#: Samples of the coarse fits that compare starts, evaluations of one, and fits that lead to others.
+COARSE_SAMPLES, FIRST_LAP, FINALISTS = 1200, 15, 3
+#: Highest order of a body with friction.
+HIGHEST = 2.0
 #: Friction at a start as shares of the force that drives the body, from next to none upwards.
 SHARES = (0.01, 0.05, 0.2, 0.5)
 #: The same as shares of what the measured sign of the velocity says.
@@ -42,7 +48,7 @@ STILL = 10.0
 
 def race_with_friction(
     alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None
-) -> list[Attempt]:
+) -> _core.JointRace:
     """Coarse fits of bodies with friction, best first, every output weighing alike.
 
     The sign of the measured velocity makes the equation linear; where the body rests it is noise, and so are its
@@ -53,15 +59,14 @@ def race_with_friction(
     structure = problem.structure
     check_moves(runs, structure)
     if not structure.has_friction:
-        return race(alike, floor, threads, progress)
+        return raced(alike, floor, threads, progress)
     coarse = replace(alike, decimation=max(1, min(run.length - 1 for run in runs) // COARSE_SAMPLES))
     starts: list[Attempt] = []
     if any(rubs.stribeck is not None for _, rubs in rubbing(structure)):
         less = FreeProblem.of(with_friction(structure, lambda rubs: replace(rubs, more=UNSET)))
         reached = race_with_friction(replace(alike, problem=less), floor, threads, progress)
-        for attempt in reached[:FINALISTS]:
-            values = dict(zip(less.names, attempt.values.tolist(), strict=True))
-            starts += falling(coarse, values, attempt.origin)
+        for values, origin in list(zip(reached.values, reached.origins, strict=True))[:FINALISTS]:
+            starts += falling(coarse, dict(zip(less.names, values, strict=True)), origin)
         return on_coarse_grids(coarse, starts, threads)
     if 1 < len(rubbing(structure)) < len(structure.equations):
         # What hangs on them is told from its own equation; that of a body, driven by all that hangs on it, may be
@@ -71,13 +76,13 @@ def race_with_friction(
         return on_coarse_grids(coarse, starts, threads)
     # Driven by measured signals, each of several bodies is told from its own equation, whatever the others do.
     signed = FreeProblem.of(replace(with_measured_sign(structure), coupling="measured"))
-    reached = race(replace(alike, problem=signed), floor, threads, progress)
-    for attempt in reached[:FINALISTS]:
-        values = dict(zip(signed.names, attempt.values.tolist(), strict=True))
-        starts += started(coarse, values, attempt.origin)
-    if len(structure.equations) > 1 and reached:
-        values = dict(zip(signed.names, reached[0].values.tolist(), strict=True))
-        starts += carrying(problem, runs, {**values, **signed.named(reached[0].coefficients)})
+    reached = raced(replace(alike, problem=signed), floor, threads, progress)
+    for values, origin in list(zip(reached.values, reached.origins, strict=True))[:FINALISTS]:
+        starts += started(coarse, dict(zip(signed.names, values, strict=True)), origin)
+    if len(structure.equations) > 1 and len(reached):
+        best = reached.values[0]
+        named = signed.named(signed.split(best)[1])
+        starts += carrying(problem, runs, {**dict(zip(signed.names, best, strict=True)), **named})
     return on_coarse_grids(coarse, starts, threads)
 
 
@@ -95,7 +100,7 @@ def skeletons(problem: FreeProblem) -> list[dict[str, float]]:
     ends = dict(zip(problem.orders, problem.bounds, strict=True))
     natural = (problem.structure.hints or Hints()).natural
     known = {n: natural[n] for n in problem.orders if natural.get(n)}
-    whole = dict(zip(problem.orders, whole_orders(problem), strict=True))
+    whole = dict(zip(problem.orders, problem.core.whole_orders, strict=True))
     whole |= {n: v for n, values in known.items() for v in values if v == round(v)}
     other = {n: v for n, values in known.items() for v in values if v != whole[n]}
     sets = [whole, whole | other] if other else [whole]
@@ -110,8 +115,8 @@ def hanging(alike: Grid, orders: dict[str, float], floor: float, threads: int) -
         if item.friction is None:
             named = {n: orders[n] for n in item.order_names}
             alone = FreeProblem.of(structure.driven(item.output).with_orders(named))
-            reached = race(replace(alike, problem=alone, weights=[weight]), floor, threads, None)
-            values |= alone.named(reached[0].coefficients) if reached else {}
+            reached = raced(replace(alike, problem=alone, weights=[weight]), floor, threads, None)
+            values |= alone.named(alone.split(reached.values[0])[1]) if len(reached) else {}
     return values
 
 
@@ -158,7 +163,7 @@ def by_itself(
     alone = replace(alone, equations=(replace(alone.equations[0], terms=kept),))
     usual = {n: 0.0 for n in alone.order_names} | {
         n: 1.0 for t in kept if t.signal == item.output for n in t.order.names
-    } | {n: FRICTION_BOUNDS[1] for n in item.order.names}  # fmt: skip
+    } | {n: HIGHEST for n in item.order.names}  # fmt: skip
     shared = {n for e in structure.equations if e is not item for n in e.order_names}
     orders = {n: values[n] if n in shared and n not in item.order.names else v for n, v in usual.items()}
     orders = {n: min(max(v, bounds[n][0]), bounds[n][1]) if n in bounds else v for n, v in orders.items()}
@@ -186,14 +191,19 @@ def reacting(structure: Structure, item: Equation, values: dict[str, float], sha
     return out
 
 
-def on_coarse_grids(coarse: Grid, starts: list[Attempt], threads: int) -> list[Attempt]:
+def raced(alike: Grid, floor: float, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointRace:
+    """Where the starts of a problem without friction get, every output weighing alike."""
+    runs = Asked(alike.problem, alike.runs).core(progress)
+    return _core.joint_race(alike.problem.core, runs, alike.weights, floor, (threads, memory_limit()), stop())
+
+
+def on_coarse_grids(coarse: Grid, starts: Sequence[Attempt], threads: int) -> _core.JointRace:
     """Where starts get on coarse grids, best first."""
-    laps = Laps(len(starts), threads, None)
-    ended = laps.run(coarse, starts, FIRST_LAP)
-    while coarse.every < FINEST and not ended:
-        coarse = coarse.finer
-        ended = laps.run(coarse, starts, FIRST_LAP)
-    return laps.run(coarse, ended[: 2 * FINALISTS], SECOND_LAP)
+    runs = Asked(coarse.problem, coarse.runs).core()
+    return _core.joint_grids(
+        coarse.problem.core, runs, coarse.weights, coarse.decimation, [(a.values.tolist(), a.origin) for a in starts],
+        threads, stop(),
+    )  # fmt: skip
 
 
 def check_moves(runs: Sequence[Run], structure: Structure) -> None:

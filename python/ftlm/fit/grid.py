@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -12,7 +11,6 @@ import numpy as np
 
 from ftlm import _core
 from ftlm.base.arrays import Floats
-from ftlm.base.errors import FtlmError
 from ftlm.base.threads import stop
 from ftlm.data.readings import read
 from ftlm.data.run import Run
@@ -23,10 +21,6 @@ from ftlm.solve.records import Record, driving, initial_tuple, record, sensor_se
 
 #: A descent ends where a whole step would lower the cost by a smaller share than this.
 TOLERANCE = 1e-9
-#: Discretisation that the first fit on all samples may leave, in standard deviations of the noise.
-NOTICED = 0.3
-#: Finest grid: pulses a sample interval.
-FINEST = 16
 
 
 def experiment(
@@ -118,14 +112,13 @@ def _instant(
 
 @dataclass
 class Attempt:
-    """A point in the space of parameters, what the core said about it, and whose starts came to it as well."""
+    """A point in the space of parameters, where it comes from, and what the core said about it."""
 
     orders: list[float]
     coefficients: list[float]
     origin: str
     outcome: Any
     inputs: list[float] = field(default_factory=list)
-    alike: tuple[str, ...] = ()
 
     @property
     def values(self) -> Floats:
@@ -223,21 +216,10 @@ class Grid:
             for k, run in enumerate(self.runs)
         ]  # fmt: skip
 
-    def sampled(self, every: int, decimation: int) -> list[Any]:
-        """The runs on a grid that the core asks for; it weighs them itself."""
-        if (every, decimation) == (self.every, self.decimation) and self.shares is None:
-            return self.experiments
-        return replace(self, every=every, decimation=decimation, shares=None).experiments
-
     @cached_property
     def finer(self) -> Grid:
         """The same on half the step."""
         return replace(self, every=2 * self.every)
-
-    @property
-    def core(self) -> tuple[Sequence[float], int, int, Sequence[Floats] | None, bool]:
-        """Weights, pulses a sample interval, decimation, shares, and whether it is steady, as the core takes them."""
-        return self.weights, self.every, self.decimation, self.shares, self.steady
 
     def descend(
         self, attempt: Attempt, evaluations: int, *, plain: bool = False, held: int | Sequence[int] = (),
@@ -252,12 +234,6 @@ class Grid:
     def evaluated(self, attempt: Attempt) -> Attempt:
         """An attempt with its residuals and its cost on this grid, without derivatives."""
         return self.descend(attempt, 0)
-
-    def lowest(self, attempt: Attempt, evaluations: int, *, ended: bool = False) -> Attempt:
-        """Descend in logarithmic coordinates, unless it ended there, then in plain ones, which may cross zero."""
-        first = attempt if ended else self.descend(attempt, evaluations)
-        second = self.descend(first, evaluations, plain=True)
-        return second if second.outcome["cost"] <= first.outcome["cost"] else first
 
     def residuals(self, attempt: Attempt) -> list[dict[str, Floats]]:
         """Residuals of an attempt over the noise by run and output, whatever their shares; NaN where none was read."""
@@ -295,38 +271,3 @@ class Grid:
         """Weighted residuals that are there by output, all runs one after another."""
         parts = self.residuals(attempt)
         return {o: read(np.concatenate([p[o] for p in parts])) for o in self.problem.structure.outputs}
-
-    def matters(self, attempt: Attempt) -> bool:
-        """Whether halving the step moves the simulated samples by a share of the residuals that the fit would notice.
-
-        What is left over is noise at least; of a structure that is not all of the machine's physics it is more.
-        """
-        try:
-            ends = [grid.evaluated(attempt).outcome["residuals"] for grid in (self, self.finer)]
-        except FtlmError:
-            # Finite on one grid and not on the other: it matters.
-            return True
-        with np.errstate(over="ignore"):
-            moved = float(np.mean((np.asarray(ends[1]) - np.asarray(ends[0])) ** 2))
-            left = max(1.0, float(np.mean(np.asarray(ends[1]) ** 2)))
-        # Squares beyond the numbers belong to a free run that one of the grids does not carry.
-        return not math.isfinite(left) or moved > NOTICED**2 * left
-
-    def ranked(self, attempts: Sequence[Attempt]) -> list[Attempt]:
-        """Attempts by their cost on the grid they come from or on this finer one, whichever is the larger.
-
-        The pulse scheme of a stiff equation has a mode that alternates from pulse to pulse. A fit may use it to follow
-        noise, at the cost of a free run that no other grid has.
-        """
-
-        def worse(attempt: Attempt) -> float:
-            try:
-                return max(attempt.level, self.evaluated(attempt).level)
-            except FtlmError:
-                # It has no finite free run there.
-                return math.inf
-
-        costs = [worse(a) for a in attempts]
-        if not any(map(math.isfinite, costs)):
-            return sorted(attempts, key=lambda a: a.level)
-        return [attempts[i] for i in sorted(range(len(attempts)), key=lambda i: (costs[i], attempts[i].level))]

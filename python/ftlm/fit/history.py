@@ -8,12 +8,13 @@ from functools import partial
 
 import numpy as np
 
+from ftlm import _core
 from ftlm.base.errors import FtlmError
 from ftlm.base.progress import Course
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss
 from ftlm.data.structures import History, Initial, Structure
-from ftlm.fit.joint import RACED, SWEEP, JointFit, Outset, Race, fit_output_error
+from ftlm.fit.joint import RACED, SWEEP, JointFit, Outset, fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.motion import has_memory, history, misfit_of_fits, needed, together
 from ftlm.solve.past import in_motion
@@ -32,7 +33,7 @@ def fit_any_start(
     history makes them much better. Which terms were fitted is in the result.
     """
 
-    def fitted(initial: Initial, *, refine: bool = True, raced: Race | None = None) -> JointFit:
+    def fitted(initial: Initial, *, refine: bool = True, raced: _core.JointRace | None = None) -> JointFit:
         asked = replace(structure, initial=initial)
         begun = partial(fit_output_error, start=known[0]) if alone else partial(fit_output_error, known=known)
         return begun(runs, asked, threads=threads, refine=refine, progress=progress, loss=loss, raced=raced)

@@ -1,36 +1,37 @@
 """Joint output error: all equations, all runs, continuous orders, from an automatic start to intervals.
 
-For white measurement noise the estimate is maximum likelihood. The core minimises from a start
-(Levenberg-Marquardt with an analytic Jacobian), weighs outputs by what is left of them, refines the grid until it no
-longer matters, and tells the covariance; this file finds where to start from, and names what comes out.
+For white measurement noise the estimate is maximum likelihood. The core finds where to start from, races the starts,
+minimises (Levenberg-Marquardt with an analytic Jacobian), weighs outputs by what is left of them, refines the grid
+until it no longer matters, and tells the covariance; this file names what goes in and what comes out.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
+from ftlm import _core
 from ftlm.base.arrays import Floats
-from ftlm.base.errors import ConvergenceError, DataError, FtlmError
-from ftlm.base.progress import Course
+from ftlm.base.errors import ConvergenceError, DataError
+from ftlm.base.memory import memory_limit
+from ftlm.base.progress import PARTS, Course
 from ftlm.base.statistics import NORMAL_95, noise_of
 from ftlm.base.threads import stop
 from ftlm.data.readings import read
 from ftlm.data.run import Run
 from ftlm.data.settings import Loss
 from ftlm.data.structures import Initial, Structure
-from ftlm.fit.clock import spans
+from ftlm.fit.asked import Asked
 from ftlm.fit.friction import race_with_friction
-from ftlm.fit.grid import FINEST, Attempt, Grid
+from ftlm.fit.grid import Attempt, Grid
+from ftlm.fit.growth import Growth
 from ftlm.fit.interval import ProfileInterval
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.race import SAME_COST, finalists, race
 from ftlm.fit.robust import Robust
-from ftlm.fit.steady import Growth, steadied
 from ftlm.fit.twins import twin_words
 from ftlm.fit.uncertainty import deviation
 from ftlm.solve.instants import compared_values
@@ -39,9 +40,8 @@ from ftlm.solve.instants import compared_values
 RACED, SWEEP = 0.5, 0.3
 #: Residual that costs 1 in a coarse fit, as a share of an output's size.
 COARSE_SHARE = 0.01
-#: Evaluations of each finalist on all samples, and of what is left then.
-FINAL_LAP = 60
-LAST_LAP = 120
+#: Two costs closer than this share are the same optimum.
+SAME_COST = 1e-3
 
 
 @dataclass(frozen=True)
@@ -171,13 +171,6 @@ class JointFit:
 
 
 @dataclass(frozen=True)
-class Race:
-    """Where starts got on thinned samples, best first: fits of the same structure to the same runs go on from there."""
-
-    reached: Sequence[Attempt]
-
-
-@dataclass(frozen=True)
 class Outset:
     """What is known before a first descent: the problem on its runs, and the size of each output."""
 
@@ -195,8 +188,7 @@ class Outset:
                 f"{samples} samples between the first and the last do not tell {len(problem.names)} free numbers; use "
                 "longer runs, or fix orders or coefficients"
             )
-        sizes = [math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in outputs]
-        return cls(problem, runs, sizes)
+        return cls(problem, runs, output_sizes(runs, structure))
 
     @cached_property
     def noise(self) -> list[float]:
@@ -205,27 +197,26 @@ class Outset:
         outputs = zip(structure.outputs, self.sizes, strict=True)
         return [first_noise(self.runs, structure, output, size) for output, size in outputs]
 
-    @property
-    def alike(self) -> Grid:
-        """Every output weighing alike: noise decides where the optimum is, not how to get near it."""
-        return Grid(self.problem, self.runs, [1.0 / (COARSE_SHARE * size) for size in self.sizes])
-
-    @property
-    def weighed(self) -> Grid:
-        """Every output weighed by its noise."""
-        return Grid(self.problem, self.runs, [1.0 / noise for noise in self.noise])
-
-    def race(self, threads: int, progress: Callable[[int, int], None] | None) -> Race:
-        """Where the starts of this problem get."""
+    def race(self, threads: int, progress: Callable[[int, int], None] | None) -> _core.JointRace:
+        """Where the starts of this problem get; fits of the same structure to the same runs go on from there."""
         shares = [noise / (COARSE_SHARE * size) for noise, size in zip(self.noise, self.sizes, strict=True)]
-        runners = race_with_friction if self.problem.structure.has_friction else race
-        return Race(runners(self.alike, float(np.mean([share**2 for share in shares])), threads, progress))
+        floor = float(np.mean([share**2 for share in shares]))
+        weights = [1.0 / (COARSE_SHARE * size) for size in self.sizes]
+        if self.problem.structure.has_friction:
+            return race_with_friction(Grid(self.problem, self.runs, weights), floor, threads, progress)
+        runs = Asked(self.problem, self.runs).core(progress)
+        return _core.joint_race(self.problem.core, runs, weights, floor, (threads, memory_limit()), stop())
+
+
+def output_sizes(runs: Sequence[Run], structure: Structure) -> list[float]:
+    """Root of the mean variance of each output on all runs."""
+    return [math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in structure.outputs]
 
 
 def fit_output_error(
     runs: Sequence[Run], structure: Structure, *, threads: int = 1, start: Mapping[str, float] | None = None,
     refine: bool = True, progress: Callable[[int, int], None] | None = None, loss: Loss = "squares",
-    known: Sequence[Mapping[str, float]] = (), near: JointFit | None = None, raced: Race | None = None,
+    known: Sequence[Mapping[str, float]] = (), near: JointFit | None = None, raced: _core.JointRace | None = None,
 ) -> JointFit:  # fmt: skip
     """Fit all equations of a structure on all runs by output error, from an automatic start.
 
@@ -233,7 +224,7 @@ def fit_output_error(
     everything free by name, and is the only one; known ones stand beside the automatic ones; `near` is a fit of the
     same structure to nearly the same runs, to go on from on its grid and with its weights; `raced` is the race of its
     starts where that was run already. Without `refine` the grid is not refined below the samples. Progress is told
-    (starts done, starts in all). The loss decides between optima on all samples, not between starts.
+    (parts done, parts in all). The loss decides between optima on all samples, not between starts.
 
     Raises
     ------
@@ -244,46 +235,35 @@ def fit_output_error(
     """
     outset = Outset.of(runs, structure)
     problem, outputs = outset.problem, structure.outputs
-    if near is not None:
-        attempt = given(problem, dict(zip(near.names, near.values.tolist(), strict=True)))
-        grid = Grid(problem, runs, [1.0 / max(near.noise[o], 1e-300) for o in outputs], near.refinement)
-        return ended(*with_settled_weights(attempt, grid, loss), raced.reached if raced else (), loss, refine=refine)
     course = Course(progress)
-    reached: Sequence[Attempt] = ()
-    if start is None:
-        reached = (raced or outset.race(threads, course.until(RACED, SWEEP))).reached
-        contenders = finalists(reached) if reached else []
-        contenders += [given(problem, values) for values in known]
-    else:
-        contenders = [given(problem, start)]
-    if not contenders:
+    if problem.structure.has_friction and raced is None and start is None and near is None:
+        raced = outset.race(threads, course.until(RACED, SWEEP))
+    given_near = None
+    if near is not None:
+        given_near = near.values.tolist(), [near.noise[o] for o in outputs], near.refinement
+    found = _core.joint_fit(
+        problem.core, Asked(problem, runs).core(lambda done, _: course.at(done / PARTS)),
+        list(zip(outset.sizes, outset.noise, strict=True)), [[v[n] for n in problem.names] for v in known],
+        None if start is None else [start[n] for n in problem.names], given_near, raced, loss == "huber", refine,
+        (threads, memory_limit()), stop(),
+    )  # fmt: skip
+    if found is None:
         why = twin_words(runs, structure) or "check the signs of the data and the bounds"
         raise ConvergenceError(f"no start of {', '.join(outputs)} has a finite free run; {why}")
-    course.at(RACED)
-    weighed = outset.weighed
-    # Where a step passes faster than the samples see, a grid as coarse as the samples has an optimum of its own.
-    while weighed.every < FINEST and weighed.matters(contenders[0]):
-        weighed = weighed.finer
-    best = winner(contenders, replace(outset.alike, every=weighed.every))
-    if len(outputs) > 1:
-        # Of one output the noise does not move the optimum.
-        best = weighed.descend(best, LAST_LAP)
-    course.at(0.65)
-    best, weighed = with_settled_weights(best, weighed, loss)
-    course.at(0.75)
-    fit = ended(best, weighed, reached, loss, refine=refine)
-    course.at(1.0)
-    return fit
-
-
-def ended(best: Attempt, grid: Grid, reached: Sequence[Attempt], loss: Loss, *, refine: bool) -> JointFit:
-    """What a fit comes to whose weights have settled: one that dies away where it may, on grids fine enough."""
-    best, grid, growth = steadied(best, grid, reached)
-    if growth is not None and not growth.kept:
-        best, grid = with_settled_weights(best, grid, loss)
-    others = finalists(reached) if reached and refine else ()
-    starts = [(a.level, origin) for a in reached for origin in (a.origin, *a.alike)]
-    return replace(finished(best, grid, others, loss, refine=refine), starts=starts, growth=growth)
+    orders, coefficients, inputs = problem.split(found["estimate"])
+    residuals = [dict(zip(outputs, part, strict=True)) for part in found["left"]]
+    return JointFit(
+        orders=dict(zip(problem.orders, orders, strict=True)),
+        coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
+        inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)), products=dict(problem.products),
+        covariance=found["covariance"], residuals=residuals, noise=dict(zip(outputs, found["noise"], strict=True)),
+        robust=None if found["robust"] is None else Robust(*found["robust"]), shares=found["shares"],
+        on_grid=found["on_grid"], cost=found["cost"],
+        samples=sum(read(e).size for part in residuals for e in part.values()), refinement=found["every"],
+        settled=found["settled"], converged=found["status"] == "converged", starts=found["starts"],
+        initial=structure.initial, initial_terms=found["initial_terms"],
+        growth=None if found["growth"] is None else Growth(*found["growth"]),
+    )  # fmt: skip
 
 
 def given(problem: FreeProblem, values: Mapping[str, float]) -> Attempt:
@@ -295,61 +275,3 @@ def given(problem: FreeProblem, values: Mapping[str, float]) -> Attempt:
 def first_noise(runs: Sequence[Run], structure: Structure, output: str, size: float) -> float:
     """A first guess of an output's noise, from second differences, but not below a share of its size."""
     return max(float(np.median([noise_of(compared_values(run, structure, output)) for run in runs])), 1e-3 * size)
-
-
-def winner(contenders: Sequence[Attempt], near: Grid) -> Attempt:
-    """The best of the contenders on all samples, every output still weighing alike."""
-    ends = []
-    for attempt in contenders:
-        try:
-            ends.append(near.descend(attempt, FINAL_LAP))
-        except FtlmError:
-            # No finite free run on this grid; the others have one.
-            if attempt is contenders[-1] and not ends:
-                raise
-    best = near.finer.ranked(ends)[0] if len(ends) > 1 else ends[0]
-    # In logarithms it had its lap.
-    return near.lowest(best, FINAL_LAP, ended=True)
-
-
-def with_settled_weights(attempt: Attempt, grid: Grid, loss: Loss = "squares") -> tuple[Attempt, Grid]:
-    """Descend on a grid until the weights are those of the residuals, pooled over runs, and so are robust shares."""
-    outcome, weights, shares = grid.problem.core.settled(
-        grid.sampled, spans(grid.runs), grid.core, _place(attempt), loss == "huber", stop()
-    )
-    numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
-    there = replace(attempt, orders=numbers[0], coefficients=numbers[1], inputs=numbers[2], outcome=outcome)
-    return there, replace(grid, weights=weights, shares=shares)
-
-
-def _place(attempt: Attempt) -> tuple[list[float], list[list[float]]]:
-    """Numbers of an attempt, and states of its runs where they are known."""
-    known = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
-    return attempt.values.tolist(), known
-
-
-def finished(best: Attempt, grid: Grid, others: Sequence[Attempt], loss: Loss, *, refine: bool) -> JointFit:
-    """An optimum, its step halved until that moves it by little of its standard error, in words and names.
-
-    A coarse grid may lead along a flat valley to where equations end, and there a finer one leads nowhere: then others
-    have their way on it as well.
-    """
-    problem, outputs = grid.problem, grid.problem.structure.outputs
-    end = problem.core.finished(
-        grid.sampled, spans(grid.runs), grid.core, best.outcome, [_place(a) for a in others], loss == "huber", refine,
-        stop(),
-    )  # fmt: skip
-    there = end["attempt"]
-    orders, coefficients, inputs = problem.split(end["estimate"])
-    residuals = [dict(zip(outputs, part, strict=True)) for part in end["left"]]
-    return JointFit(
-        orders=dict(zip(problem.orders, orders, strict=True)),
-        coefficients=dict(zip(problem.coefficients, coefficients, strict=True)),
-        inputs=dict(zip((item.name for item in problem.inputs), inputs, strict=True)), products=dict(problem.products),
-        covariance=end["covariance"], residuals=residuals, noise=dict(zip(outputs, end["noise"], strict=True)),
-        robust=None if end["robust"] is None else Robust(*end["robust"]), shares=end["shares"],
-        on_grid=np.array([*there["orders"], *there["coefficients"], *there["inputs"]]), cost=there["cost"],
-        samples=sum(read(e).size for part in residuals for e in part.values()), refinement=end["every"],
-        settled=end["settled"], converged=there["status"] == "converged", starts=[],
-        initial=problem.structure.initial, initial_terms=sum(len(x) for run in there["initial"] for x in run),
-    )  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,14 +13,9 @@ from ftlm import _core
 from ftlm.base.arrays import Floats
 from ftlm.data.equations import Friction, Stribeck
 from ftlm.data.limits import FreeInput
-from ftlm.data.orders import MAX_ORDER, SEARCHED_ORDER, Order
-from ftlm.data.structures import Hints, Structure
+from ftlm.data.orders import Order
+from ftlm.data.structures import Hints, History, Structure
 from ftlm.solve.records import affine, initial_tuple
-
-#: Own bounds of orders where the structure gives none.
-ALPHA_BOUNDS = (0.05, SEARCHED_ORDER)
-#: The same of highest orders beside friction.
-FRICTION_BOUNDS = (1.001, 2.0)
 
 
 @dataclass(frozen=True)
@@ -35,7 +30,8 @@ class FreeProblem:
     coefficients: tuple[str, ...]
     bounds: tuple[tuple[float, float], ...]
     products: Mapping[str, tuple[float, tuple[str, ...]]]
-    inputs: tuple[FreeInput, ...] = ()
+    inputs: tuple[FreeInput, ...]
+    core: _core.JointProblem = field(repr=False, compare=False)
 
     @property
     def names(self) -> list[str]:
@@ -61,44 +57,12 @@ class FreeProblem:
     @classmethod
     def of(cls, structure: Structure) -> FreeProblem:
         """Free orders, free coefficients and their bounds."""
-        law = {name: (sign, factors) for name, sign, factors in structure.coefficient_law}
-        named = structure.coefficient_names
-        products = {n: law[n] for n in named if n in law}
-        free = [n for n in named if n not in products]
-        free += [f for _, factors in products.values() for f in factors if f not in named]
-        highest = {n for e in structure.equations if e.order.is_single for n in e.order.names}
-        bounds = []
-        for name in structure.order_names:
-            if name in structure.order_values:
-                values = structure.order_values[name]
-                bounds.append((values[0], values[-1]))
-            else:
-                least = ALPHA_BOUNDS[0] if name in highest else 0.0
-                bounds.append((least, _reach(structure, name, above=name in highest)))
-        if structure.has_friction:
-            # A velocity needs inertia, and friction of it an order of 2 at most.
-            ends = dict(zip(structure.order_names, bounds, strict=True))
-            orders = [structure.equations[i].order for i in structure.sticks]
-            inertia = {
-                n: (max(ends[n][0], FRICTION_BOUNDS[0]), min(ends[n][1], FRICTION_BOUNDS[1]))
-                for body in orders
-                for n in (body.names if body.is_single else ())
-            }
-            bounds = list((ends | inertia).values())
-        coefficients = tuple(dict.fromkeys(free))
-        return cls(structure, structure.order_names, coefficients, tuple(bounds), products, structure.free_inputs)
-
-    @property
-    def core(self) -> _core.JointProblem:
-        """The problem as the core follows its optima."""
-        structure, signals = self.structure, self.structure.signals
-        states = structure.filter_states(structure.initial)
-        return _core.JointProblem(
-            structure.outputs, self.laws(signals), self.bounds, len(self.coefficients),
-            [(signals.index(item.signal), item.law, item.bounds) for item in self.inputs],
-            structure.coupling == "simulated", initial_tuple(structure.initial, structure.offset, states),
-            self.frictions(),
-        )  # fmt: skip
+        core = _core.JointProblem(told(structure))
+        bounds = tuple(core.bounds[: len(core.orders)])
+        products = {name: (sign, tuple(factors)) for name, sign, factors in core.products}
+        return cls(
+            structure, tuple(core.orders), tuple(core.coefficients), bounds, products, structure.free_inputs, core
+        )
 
     @property
     def all_bounds(self) -> list[tuple[float, float]]:
@@ -203,29 +167,49 @@ class FreeProblem:
 
     def free_from(self, estimated: Mapping[str, float]) -> list[float]:
         """Free coefficients from freely estimated ones; ratios as the median of what the equations can say."""
-        out = []
-        for name in self.coefficients:
-            if name in estimated:
-                out.append(estimated[name])
-                continue
-            said = []
-            for dependent, (sign, factors) in self.products.items():
-                others = [estimated[f] for f in factors if f != name and f in estimated]
-                product = float(np.prod(others))
-                if name in factors and product:
-                    said.append(sign * estimated[dependent] / product)
-            least = self._exceeds(name)
-            usable = [s for s in said if math.isfinite(s) and least + 0.05 < s < 20]
-            out.append(float(np.median(usable)) if usable else least + 0.5)
-        return out
+        return self.core.free_from(dict(estimated))
 
     def _exceeds(self, ratio: str) -> float:
         """What a ratio of the coefficient law exceeds."""
         return (self.structure.hints or Hints()).exceeds.get(ratio, 1.0)
 
 
-def _reach(structure: Structure, name: str, *, above: bool) -> float:
-    """How high a free order is sought: 3, or past the highest number in its equations where that is more."""
-    beside = [e for e in structure.equations if name in e.order_names]
-    numbers = [o.constant for e in beside for o in (e.order, *(t.order for t in e.terms)) if not o.names]
-    return min(max([SEARCHED_ORDER, *(n + above for n in numbers)]), MAX_ORDER)
+def told(structure: Structure) -> dict[str, Any]:
+    """A structure, its initial terms decided, as the core takes it."""
+    signals, hints = structure.signals, structure.hints or Hints()
+    states = structure.filter_states(structure.initial)
+
+    def order(of: Order) -> tuple[float, list[tuple[str, float]]]:
+        return of.constant, list(of.weights)
+
+    def friction(rubs: Friction | None) -> list[tuple[float, str | float]] | None:
+        if rubs is None:
+            return None
+        more = rubs.stribeck or Stribeck(0.0, 1.0)
+        return [(-rubs.factor, rubs.coefficient), (-more.factor, more.coefficient), (1.0, more.speed)]
+
+    equations = [
+        (
+            signals.index(e.output), order(e.order),
+            [(signals.index(t.signal), order(t.order), t.coefficient, t.factor) for t in e.terms], friction(e.friction),
+        )
+        for e in structure.equations
+    ]  # fmt: skip
+    return {
+        "signals": list(signals),
+        "equations": equations,
+        "bounds": [(name, (values[0], values[-1])) for name, values in structure.order_values.items()],
+        "coupled": structure.coupling == "simulated",
+        "delayed": bool(structure.delay),
+        "initial": initial_tuple(structure.initial, structure.offset, states),
+        "history": isinstance(structure.initial, History),
+        "inputs": [(i.name, signals.index(i.signal), i.law, i.bounds) for i in structure.free_inputs],
+        "laws": list(structure.coefficient_law),
+        "hints": {
+            "highest": hints.highest,
+            "natural": [(name, list(values)) for name, values in hints.natural.items()],
+            "exceeds": list(hints.exceeds.items()),
+            "positive": list(hints.positive),
+            "known": list(hints.known.items()),
+        },
+    }

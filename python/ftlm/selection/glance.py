@@ -6,16 +6,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol, TypeVar
 
-import numpy as np
-
 from ftlm.base.errors import FtlmError
 from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.grid import Grid
-from ftlm.fit.joint import COARSE_SHARE, given
+from ftlm.fit.joint import COARSE_SHARE, given, output_sizes
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.race import COARSE_SAMPLES, CONTENDER, SECOND_LAP
 from ftlm.selection.trial import decided
+
+#: Samples of the thinned records, and evaluations of a descent on them: those of a race of starts whose best go on; by
+#: how much more than the best one leaves others are out of it.
+COARSE_SAMPLES, SECOND_LAP, CONTENDER = 1200, 60, 3.0
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -59,8 +60,9 @@ def contenders(runs: Sequence[Run], starts: Sequence[Start], least: int, pool: P
 def _level(runs: Sequence[Run], structure: Structure, points: Sequence[Mapping[str, float]], decimation: int) -> float:
     """The least that descents from some points leave on thinned samples, every output weighing alike."""
     problem = FreeProblem.of(structure)
-    sizes = [math.sqrt(float(np.mean([np.nanvar(run[o]) for run in runs]))) for o in structure.outputs]
-    grid = Grid(problem, runs, [1.0 / (COARSE_SHARE * size) for size in sizes], decimation=decimation)
+    grid = Grid(
+        problem, runs, [1.0 / (COARSE_SHARE * size) for size in output_sizes(runs, structure)], decimation=decimation
+    )
     found = math.inf
     for point in points:
         try:

@@ -22,8 +22,8 @@ from ftlm.base.arrays import Floats
 from ftlm.base.errors import ConvergenceError, DataError, FtlmError, ModelError
 from ftlm.data.run import Run
 from ftlm.data.structures import History, Initial, Structure
+from ftlm.fit.growth import Growth
 from ftlm.fit.joint import JointFit
-from ftlm.fit.steady import Growth
 from ftlm.search import frames
 from ftlm.search.log import SELECTION, Log
 from ftlm.selection.candidates import Change, Variant

@@ -173,12 +173,7 @@ impl<'a> Sought<'a> {
 /// # Errors
 /// Those of the source and the starts; [`Error::Beyond`] where squares of residuals are no numbers; what the last contender's
 /// descent ends with where none has a free run; [`Error::Interrupted`].
-pub fn fit(
-    sought: Sought<'_>,
-    outset: Outset,
-    settings: Settings,
-    told: &Listener<'_>,
-) -> Result<Option<JointFit>> {
+pub fn fit(sought: Sought<'_>, outset: Outset, settings: Settings, told: &Listener<'_>) -> Result<Option<JointFit>> {
     let free = sought.free;
     let mut pace = Pace::new(told);
     let (reached, contenders) = match outset {

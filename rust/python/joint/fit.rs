@@ -11,7 +11,7 @@ use super::super::errors::attached;
 use super::super::estimate::status;
 use super::super::lists::List;
 use super::super::search::watch::{served, Stop};
-use super::asked::{Answer, Answering, Asked, Known, Question, RunsArg};
+use super::asked::{Answering, Asked, Known, Question, RunsArg};
 use super::JointProblem;
 use crate::error::Result;
 use crate::estimate::joint::free::Free;
@@ -58,9 +58,12 @@ fn asking<T: Send + 'static>(
     work: impl FnOnce(&crate::stop::Stop, &Asked<'_, T>) -> Result<T> + Send + 'static,
 ) -> PyResult<T> {
     let (known, answering): (Known, Answering) = Known::of(runs)?;
-    served(py, stop, |py, question: Question| answering.answer(py, question), move |stop, desk| {
-        work(stop, &Asked::<T>::new(desk, known))
-    })
+    served(
+        py,
+        stop,
+        |py, question: Question| answering.answer(py, question),
+        move |stop, desk| work(stop, &Asked::<T>::new(desk, known)),
+    )
 }
 
 /// The race of the starts of a problem, every output weighing so; noise alone leaves `floor` per residual.
@@ -80,8 +83,7 @@ pub fn joint_race(
     let reached = asking(py, runs, stop, move |stop, source| {
         let starts = Lattices::new(source, threads, memory, stop);
         let told = |done, of| source.tell(done, of);
-        let course =
-            Course { source, starts: &starts, stop, weights: &weights, floor, threads, told: Some(&told) };
+        let course = Course { source, starts: &starts, stop, weights: &weights, floor, threads, told: Some(&told) };
         race::race(&free, course)
     })?;
     Ok(JointRace { inner: Arc::new(reached) })
@@ -102,7 +104,8 @@ pub fn joint_grids(
     stop: Option<&Stop>,
 ) -> PyResult<JointRace> {
     let free = Arc::clone(&problem.inner);
-    let starts = starts.into_iter().map(|(values, origin)| started(&free, &values, origin)).collect::<Result<Vec<_>>>()?;
+    let starts =
+        starts.into_iter().map(|(values, origin)| started(&free, &values, origin)).collect::<Result<Vec<_>>>()?;
     let reached = asking(py, runs, stop, move |stop, source| {
         let weights = Weights { outputs: weights.into(), shares: None };
         let sampling = Sampling { decimation, ..Sampling::default() };

@@ -4,6 +4,7 @@ mod asked;
 mod fit;
 mod named;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use numpy::{PyArray1, PyArray2, PyReadonlyArray1, PyReadonlyArray2};
@@ -65,6 +66,12 @@ impl JointProblem {
     #[getter]
     fn whole_orders(&self) -> PyResult<Vec<f64>> {
         attached(|| Ok(self.inner.whole_orders()))
+    }
+
+    /// Free coefficients from freely estimated ones, by name; ratios as the median of what the equations can say.
+    #[allow(clippy::needless_pass_by_value)]
+    fn free_from(&self, estimated: BTreeMap<String, f64>) -> PyResult<Vec<f64>> {
+        attached(|| Ok(self.inner.free_from(&estimated)))
     }
 
     /// Bounds of everything that is free.

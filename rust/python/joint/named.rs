@@ -109,7 +109,8 @@ pub fn named(argument: StructureArg) -> PyResult<Structure> {
         },
     };
     let signals = found.signals.len();
-    let missing = found.equations.iter().flat_map(|e| std::iter::once(e.output).chain(e.terms.iter().map(|t| t.signal)));
+    let missing =
+        found.equations.iter().flat_map(|e| std::iter::once(e.output).chain(e.terms.iter().map(|t| t.signal)));
     if let Some(signal) = missing.chain(found.inputs.iter().map(|i| i.free.signal)).find(|&s| s >= signals) {
         let what = format!("signal {signal} of {signals}");
         return Err(Error::Structure { what, remedy: "number them from 0".into() }.into());

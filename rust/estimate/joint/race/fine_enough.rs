@@ -24,14 +24,8 @@ pub(super) struct Chosen<'a> {
 ///
 /// A stiff equation may have no stable scheme, and so no start, on a coarse grid; and a coarse grid has optima of its own:
 /// all start anew on the grid on which those few no longer move.
-pub(super) fn fine_enough<'a>(
-    laps: Laps<'_>,
-    free: &Free,
-    coarse: Grid<'a>,
-    starts: &[Runner],
-) -> Result<Chosen<'a>> {
-    let glance =
-        |grid: &Grid<'_>, starts: &[Runner]| Ok(distinct(&laps.run(free, grid, starts, GLANCE)?, same_place));
+pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, starts: &[Runner]) -> Result<Chosen<'a>> {
+    let glance = |grid: &Grid<'_>, starts: &[Runner]| Ok(distinct(&laps.run(free, grid, starts, GLANCE)?, same_place));
     let mut glanced: Vec<Runner> = glance(&coarse, starts)?;
     if starts.len() <= PIONEERS || coarse.sampling.every >= FINEST {
         return Ok(Chosen { grid: coarse, glanced, ran: Vec::new() });

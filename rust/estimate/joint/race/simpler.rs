@@ -118,7 +118,9 @@ fn nameless(less: &Simpler) -> Option<String> {
         let weights: Vec<_> = order.weights.iter().map(|(name, weight)| (*weight, bound(name))).collect();
         format!("{:?} {weights:?}", order.constant)
     };
-    let term = |t: &crate::estimate::joint::free::Term| format!("{} {} {:?} {:?}", t.signal, of(&t.order), t.fixed(), t.factor);
+    let term = |t: &crate::estimate::joint::free::Term| {
+        format!("{} {} {:?} {:?}", t.signal, of(&t.order), t.fixed(), t.factor)
+    };
     let mut terms: Vec<String> = item.terms.iter().map(term).collect();
     terms.sort();
     Some(format!("{} {} {terms:?}", item.output, of(&item.order)))

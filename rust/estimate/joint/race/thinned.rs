@@ -42,7 +42,8 @@ pub(super) fn thinned(free: &Free, source: &dyn Recordings) -> Result<Sampling> 
         return Ok(all);
     }
     let first = each * carried;
-    let as_lively = |samples: &Vec<f64>| deviation(&samples[..=first.min(samples.len() - 1)]) >= AS_LIVELY * deviation(samples);
+    let as_lively =
+        |samples: &Vec<f64>| deviation(&samples[..=first.min(samples.len() - 1)]) >= AS_LIVELY * deviation(samples);
     if !outputs.iter().flatten().all(as_lively) {
         return Ok(all);
     }

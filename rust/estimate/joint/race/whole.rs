@@ -39,7 +39,8 @@ pub fn whole(free: &Free, near: &[f64]) -> Vec<Whole> {
     let natural = &free.structure.hints.natural;
     let values: Vec<Vec<f64>> = (free.orders.iter().zip(free.bounds()))
         .map(|(name, &(low, high))| {
-            let known: Vec<f64> = natural.get(name).into_iter().flatten().copied().filter(|v| *v == v.round()).collect();
+            let known: Vec<f64> =
+                natural.get(name).into_iter().flatten().copied().filter(|v| *v == v.round()).collect();
             let known = if known.is_empty() { WHOLE.to_vec() } else { known };
             known.into_iter().filter(|v| (low..=high).contains(v)).collect()
         })

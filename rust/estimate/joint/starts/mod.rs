@@ -19,6 +19,7 @@ use self::prefilter::LowPasses;
 use self::resonances::scanned_attempts;
 use self::rows::Coarse;
 use super::free::Free;
+use super::race::Starts;
 use super::runner::Runner;
 use super::source::Recordings;
 use super::words::short;
@@ -166,5 +167,11 @@ impl<'a> Lattices<'a> {
             }
         }
         Ok(())
+    }
+}
+
+impl Starts for Lattices<'_> {
+    fn of(&self, free: &Free) -> Result<Vec<Runner>> {
+        self.starts(free)
     }
 }
