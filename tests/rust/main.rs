@@ -34,3 +34,4 @@ mod search_refusals;
 mod series;
 mod simulate;
 mod stage;
+mod starts;

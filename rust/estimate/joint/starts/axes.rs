@@ -31,10 +31,12 @@ pub(super) fn start_axes(free: &Free) -> Axes {
         if !above {
             high = high.min(BELOW);
         }
-        let count = ((high - low) / START_STEP).round_ties_even().max(0.0) as usize;
-        let values = if high > low { between(low, high, count + 1) } else { vec![low] };
-        let values =
-            if high > low { values.iter().map(|v| (v * GRAINS).round_ties_even() / GRAINS).collect() } else { values };
+        if high <= low {
+            return (name.clone(), vec![low]);
+        }
+        let count = ((high - low) / START_STEP).round_ties_even() as usize;
+        let tidied = |v: &f64| (v * GRAINS).round_ties_even() / GRAINS;
+        let values = between(low, high, count + 1).iter().map(tidied).collect();
         (name.clone(), values)
     };
     let mut axes: Axes = free.orders.iter().zip(free.bounds()).map(axis).collect();
@@ -87,4 +89,41 @@ pub(super) fn values<'a>(axes: &'a Axes, name: &str) -> &'a [f64] {
 fn size(equation: &Equation, axes: &Axes) -> u128 {
     let names: BTreeSet<&String> = equation.orders().flat_map(Order::names).collect();
     names.iter().fold(1, |size, name| size.saturating_mul(values(axes, name).len() as u128))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::{between, start_axes, values};
+    use crate::equation::Initial;
+    use crate::error::Result;
+    use crate::estimate::joint::free::{Coefficient, Equation, Free, Hints, Order, Structure, Term};
+
+    #[test]
+    fn orders_lie_on_a_coarse_lattice_within_their_bounds() -> Result<()> {
+        let term = |signal, order| {
+            let coefficient = Coefficient::Free(format!("c_{order}"));
+            Term { signal, order: Order::free(order), coefficient, factor: 1.0 }
+        };
+        let terms = vec![term(0, "nu"), term(1, "beta")];
+        let equations = vec![Equation { output: 0, order: Order::free("alpha"), terms, friction: None }];
+        let structure = Structure {
+            signals: vec!["y".into(), "u".into()],
+            equations,
+            bounds: [("beta".into(), (0.5, 0.5))].into(),
+            coupled: false,
+            delayed: false,
+            initial: Initial::Rest,
+            history: false,
+            inputs: Vec::new(),
+            laws: Vec::new(),
+            hints: Hints::default(),
+        };
+        let axes = start_axes(&Free::of(structure)?);
+        let alphas = values(&axes, "alpha");
+        assert_eq!((alphas.len(), alphas[0], alphas[1], alphas[14]), (15, 0.2, 0.4, 3.0));
+        assert_eq!((values(&axes, "nu").len(), values(&axes, "nu")[10]), (11, 2.0));
+        assert_eq!(values(&axes, "beta"), [0.5]);
+        assert_eq!(between(1.0, 2.0, 1), [1.0]);
+        Ok(())
+    }
 }

@@ -13,7 +13,7 @@ const SHARE: f64 = 0.9;
 ///
 /// ```
 /// use ftlm::estimate::joint::starts::power_frequency;
-/// let wave: Vec<f64> = (0..500).map(|k| f64::from(k).mul_add(0.1, 0.0).sin()).collect();
+/// let wave: Vec<f64> = (0..500).map(|k| (0.1 * f64::from(k)).sin()).collect();
 /// // One bin of the transform is 2π/5 rad/s.
 /// assert!((power_frequency(&wave, 0.01) - 10.0).abs() < 2.6);
 /// ```

@@ -6,13 +6,13 @@ use super::axes::{values, Axes};
 use super::parts::parts;
 use crate::equation::Initial;
 use crate::error::{Error, Result};
-use crate::estimate::joint::free::{Equation, Order, Structure};
+use crate::estimate::joint::free::{Equation, Order, Structure, Term};
 use crate::regressors::Record;
 use crate::search::control::Control;
 use crate::search::lattice::{Lattice, LawEquation, LawLattice, TermAxis};
 use crate::search::options::Options;
 use crate::search::{rounds, stage};
-use crate::statistics::{mean, sum};
+use crate::statistics::mean;
 use crate::stop::Stop;
 
 /// A row of a lattice: its orders, and the coefficients freely estimated there, by name.
@@ -131,7 +131,7 @@ impl Coarse<'_> {
             Some(name) => values(axes, name).to_vec(),
             None => vec![order.constant],
         };
-        let term = |t: &crate::estimate::joint::free::Term| TermAxis {
+        let term = |t: &Term| TermAxis {
             signal: t.signal,
             values: axis(&t.order),
             interchangeable: t.order.is_free() && t.fixed().is_none(),
@@ -173,7 +173,7 @@ pub(super) fn named_coefficients<'a>(item: &'a Equation, raw: &'a [f64]) -> impl
 
 /// Products of factor and coefficient where they are known.
 pub(super) fn known(item: &Equation) -> Vec<Option<f64>> {
-    item.terms.iter().map(crate::estimate::joint::free::Term::fixed).collect()
+    item.terms.iter().map(Term::fixed).collect()
 }
 
 /// Refuses friction where nothing knows it.
@@ -208,10 +208,5 @@ fn named_signals(error: Error, signals: &[String]) -> Error {
 fn deviation(values: &[f64]) -> f64 {
     let centre = mean(values);
     let squares: Vec<f64> = values.iter().map(|v| (v - centre) * (v - centre)).collect();
-    (sum(&squares) / centre_count(values)).sqrt()
-}
-
-#[allow(clippy::cast_precision_loss)]
-fn centre_count(values: &[f64]) -> f64 {
-    values.len() as f64
+    mean(&squares).sqrt()
 }

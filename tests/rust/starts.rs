@@ -1,0 +1,215 @@
+//! Where joint fits start: frequencies against sums, lattices against brute force, delays and limits, refusals.
+
+use std::f64::consts::PI;
+
+use ftlm::equation::{self, Initial};
+use ftlm::error::{Error, Result};
+use ftlm::estimate::joint::free::{Coefficient, Equation, Free, Hints, Input, Order, Structure, Term};
+use ftlm::estimate::joint::starts::{power_frequency, Lattices};
+use ftlm::estimate::joint::{Recordings, Runner, Sampled, Sampling, Signal, Source};
+use ftlm::estimate::output_error::{Experiment, FreeInput, InputLaw};
+use ftlm::means::{delayed, point_samples, Intersample};
+use ftlm::regressors::{Record, BANK_LIMIT};
+use ftlm::search::control::Control;
+use ftlm::search::lattice::{Lattice, TermAxis};
+use ftlm::search::options::Options;
+use ftlm::search::rounds::search;
+use ftlm::simulate::respond;
+use ftlm::stop::Stop;
+
+use crate::common::{bits, check, deviation, Random};
+
+const STEP: f64 = 0.02;
+const ALPHA: f64 = 1.7;
+const NU: f64 = 0.8;
+
+/// Samples of D^1.7 y = −3 D^0.8 y − 20 y + 5 u with a little noise, and the held input.
+fn plant() -> Vec<Signal> {
+    let mut random = Random::new(4);
+    let input = random.steps(800, 15);
+    let term = |signal, order| equation::Term { signal, order };
+    let terms = vec![term(0, NU), term(0, 0.0), term(1, 0.0)];
+    let known = equation::Structure { output: 0, order: ALPHA, terms };
+    let truth = equation::Equation::new(known, vec![-3.0, -20.0, 5.0]).unwrap();
+    let rest = Record::new(STEP, vec![vec![0.0; 800], input.clone()], None).unwrap();
+    let mut y = point_samples(&respond(&[truth], &rest, &[]).unwrap()[0]);
+    let size = 0.01 * deviation(&y);
+    y.iter_mut().for_each(|v| *v += size * random.normal());
+    y.truncate(800);
+    let signal = |samples, between| Signal { samples, between };
+    vec![signal(y, Intersample::Linear), signal(input, Intersample::Hold)]
+}
+
+fn runs() -> Sampled {
+    let mut run = plant();
+    let rows = run.iter().map(|s| s.samples.len()).min().unwrap();
+    run.iter_mut().for_each(|s| s.samples.truncate(rows));
+    Sampled::new(STEP, vec![0], vec![run]).unwrap()
+}
+
+fn term(signal: usize, order: Order, name: &str) -> Term {
+    Term { signal, order, coefficient: Coefficient::Free(name.into()), factor: 1.0 }
+}
+
+/// D^alpha y = a D^nu y + b y + c D^beta u.
+fn structure(alpha: Order, beta: f64) -> Structure {
+    let terms =
+        vec![term(0, Order::free("nu"), "a"), term(0, Order::number(0.0), "b"), term(1, Order::number(beta), "c")];
+    Structure {
+        signals: vec!["y".into(), "u".into()],
+        equations: vec![Equation { output: 0, order: alpha, terms, friction: None }],
+        bounds: [].into(),
+        coupled: true,
+        delayed: false,
+        initial: Initial::Rest,
+        history: false,
+        inputs: Vec::new(),
+        laws: Vec::new(),
+        hints: Hints::default(),
+    }
+}
+
+fn found(structure: Structure, source: &dyn Recordings, threads: usize) -> Result<Vec<Runner>> {
+    Lattices::new(source, threads, BANK_LIMIT, &Stop::default()).starts(&Free::of(structure)?)
+}
+
+#[test]
+fn the_frequency_of_power_is_that_of_sums() {
+    for count in [7_usize, 128, 301] {
+        let x = Random::new(count as u64).signal(count);
+        let centre = x.iter().sum::<f64>() / count as f64;
+        let last = (count - 1) as f64;
+        let y: Vec<f64> = (x.iter().enumerate())
+            .map(|(k, v)| (v - centre) * (0.5 - 0.5 * (2.0 * PI * k as f64 / last).cos()))
+            .collect();
+        let power = |bin: usize| {
+            let angle = |k: usize| 2.0 * PI * (bin * k) as f64 / count as f64;
+            let (c, s) = y
+                .iter()
+                .enumerate()
+                .fold((0.0, 0.0), |(c, s), (k, v)| (c + v * angle(k).cos(), s + v * angle(k).sin()));
+            c * c + s * s
+        };
+        let all: Vec<f64> = (0..=count / 2).map(power).collect();
+        let whole: f64 = all.iter().sum();
+        let at = (0..all.len()).find(|&k| all[..=k].iter().sum::<f64>() >= 0.9 * whole).unwrap();
+        let told = 2.0 * PI * at.max(1) as f64 / (count as f64 * 0.1);
+        check("frequency", (power_frequency(&x, 0.1) / told - 1.0).abs(), 1e-14);
+    }
+    // What never moves is as slow as can be told; what was not read is bridged.
+    assert_eq!(power_frequency(&[3.0; 10], 0.1), 2.0 * PI);
+    let mut ramp: Vec<f64> = (0..50).map(f64::from).collect();
+    let whole = power_frequency(&ramp, 0.1);
+    ramp[20..25].fill(f64::NAN);
+    assert_eq!(power_frequency(&ramp, 0.1), whole);
+}
+
+#[test]
+fn starts_of_a_known_plant_hold_one_near_the_truth_whatever_the_threads() {
+    let source = runs();
+    let one = found(structure(Order::free("alpha"), 0.0), &source, 1).unwrap();
+    let two = found(structure(Order::free("alpha"), 0.0), &source, 2).unwrap();
+    let values = |all: &[Runner]| all.iter().flat_map(|r| bits(&r.attempt.values())).collect::<Vec<_>>();
+    assert_eq!(values(&one), values(&two));
+    assert!(one.iter().zip(&two).all(|(a, b)| a.origin == b.origin));
+    let distance = |r: &Runner| {
+        let orders = &r.attempt.place.point.orders;
+        (orders[0] - ALPHA).abs().max((orders[1] - NU).abs())
+    };
+    check("distance from the truth", one.iter().map(distance).fold(f64::INFINITY, f64::min), 0.15);
+    assert!(one.iter().any(|r| r.origin == "no prefilter") && one.iter().any(|r| r.origin == "scan of resonances"));
+    assert!(one[0].origin.starts_with("prefilter ") && one[0].origin.ends_with(" rad/s"));
+}
+
+#[test]
+fn the_best_row_is_followed_to_where_no_neighbour_is_better() {
+    let source = runs();
+    let all = found(structure(Order::free("alpha"), 0.0), &source, 1).unwrap();
+    let best = &all.iter().find(|r| r.origin == "no prefilter").unwrap().attempt.place.point.orders;
+    let records = source.records(799.min(source.samples(0).unwrap()[0].len() - 1), &[]).unwrap();
+    let axis = |signal, values| TermAxis { signal, values, interchangeable: false };
+    let around = |v: f64| vec![v - 0.05, v, v + 0.05];
+    let terms = [axis(0, around(best[1])), axis(0, vec![0.0]), axis(1, vec![0.0])];
+    let lattice = Lattice::new(0, &around(best[0]), &terms, |s| s == 1).unwrap();
+    let options = Options { keep: 1, early_stopping: false, ..Options::default() };
+    let table = search(&records, &lattice, &[None; 3], &options, &Control::default()).unwrap();
+    let at = lattice.structure(table.rows[0].index);
+    assert!((at.order - best[0]).abs() < 1e-9 && (at.terms[0].order - best[1]).abs() < 1e-9);
+}
+
+/// Runs whose input acts later, or no further than a limit.
+struct Acting(Sampled, Vec<Signal>, Input);
+
+impl Source for Acting {
+    fn spans(&self) -> Vec<(f64, f64)> {
+        self.0.spans()
+    }
+
+    fn experiments(&self, sampling: Sampling) -> Result<Vec<Experiment>> {
+        self.0.experiments(sampling)
+    }
+}
+
+impl Recordings for Acting {
+    fn inputs(&self) -> Vec<Option<Intersample>> {
+        self.0.inputs()
+    }
+
+    fn samples(&self, signal: usize) -> Result<Vec<Vec<f64>>> {
+        self.0.samples(signal)
+    }
+
+    fn records(&self, m: usize, inputs: &[f64]) -> Result<Vec<Record>> {
+        let mut run = self.1.clone();
+        let input = &mut run[1].samples;
+        *input = match self.2.free.law {
+            InputLaw::Delay => delayed(input, inputs[0] / STEP, 0.0)?,
+            _ => input.iter().map(|v| v.clamp(-inputs[0], inputs[0])).collect(),
+        };
+        Sampled::new(STEP, vec![0], vec![run])?.records(m, &[])
+    }
+}
+
+#[test]
+fn delays_and_limits_are_tried() {
+    for (law, name, bounds, words) in [
+        (InputLaw::Delay, "delay_u", (0.0, 0.3), ", delay 0 ms"),
+        (InputLaw::Saturation, "sat_u", (0.01, 10.0), ", sat_u 0."),
+    ] {
+        let input = Input { name: name.into(), free: FreeInput { signal: 1, law, bounds } };
+        let mut free = structure(Order::number(1.7), 0.0);
+        free.inputs = vec![input.clone()];
+        let source = runs();
+        let run: Vec<Signal> = source
+            .samples(0)
+            .unwrap()
+            .into_iter()
+            .chain(source.samples(1).unwrap())
+            .zip([Intersample::Linear, Intersample::Hold])
+            .map(|(samples, between)| Signal { samples, between })
+            .collect();
+        let all = found(free, &Acting(source, run, input), 1).unwrap();
+        let mut tried: Vec<f64> = all.iter().map(|r| r.attempt.place.point.inputs[0]).collect();
+        tried.dedup();
+        assert!(all[0].origin.contains(words), "{}", all[0].origin);
+        assert!(tried.len() >= 2 && tried.iter().all(|v| (bounds.0..=bounds.1).contains(v)), "{tried:?}");
+        if law == InputLaw::Delay {
+            assert_eq!((tried[0], *tried.last().unwrap()), bounds);
+        }
+    }
+}
+
+#[test]
+fn what_makes_no_start_is_refused() {
+    let source = runs();
+    let held = found(structure(Order::number(1.7), 2.2), &source, 1).unwrap_err();
+    assert!(held.to_string().starts_with("order 2.2 of u is above alpha = 1.7 of y"), "{held}");
+    let mut narrow = structure(Order::number(1.0), 0.0);
+    narrow.bounds.insert("nu".into(), (1.5, 1.9));
+    let empty = found(narrow, &source, 1).unwrap_err();
+    assert!(empty.to_string().contains("no orders of signal 'y' fit below alpha = 1"), "{empty}");
+    let stop = Stop::default();
+    stop.set();
+    let free = Free::of(structure(Order::free("alpha"), 0.0)).unwrap();
+    assert_eq!(Lattices::new(&source, 1, BANK_LIMIT, &stop).starts(&free), Err(Error::Interrupted));
+}
