@@ -251,53 +251,102 @@ class Sound:
             free, self.one(1, 3, 20), 1e-6, self.one(True, False), self.one(None, _core.Stop()),
         )  # fmt: skip
 
-    # ------------------------------------------------------------------------------------------ the end of a joint fit
+    # ------------------------------------------------------------------------------------------------------ joint fits
 
     def joint_problem_new(self):
-        law = (0, (0.0, [1.0]), [(0, (0.0, [0.0]), (-1.0, [(0, 1)])), (1, (0.0, [0.0]), (1.0, [(1, 1)]))])
-        inputs = [(signal, kind, ends) for signal, kind, ends, _ in self.free_inputs("saturation", "dead_zone")]
-        return ["y"], [law], [(0.5, 2.0)], 2, inputs, True, self.terms(), []
+        plain = 0.0, []
+        terms = [(0, plain, "a", -1.0), (1, plain, "b", 1.0)]
+        inputs = [
+            (f"{kind}_u", signal, kind, ends) for signal, kind, ends, _ in self.free_inputs("saturation", "dead_zone")
+        ]
+        hints = {"highest": None, "natural": [("alpha", [1.0])], "exceeds": [], "positive": [], "known": [("b", 1.0)]}
+        told = {
+            "signals": ["y", "u"], "equations": [(0, (0.0, [("alpha", 1.0)]), terms, None)],
+            "bounds": self.one([], [("alpha", (0.5, 2.0))]), "coupled": self.one(True, False), "delayed": False,
+            "initial": self.terms(), "history": False, "inputs": inputs, "laws": [], "hints": self.one(hints, hints),
+        }  # fmt: skip
+        return (told,)
 
     def sampled(self):
-        """A problem, its runs as they are asked for, their spans, a grid, and a place on it."""
-        given = self.joint_problem_new()
-        runs = [(self.normal((2, 32)), self.normal((1, 33))) for _ in range(self.one(1, 2))]
+        """A problem, its runs as the core asks for them, and values of everything free."""
+        (told,) = self.joint_problem_new()
+        problem, step, rows = _core.JointProblem(told), 0.05, 33
+        drawn = [(self.normal(rows), self.normal(rows)) for _ in range(self.one(1, 2))]
 
-        def at(every, decimation):
-            return [
-                ((0.05 / every, np.repeat(means, every, axis=1), None), every, samples, None, [1.0], [], None, None)
-                for means, samples in runs
-            ]
+        class Runs:
+            def sampled(self, every, decimation, first):
+                kept = (min(first or rows - 1, rows - 1)) // decimation
+                made = []
+                for run in drawn:
+                    signals = [np.ascontiguousarray(s[: kept * decimation + 1]) for s in run]
+                    means = np.stack([_core.pulse_means(s, kept * every, True) for s in signals])
+                    samples = signals[0][::decimation][None].copy()
+                    made.append(((step * decimation / every, means, None), every, samples, None, [1.0], [], None, None))
+                return made
 
-        place = [1.2, 1.5, 0.7, *(1.0 for _ in given[4])], []
-        grid = [1.0], 1, 1, None, self.one(True, False)
-        return _core.JointProblem(*given), at, [(0.05, 1.65)] * len(runs), grid, place
+            def records(self, m, inputs):
+                means = [np.stack([_core.pulse_means(s, m, True) for s in run]) for run in drawn]
+                return [(step * (rows - 1) / m, rows_of, None) for rows_of in means]
+
+            def read(self, signal):
+                return [run[signal] for run in drawn]
+
+        heard = self.one(None, lambda done, of: None)
+        values = [1.2, 1.5, 0.7, *(1.0 for _ in told["inputs"])]
+        return problem, (Runs(), [(step, rows * step)] * len(drawn), [None, "zoh"], heard), values
+
+    def joint_problem_orders(self):
+        return self.one_of("JointProblem"), ()
+
+    def joint_problem_coefficients(self):
+        return self.one_of("JointProblem"), ()
+
+    def joint_problem_products(self):
+        return self.one_of("JointProblem"), ()
+
+    def joint_problem_whole_orders(self):
+        return self.one_of("JointProblem"), ()
 
     def joint_problem_bounds(self):
         return self.one_of("JointProblem"), ()
 
+    def joint_problem_free_from(self):
+        return self.one_of("JointProblem"), ({"a": 1.0, "b": self.one(2.0, -1.0)},)
+
     def joint_problem_feasible(self):
-        problem, *_, (values, _) = self.sampled()
+        problem, _, values = self.sampled()
         return problem, (np.array(values), np.array(values) * self.one(1.0, 1.4))
 
-    def joint_problem_settled(self):
-        problem, at, spans, grid, place = self.sampled()
-        return problem, (at, spans, grid, place, self.one(True, False), self.one(None, _core.Stop()))
+    def joint_race(self):
+        problem, runs, _ = self.sampled()
+        return problem, runs, [1.0], 1.0, (self.one(1, 2), 1 << 30), self.one(None, _core.Stop())
 
-    def joint_problem_finished(self):
-        problem, at, spans, grid, place = self.sampled()
-        found, weights, _ = problem.settled(at, spans, grid, place, False)
-        grid = weights, *grid[1:]
-        others, refine = self.one([], [place]), self.one(True, False)
-        return problem, (at, spans, grid, found, others, False, refine, self.one(None, _core.Stop()))
+    def joint_grids(self):
+        problem, runs, values = self.sampled()
+        return problem, runs, [1.0], self.one(1, 2), [(values, "here")], self.one(1, 2), self.one(None, _core.Stop())
+
+    def joint_fit(self):
+        problem, runs, values = self.sampled()
+        near, start = self.one((values, [1.0], 1), None), self.one(values, None)
+        raced = self.one(None, _core.joint_grids(problem, runs, [1.0], 1, [(values, "here")], 1))
+        return (
+            problem, runs, [(1.0, 0.1)], self.one([], [values]), start, near, raced, self.one(True, False),
+            self.one(True, False), (self.one(1, 2), 1 << 30), self.one(None, _core.Stop()),
+        )  # fmt: skip
+
+    def joint_race_values(self):
+        problem, runs, values = self.sampled()
+        return _core.joint_grids(problem, runs, [1.0], 1, [(values, "here")], 1), ()
+
+    joint_race_len = joint_race_origins = joint_race_values
 
     def joint_problem_clock(self):
-        problem, _, spans, *_ = self.sampled()
+        problem, (_, spans, *_), _ = self.sampled()
         return problem, (spans,)
 
     def clocked(self):
         """A clock, and values of what it tells."""
-        problem, _, spans, _, (values, _) = self.sampled()
+        problem, (_, spans, *_), values = self.sampled()
         return problem.clock(spans), np.array(values)
 
     def joint_clock_unit(self):

@@ -4,7 +4,7 @@ Arrays are float64. A signal is a vector of pulse means unless it says samples; 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final, Literal, TypeAlias, TypedDict, final
+from typing import Any, Final, Literal, Protocol, TypeAlias, TypedDict, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ __all__ = [
     "Guard",
     "JointClock",
     "JointProblem",
+    "JointRace",
     "OrderSearch",
     "Points",
     "StageSearch",
@@ -48,6 +49,9 @@ __all__ = [
     "haar_transform",
     "instrumental_variables",
     "is_white",
+    "joint_fit",
+    "joint_grids",
+    "joint_race",
     "lattice_size",
     "least_squares",
     "long_run",
@@ -266,17 +270,50 @@ def output_error(
 ) -> _Fit: ...
 def grows(alpha: float, own_terms: Sequence[tuple[float, float]]) -> bool: ...
 
-# --------------------------------------------------------------------------------------------------- end of a joint fit
+# ----------------------------------------------------------------------------------------------------------- joint fits
 
-#: the runs with so many pulses a sample interval, of every so manieth sample
-_Sampling: TypeAlias = Callable[[int, int], Sequence[_Experiment]]
-#: (weight of each output, pulses a sample interval, of how many samples one counts, shares by run, whether steady)
-_Grid: TypeAlias = tuple[Sequence[float], int, int, Sequence[_Floats] | None, bool]
-#: (values of everything free, states of each run with friction)
-_Place: TypeAlias = tuple[Sequence[float], Sequence[Sequence[float]]]
+#: (constant, weight of each free order by name)
+_Order: TypeAlias = tuple[float, Sequence[tuple[str, float]]]
+#: (output, order, (signal, order, coefficient, factor) of each term, (factor, coefficient) of fc, fs and vs)
+_NamedEquation: TypeAlias = tuple[
+    int,
+    _Order,
+    Sequence[tuple[int, _Order, str | float, float]],
+    Sequence[tuple[float, str | float]] | None,
+]
 
-class _Finished(TypedDict):
-    weights: list[float]
+class _Hints(TypedDict):
+    highest: tuple[float, float] | None
+    natural: Sequence[tuple[str, Sequence[float]]]
+    exceeds: Sequence[tuple[str, float]]
+    positive: Sequence[str]
+    known: Sequence[tuple[str, float]]
+
+class _Named(TypedDict):
+    signals: Sequence[str]
+    equations: Sequence[_NamedEquation]
+    #: least and largest value of orders that were given some
+    bounds: Sequence[tuple[str, tuple[float, float]]]
+    coupled: bool
+    delayed: bool
+    initial: _Initial
+    history: bool
+    #: name, signal, law, bounds
+    inputs: Sequence[tuple[str, int, str, tuple[float, float]]]
+    #: coefficient, sign, factors
+    laws: Sequence[tuple[str, float, Sequence[str]]]
+    hints: _Hints
+
+class _Asked(Protocol):
+    def sampled(self, every: int, decimation: int, first: int | None, /) -> Sequence[_Experiment]: ...
+    def records(self, m: int, inputs: Sequence[float], /) -> Sequence[_Record]: ...
+    def read(self, signal: int, /) -> Sequence[_Floats]: ...
+
+#: (who answers, sample interval and duration of each run [s], what each signal does between samples if it is an input,
+#: who is told (done, all))
+_Runs: TypeAlias = tuple[_Asked, Sequence[tuple[float, float]], Sequence[str | None], Callable[[int, int], None] | None]
+
+class _JointFit(TypedDict):
     shares: list[_Matrix] | None
     every: int
     estimate: list[float]
@@ -287,47 +324,72 @@ class _Finished(TypedDict):
     left: list[_Matrix]
     #: residuals that count less, outliers, and all
     robust: tuple[int, int, int] | None
-    attempt: dict[str, Any]
+    on_grid: _Vector
+    #: of each run with friction
+    states: list[list[float]]
+    cost: float
+    status: str
+    initial_terms: int
+    #: cost per residual and origin
+    starts: list[tuple[float, str]]
+    #: whether it is kept, by what share the other one leaves more, whether that is at a limit
+    growth: tuple[bool, float, bool] | None
 
 @final
 class JointProblem:
-    def __new__(
-        cls,
-        outputs: Sequence[str],
-        laws: Sequence[_FreeEquation],
-        order_bounds: Sequence[tuple[float, float]],
-        coefficients: int,
-        inputs: Sequence[tuple[int, str, tuple[float, float]]],
-        coupled: bool,
-        terms: _Initial,
-        frictions: Sequence[tuple[int, Sequence[_Monomial]]],
-    ) -> JointProblem: ...
+    def __new__(cls, told: _Named) -> JointProblem: ...
+    @property
+    def orders(self) -> list[str]: ...
+    @property
+    def coefficients(self) -> list[str]: ...
+    @property
+    def products(self) -> list[tuple[str, float, list[str]]]: ...
+    @property
+    def whole_orders(self) -> list[float]: ...
     @property
     def bounds(self) -> list[tuple[float, float]]: ...
+    def free_from(self, /, estimated: Mapping[str, float]) -> list[float]: ...
     def feasible(self, /, at: _Floats, towards: _Floats) -> _Vector: ...
-    def settled(
-        self,
-        /,
-        runs: _Sampling,
-        spans: Sequence[tuple[float, float]],
-        grid: _Grid,
-        start: _Place,
-        huber: bool,
-        stop: Stop | None = None,
-    ) -> tuple[dict[str, Any], list[float], list[_Matrix] | None]: ...
-    def finished(
-        self,
-        /,
-        runs: _Sampling,
-        spans: Sequence[tuple[float, float]],
-        grid: _Grid,
-        found: Mapping[str, Any],
-        others: Sequence[_Place],
-        huber: bool,
-        refine: bool,
-        stop: Stop | None = None,
-    ) -> _Finished: ...
     def clock(self, /, spans: Sequence[tuple[float, float]]) -> JointClock: ...
+
+@final
+class JointRace:
+    def __len__(self) -> int: ...
+    @property
+    def values(self) -> list[list[float]]: ...
+    @property
+    def origins(self) -> list[str]: ...
+
+def joint_race(
+    problem: JointProblem,
+    runs: _Runs,
+    weights: Sequence[float],
+    floor: float,
+    means: tuple[int, int],
+    stop: Stop | None = None,
+) -> JointRace: ...
+def joint_grids(
+    problem: JointProblem,
+    runs: _Runs,
+    weights: Sequence[float],
+    decimation: int,
+    starts: Sequence[tuple[Sequence[float], str]],
+    threads: int,
+    stop: Stop | None = None,
+) -> JointRace: ...
+def joint_fit(
+    problem: JointProblem,
+    runs: _Runs,
+    sizes: Sequence[tuple[float, float]],
+    known: Sequence[Sequence[float]],
+    start: Sequence[float] | None,
+    near: tuple[Sequence[float], Sequence[float], int] | None,
+    raced: JointRace | None,
+    huber: bool,
+    refine: bool,
+    means: tuple[int, int],
+    stop: Stop | None = None,
+) -> _JointFit | None: ...
 
 @final
 class JointClock:

@@ -263,16 +263,6 @@ pub fn status(status: joint::Status) -> &'static str {
     }
 }
 
-/// How a search ended, as the core has it.
-pub fn status_of(name: &str) -> PyResult<joint::Status> {
-    let known = [joint::Status::Converged, joint::Status::Exhausted, joint::Status::Stalled, joint::Status::Wall];
-    let unknown = || Error::Structure {
-        what: format!("status '{name}' of a search is not known"),
-        remedy: "use converged, exhausted, stalled or wall".into(),
-    };
-    Ok(known.into_iter().find(|&one| status(one) == name).ok_or_else(unknown)?)
-}
-
 /// What is free of inputs: signal, law, bounds, value at the start.
 pub(super) type FreeInputArg = (usize, String, (f64, f64), f64);
 

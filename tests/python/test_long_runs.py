@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,10 +11,8 @@ from scipy.signal import cont2discrete, lfilter, ss2tf
 from scipy.special import erfcx
 
 import ftlm
-from ftlm.fit.grid import Grid
-from ftlm.fit.problem import FreeProblem
-from ftlm.fit.race import COARSE_SAMPLES, thinned
-from ftlm.fit.starts import power_frequency
+from ftlm.fit.asked import Asked
+from ftlm.fit.joint import Outset
 from ftlm.solve import long
 from ftlm.solve.refined import refined
 from ftlm.solve.sampled import started
@@ -137,19 +136,33 @@ def test_too_few_pulses_are_an_error_and_what_grows_is_one_too():
         ftlm.Model(ftlm.equation("D^1.4 y = 4 y + 2 u")).simulate(run)
 
 
-def test_starts_of_a_long_fast_record_compete_on_a_part_that_still_shows_its_motion() -> None:
+def test_starts_of_a_long_fast_record_compete_on_a_part_that_still_shows_its_motion(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Thinned to 1200 samples, 60 000 of a swing of 20 rad/s would be read every 0.5 s, two turns and a half."""
     rng = np.random.default_rng(1)
     u = np.repeat(rng.choice([-1.0, 1.0], size=1200), 50)
     y = lfilter(*(np.ravel(p) for p in cont2discrete(([1.0], [1.0, 2.0, 400.0]), 0.01)[:2]), u)
-    runs = [ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})]
-    problem = FreeProblem.of(ftlm.equation("D^2 y = d D y + a y + b u", initial="rest"))
-    grid = thinned(Grid(problem, runs, [1.0]))
-    carried = math.pi / (power_frequency(runs[0], "y") * 0.01)
-    assert 10 <= grid.decimation <= max(10.0, carried)
-    assert grid.runs[0].length == COARSE_SAMPLES * grid.decimation + 1
-    np.testing.assert_array_equal(grid.runs[0]["y"], y[: grid.runs[0].length])
-    assert grid.experiments[0][2].shape[1] == COARSE_SAMPLES + 1
+    asked: set[tuple[int, int | None]] = set()
+    sampled = Asked.sampled
+
+    def noted(self: Asked, every: int, decimation: int, first: int | None) -> list[Any]:
+        asked.add((decimation, first))
+        return sampled(self, every, decimation, first)
+
+    monkeypatch.setattr(Asked, "sampled", noted)
+    structure = ftlm.equation("D^2 y = d D y + a y + b u", initial="rest")
+
+    def raced(y: np.ndarray) -> tuple[int, int | None]:
+        asked.clear()
+        Outset.of([ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": y})], structure).race(2, None)
+        (found,) = asked
+        return found
+
+    share = np.cumsum(np.abs(np.fft.rfft((y - np.mean(y)) * np.hanning(y.size))) ** 2)
+    fastest = 2 * math.pi * int(np.searchsorted(share / share[-1], 0.9)) / (y.size * 0.01)
+    decimation, first = raced(y)
+    assert 10 <= decimation <= max(10.0, math.pi / (fastest * 0.01))
+    assert first == 1200 * decimation
     # What stands still at first does not stand for what moves later.
-    still = [ftlm.Run.from_arrays(step=0.01, inputs={"u": u}, outputs={"y": np.where(np.arange(y.size) < 3e4, 0.0, y)})]
-    assert thinned(Grid(problem, still, [1.0])).runs is still
+    assert raced(np.where(np.arange(y.size) < 3e4, 0.0, y)) == (50, None)

@@ -14,7 +14,6 @@ from ftlm.base.statistics import is_white
 from ftlm.fit.grid import experiment
 from ftlm.fit.joint import fit_output_error
 from ftlm.fit.problem import FreeProblem
-from ftlm.fit.simpler import lower_orders
 from ftlm.fit.twins import twin_words
 from ftlm.paper.arm import demo_plant
 
@@ -224,19 +223,6 @@ def test_the_choice_of_an_optimum_is_given_in_words() -> None:
     assert behind.choice == (
         "2 of 3 starts ended in the lowest optimum, first that of: a; the next costs 3 times as much"
     )
-
-
-def test_only_one_equation_of_whole_orders_starts_from_a_lower_one(small_run):
-    one = ftlm.equation("D^2 y = a1 D y + a0 y + b0 u", initial=(0.0, 1.0))
-    (lower,) = lower_orders(FreeProblem.of(one), [small_run])
-    assert [e.order.constant for e in lower.problem.structure.equations] == [1.0]
-    assert (lower.coefficient, lower.others, lower.problem.structure.initial) == ("a1", ("a0", "b0"), (0.0,))
-    for words in ("D^alpha y = a1 D y + a0 y + b0 u", "D^2 y = b0 u"):
-        assert lower_orders(FreeProblem.of(ftlm.equation(words)), [small_run]) == []
-    # Of two equations each measures the other, but both are fitted at once.
-    pair = ftlm.flexible_link(form="published", stage=1, laws=(), coupling="measured")
-    whole = pair.with_orders({n: 2.0 if n.startswith("alpha") else 0.5 for n in pair.order_names})
-    assert lower_orders(FreeProblem.of(whole), [small_run]) == []
 
 
 def test_two_signals_that_drive_alike_are_named() -> None:

@@ -228,7 +228,7 @@ def test_intervals_hold_the_truth(name: str, level: int) -> None:
     (scores,) = truth.intervals([name], [level], 100)
     print(scores)
     assert np.max(np.abs(scores.mean)) < 0.4
-    # Numbers of one fit go together: of twelve such pools chance takes one to two of their deviations above 95 and more.
+    # Numbers of one fit go together: of twelve such pools chance takes one two of their deviations above 95 or more.
     assert 92 <= 100 * np.mean(np.abs(scores.z) < truth.NORMAL_95) <= 99.5
     assert scores.coverage.min() >= 86
 

@@ -174,7 +174,7 @@ class FreeProblem:
         return (self.structure.hints or Hints()).exceeds.get(ratio, 1.0)
 
 
-def told(structure: Structure) -> dict[str, Any]:
+def told(structure: Structure) -> Any:
     """A structure, its initial terms decided, as the core takes it."""
     signals, hints = structure.signals, structure.hints or Hints()
     states = structure.filter_states(structure.initial)

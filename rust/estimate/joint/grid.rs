@@ -56,6 +56,7 @@ impl<'a> Grid<'a> {
         steady: bool,
     ) -> Result<Self> {
         check_length("weights", problem.outputs.len(), weights.outputs.len())?;
+        sampling.check()?;
         let experiments = source.experiments(sampling)?;
         stop.check()?;
         let read = Arc::new(experiments.iter().map(|e| e.shares.clone()).collect());

@@ -1,6 +1,6 @@
 //! Where the runs of a joint fit come from: sampled as finely as it is asked.
 
-use crate::error::{check_length, check_step, Error, Result};
+use crate::error::{check_length, check_points, check_step, Error, Result};
 use crate::estimate::output_error::{Experiment, Instant};
 use crate::means::{pulse_means, Intersample};
 use crate::regressors::Record;
@@ -26,6 +26,23 @@ pub struct Sampling {
     pub decimation: usize,
     /// So many sample intervals from the beginning of each run on; none: all.
     pub first: Option<usize>,
+}
+
+impl Sampling {
+    /// Refuses a sampling of nothing, and one finer than memory.
+    ///
+    /// # Errors
+    /// [`Error::OutOfRange`].
+    pub fn check(self) -> Result<()> {
+        for (name, number) in [("pulses a sample interval", self.every), ("samples that become one", self.decimation)] {
+            check_points(name, number)?;
+            if number == 0 {
+                let (value, range) = (0.0, "[1, ∞)".into());
+                return Err(Error::OutOfRange { name: name.into(), value, range, remedy: "give 1 or more".into() });
+            }
+        }
+        Ok(())
+    }
 }
 
 impl Default for Sampling {

@@ -12,7 +12,7 @@ use super::super::estimate::status;
 use super::super::lists::List;
 use super::super::search::watch::{served, Stop};
 use super::asked::{Answering, Asked, Known, Question, RunsArg};
-use super::JointProblem;
+use super::problem::JointProblem;
 use crate::error::Result;
 use crate::estimate::joint::free::Free;
 use crate::estimate::joint::race::{self, Course};
@@ -33,8 +33,8 @@ pub struct JointRace {
 
 #[pymethods]
 impl JointRace {
-    fn __len__(&self) -> usize {
-        self.inner.len()
+    fn __len__(&self) -> PyResult<usize> {
+        attached(|| Ok(self.inner.len()))
     }
 
     /// Values of everything free, of each.
