@@ -173,6 +173,44 @@ impl<'a> Sought<'a> {
 /// # Errors
 /// Those of the source and the starts; [`Error::Beyond`] where squares of residuals are no numbers; what the last contender's
 /// descent ends with where none has a free run; [`Error::Interrupted`].
+///
+/// ```
+/// # fn main() -> ftlm::error::Result<()> {
+/// use ftlm::equation::Initial;
+/// use ftlm::estimate::joint::free::{Coefficient, Equation, Free, Order, Structure, Term};
+/// use ftlm::estimate::joint::starts::Lattices;
+/// use ftlm::estimate::joint::{fit, Loss, Outset, Sampled, Settings, Signal, Size, Sought};
+/// use ftlm::means::Intersample;
+/// use ftlm::stop::Stop;
+/// // y of D y = −2 y + 3 u in exact steps, and D^alpha y = a y + b u sought.
+/// let (step, mut y) = (0.05, vec![0.0]);
+/// let u: Vec<f64> = (0..200).map(|k| if k % 40 < 20 { 1.0 } else { -1.0 }).collect();
+/// let fall = f64::exp(-2.0 * step);
+/// u.iter().for_each(|u| y.push(fall * y[y.len() - 1] + 1.5 * (1.0 - fall) * u));
+/// y.pop();
+/// let sizes = [Size::of(&[y.clone()])];
+/// let signal = |samples, between| Signal { samples, between };
+/// let run = vec![signal(y, Intersample::Linear), signal(u, Intersample::Hold)];
+/// let runs = Sampled::new(step, vec![0], vec![run])?;
+/// let term = |signal, name: &str| {
+///     let coefficient = Coefficient::Free(name.into());
+///     Term { signal, order: Order::number(0.0), coefficient, factor: 1.0 }
+/// };
+/// let terms = vec![term(0, "a"), term(1, "b")];
+/// let sought = Equation { output: 0, order: Order::free("alpha"), terms, friction: None };
+/// let signals = vec!["y".into(), "u".into()];
+/// let free = Free::of(Structure::new(signals, vec![sought], Initial::Rest))?;
+/// let stop = Stop::default();
+/// let starts = Lattices::new(&runs, 1, 1 << 28, &stop);
+/// let asked = Sought { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
+/// let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
+/// let outset = Outset::Starts { known: Vec::new(), raced: None };
+/// let found = fit::fit(asked, outset, settings, &|_, _| Ok(()))?.expect("a start has a free run");
+/// let [alpha, a, b] = found.finished.estimate[..] else { panic!("three numbers") };
+/// assert!((alpha - 1.0).abs() < 1e-3 && (a + 2.0).abs() < 1e-2 && (b - 3.0).abs() < 1e-2);
+/// # Ok(())
+/// # }
+/// ```
 pub fn fit(sought: Sought<'_>, outset: Outset, settings: Settings, told: &Listener<'_>) -> Result<Option<JointFit>> {
     let free = sought.free;
     let mut pace = Pace::new(told);

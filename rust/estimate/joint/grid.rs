@@ -246,22 +246,6 @@ impl<'a> Grid<'a> {
         parts
     }
 
-    /// Refuses an attempt that was not on this grid.
-    ///
-    /// # Errors
-    /// [`Error::Length`].
-    pub fn check(&self, attempt: &Attempt) -> Result<()> {
-        let residuals = self.shares().map(|(experiment, _, _)| experiment.compared()).sum();
-        check_length("residuals", residuals, attempt.residuals.len())?;
-        for row in &attempt.jacobian {
-            check_length("a row of a Jacobian", residuals, row.len())?;
-        }
-        if attempt.jacobian.is_empty() {
-            return Ok(());
-        }
-        check_length("rows of a Jacobian", self.problem.size(), attempt.jacobian.len())
-    }
-
     /// Share of every residual, as they are strung together.
     #[must_use]
     pub fn every_share(&self) -> Vec<f64> {

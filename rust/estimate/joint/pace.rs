@@ -69,10 +69,9 @@ mod tests {
         };
         let mut pace = Pace::new(&told);
         for (done, of) in [(0, 4), (2, 4), (4, 4), (0, 2), (1, 2), (1, 2)] {
-            pace.until(0.5, 0.3, done, of).unwrap();
+            assert_eq!(pace.until(0.5, 0.3, done, of), Ok(()));
         }
-        pace.at(0.5).unwrap();
-        pace.at(0.2).unwrap();
+        assert_eq!((pace.at(0.5), pace.at(0.2)), (Ok(()), Ok(())));
         let parts: Vec<usize> = heard.borrow().iter().map(|(done, _)| *done).collect();
         assert_eq!(parts, [0, 75, 150, 202, 500]);
     }

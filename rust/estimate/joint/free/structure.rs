@@ -201,6 +201,23 @@ pub struct Structure {
 }
 
 impl Structure {
+    /// Equations driven by what was measured; nothing else is known.
+    #[must_use]
+    pub fn new(signals: Vec<String>, equations: Vec<Equation>, initial: Initial) -> Self {
+        Self {
+            signals,
+            equations,
+            bounds: BTreeMap::new(),
+            coupled: false,
+            delayed: false,
+            initial,
+            history: false,
+            inputs: Vec::new(),
+            laws: Vec::new(),
+            hints: Hints::default(),
+        }
+    }
+
     /// Free orders: those that stand alone in order of appearance, then those seen only through a law.
     #[must_use]
     pub fn order_names(&self) -> Vec<String> {

@@ -1,8 +1,8 @@
 //! The race of starts: short fits on thinned samples, of which the best go on.
 //!
-//! [`run::race`] sends starts over laps, from a glance to those few that go on on all samples. Beside them run the problems
-//! inside a problem, whose optima it reaches, too: a term less ([`simpler`]), an order less ([`lower`]), orders known
-//! ([`known`]) or whole ([`whole`]).
+//! [`race`] sends starts over laps, from a glance to those few that go on on all samples. Beside them run the problems
+//! inside a problem, whose optima it reaches, too: a term less ([`Simpler`]), an order less ([`LowerOrder`]), orders known
+//! ([`Held`]) or whole ([`Whole`]).
 
 mod behind;
 mod bodies;
