@@ -14,6 +14,8 @@ const MOVED: f64 = 0.1;
 /// A grid on which starts may compete.
 pub(super) struct Chosen<'a> {
     pub grid: Grid<'a>,
+    /// The same on half the step, where it was made.
+    pub half: Option<Grid<'a>>,
     /// Where the others are after a glance.
     pub glanced: Vec<Runner>,
     /// Where a few are after a lap.
@@ -28,11 +30,12 @@ pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, sta
     let glance = |grid: &Grid<'_>, starts: &[Runner]| Ok(distinct(&laps.run(free, grid, starts, GLANCE)?, same_place));
     let mut glanced: Vec<Runner> = glance(&coarse, starts)?;
     if starts.len() <= PIONEERS || coarse.sampling.every >= FINEST {
-        return Ok(Chosen { grid: coarse, glanced, ran: Vec::new() });
+        return Ok(Chosen { grid: coarse, half: None, glanced, ran: Vec::new() });
     }
     let (first, mut coarse) = (coarse.sampling.every, coarse);
     let mut before: Vec<(Grid<'a>, Runner)> = Vec::new();
     let mut pioneers: Vec<Runner> = glanced.iter().take(PIONEERS).cloned().collect();
+    let mut half = None;
     let reached = loop {
         if coarse.sampling.every >= FINEST {
             break pioneers;
@@ -41,6 +44,7 @@ pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, sta
         let finer = coarse.finer()?;
         if let Some(best) = reached.first() {
             if !coarse.noticed(&best.attempt.place, &finer)? {
+                half = Some(finer);
                 break reached;
             }
             before.push((coarse, best.clone()));
@@ -54,7 +58,7 @@ pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, sta
     };
     if coarse.sampling.every == first {
         glanced.drain(..PIONEERS.min(glanced.len()));
-        return Ok(Chosen { grid: coarse, glanced, ran: reached });
+        return Ok(Chosen { grid: coarse, half, glanced, ran: reached });
     }
     let told = reached.first().map(|best| best.attempt.values());
     let alike = |(_, best): &&(Grid<'a>, Runner)| {
@@ -69,5 +73,5 @@ pub(super) fn fine_enough<'a>(laps: Laps<'_>, free: &Free, coarse: Grid<'a>, sta
         }
     }
     let glanced = glance(&coarse, &starts)?;
-    Ok(Chosen { grid: coarse, glanced, ran: Vec::new() })
+    Ok(Chosen { grid: coarse, half, glanced, ran: Vec::new() })
 }

@@ -80,21 +80,26 @@ impl Laps<'_> {
         let (send, receive) = channel();
         let (lap, next, left) = (&lap, &next, &left);
         std::thread::scope(|scope| {
-            for _ in 0..self.threads.min(runners.len()) {
+            let mut refused = None;
+            let threads = self.threads.min(runners.len());
+            for _ in 0..threads {
                 let send = send.clone();
-                scope.spawn(move || {
-                    while let Some((k, runner)) = Some(next.fetch_add(1, Ordering::Relaxed))
-                        .and_then(|k| runners.get(k).map(|runner| (k, runner)))
-                    {
-                        let found = lap.tried(runner);
-                        if left.is_set() || send.send((k, found)).is_err() {
+                let runs = move || {
+                    while !left.is_set() {
+                        let k = next.fetch_add(1, Ordering::Relaxed);
+                        let Some(runner) = runners.get(k) else { return };
+                        if send.send((k, lap.tried(runner))).is_err() {
                             return;
                         }
                     }
-                });
+                };
+                if let Err(error) = std::thread::Builder::new().spawn_scoped(scope, runs) {
+                    left.set();
+                    refused = Some(Error::Threads { threads, why: error.to_string() });
+                    break;
+                }
             }
             drop(send);
-            let mut refused = None;
             for (k, found) in &receive {
                 match found.and_then(|found| heard().map(|()| found)) {
                     Ok(found) => ended[k] = found,
@@ -159,15 +164,14 @@ pub(super) fn sorted(mut runners: Vec<Runner>) -> Vec<Runner> {
 pub fn finalists(reached: &[Runner]) -> Vec<Runner> {
     let mut first = distinct(reached, same_optimum);
     first.truncate(FINALISTS);
-    in_reach(&first).to_vec()
+    in_reach(&first)
 }
 
-/// Those of runners, best first, that are not far behind the best.
+/// Those of runners, best first, that are not far behind the best; on a finer grid one that is may come before another.
 #[must_use]
-pub fn in_reach(reached: &[Runner]) -> &[Runner] {
+pub fn in_reach(reached: &[Runner]) -> Vec<Runner> {
     let limit = reached.first().map_or(0.0, |best| CONTENDER * best.level());
-    let beyond = reached.iter().position(|runner| runner.level() > limit);
-    &reached[..beyond.unwrap_or(reached.len())]
+    reached.iter().filter(|runner| runner.level() <= limit).cloned().collect()
 }
 
 /// Whether two that ended cost the same at orders that are as near.
@@ -203,4 +207,30 @@ pub fn distinct(runners: &[Runner], same: impl Fn(&Runner, &Runner) -> bool) -> 
         }
     }
     kept
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimate::joint::{Attempt, Place};
+    use crate::estimate::output_error::Point;
+
+    fn ended(level: f64, order: f64) -> Runner {
+        let point = Point { orders: vec![order], coefficients: vec![1.0], inputs: Vec::new() };
+        let attempt = Attempt::unrun(Place { point, states: Vec::new() });
+        Runner {
+            attempt: Attempt { cost: level, residuals: vec![0.0; 2], ..attempt },
+            origin: String::new(),
+            alike: Vec::new(),
+        }
+    }
+
+    #[test]
+    fn one_too_far_behind_hides_nobody_behind_it() {
+        // On a finer grid the last one was last: its own level is in reach all the same.
+        let reached = [ended(1.0, 0.5), ended(3.5, 1.0), ended(2.0, 1.5)];
+        let orders: Vec<f64> = finalists(&reached).iter().map(|r| r.attempt.place.point.orders[0]).collect();
+        assert_eq!(orders, [0.5, 1.5]);
+        assert!(in_reach(&[ended(0.0, 1.0), ended(1e-9, 2.0)]).len() == 1);
+    }
 }

@@ -12,7 +12,7 @@ use super::simpler::{simpler, unlike, Simpler};
 use super::thinned::thinned;
 use super::whole::{whole, Whole};
 use crate::equation::Initial;
-use crate::error::{Error, Result};
+use crate::error::{Error, Kind, Result};
 use crate::estimate::joint::free::{Equation, Free, Structure};
 use crate::estimate::joint::grid::FINEST;
 use crate::estimate::joint::pace::Listener;
@@ -81,8 +81,8 @@ pub fn race(free: &Free, course: Course<'_>) -> Result<Vec<Runner>> {
 /// What a computation found; nothing where it made no equation.
 fn made<T>(found: Result<T>) -> Result<Option<T>> {
     match found {
-        Err(Error::Interrupted) => Err(Error::Interrupted),
-        found => Ok(found.ok()),
+        Err(error) if error.kind() == Kind::Model => Ok(None),
+        found => found.map(Some),
     }
 }
 
@@ -92,6 +92,8 @@ struct Run<'a> {
     course: Course<'a>,
     laps: Laps<'a>,
     coarse: Grid<'a>,
+    /// The same on half the step, where it was made.
+    half: Option<Grid<'a>>,
     starts: Vec<Runner>,
     /// Where the first lap of the whole problem ended.
     first: Vec<Runner>,
@@ -108,14 +110,15 @@ fn without_history<'a>(free: &'a Free, course: Course<'a>) -> Result<(Vec<Runner
     let sampling = thinned(free, course.source)?;
     let grid = Grid::new((&free.problem, course.source, course.stop), weights, sampling, false)?;
     let chosen = fine_enough(laps, free, grid, &starts)?;
-    let mut coarse = chosen.grid;
+    let (mut coarse, mut half) = (chosen.grid, chosen.half);
     let mut reached = chosen.ran;
     reached.extend(laps.run(free, &coarse, &chosen.glanced, FIRST_LAP)?);
     reached = sorted(reached);
     while coarse.sampling.every < FINEST {
-        let finer = coarse.finer()?;
+        let finer = half.take().map_or_else(|| coarse.finer(), Ok)?;
         if let Some(best) = reached.first() {
             if !coarse.noticed(&best.attempt.place, &finer)? {
+                half = Some(finer);
                 break;
             }
         }
@@ -123,7 +126,7 @@ fn without_history<'a>(free: &'a Free, course: Course<'a>) -> Result<(Vec<Runner
         reached = laps.run(free, &coarse, &starts, FIRST_LAP)?;
     }
     let (first, wholes) = (reached.clone(), Vec::new());
-    let mut run = Run { free, course, laps, coarse, starts, first, wholes, reached };
+    let mut run = Run { free, course, laps, coarse, half, starts, first, wholes, reached };
     run.inside()?;
     let told = run.laps.starts;
     let found = run.ended()?;
@@ -183,7 +186,7 @@ impl<'a> Run<'a> {
             // One of several terms of free orders less is still an equation of many optima: searched like the whole.
             let ended = without_history(&less.free, self.course.inside())?.0;
             // Which of its optima is the lowest, a history may turn round.
-            let there = in_reach(&ended).iter().take(FEWEST).map(|runner| less.embedded(runner, self.free));
+            let there = in_reach(&ended).into_iter().take(FEWEST).map(|runner| less.embedded(&runner, self.free));
             return self.join(&there.collect::<Vec<_>>());
         }
         let ended = self.of(&less.free, FEWEST)?;
@@ -222,7 +225,7 @@ impl<'a> Run<'a> {
         if one.free.orders.len() == 1 && level > ABOVE_FLOOR * self.course.floor {
             // A race of one free order costs little where noise alone would leave less; bounds may leave it no lattice.
             if let Some((ended, _)) = made(without_history(&one.free, self.course.inside()))? {
-                let there = in_reach(&ended).iter().take(FINALISTS).map(|runner| one.embedded(runner, self.free));
+                let there = in_reach(&ended).into_iter().take(FINALISTS).map(|runner| one.embedded(&runner, self.free));
                 return self.join(&there.collect::<Vec<_>>());
             }
         }
@@ -268,15 +271,24 @@ impl<'a> Run<'a> {
             rest.extend(on_the_way(laps, free, &coarse, &stirring)?);
         }
         found.extend(rest);
-        let mut found = ranked(&coarse, found)?;
+        let mut found = ranked(&coarse, self.half, found)?;
         found.extend(lost);
         Ok((found, coarse))
     }
 }
 
-/// Runners in the order of their cost on a grid or on half its step, whichever is the larger.
-fn ranked(coarse: &Grid<'_>, runners: Vec<Runner>) -> Result<Vec<Runner>> {
-    let order = coarse.finer()?.ranked(&runners.iter().map(|runner| &runner.attempt).collect::<Vec<_>>())?;
+/// Runners in the order of their cost on a grid or on half its step, whichever is the larger; where that cannot be made, on
+/// the grid.
+fn ranked(coarse: &Grid<'_>, half: Option<Grid<'_>>, runners: Vec<Runner>) -> Result<Vec<Runner>> {
+    if runners.is_empty() {
+        return Ok(runners);
+    }
+    let half = match half.map_or_else(|| coarse.finer(), Ok) {
+        Err(Error::Interrupted) => return Err(Error::Interrupted),
+        Err(_) => return Ok(sorted(runners)),
+        Ok(half) => half,
+    };
+    let order = half.ranked(&runners.iter().map(|runner| &runner.attempt).collect::<Vec<_>>())?;
     let mut runners: Vec<Option<Runner>> = runners.into_iter().map(Some).collect();
     Ok(order.into_iter().filter_map(|i| runners[i].take()).collect())
 }
@@ -305,7 +317,7 @@ fn with_history(free: &Free, course: Course<'_>) -> Result<Vec<Runner>> {
         order.iter().take(FEWEST).filter(|&&i| levels[i] <= limit).map(|&i| reached[i].clone()).collect();
     let mut rest = order[going.len()..].to_vec();
     rest.sort_unstable();
-    let mut ahead = ranked(&coarse, laps.run(free, &coarse, &going, FIRST_LAP)?)?;
+    let mut ahead = ranked(&coarse, None, laps.run(free, &coarse, &going, FIRST_LAP)?)?;
     ahead.extend(rest.into_iter().map(|i| reached[i].clone()));
     Ok(distinct(&ahead, same_optimum))
 }
