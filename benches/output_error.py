@@ -25,6 +25,7 @@ from ftlm.fit.grid import Attempt, descend, experiment
 from ftlm.fit.joint import fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.records import record
+from laws import laws
 from results import append, heading
 
 #: Factors on the true coefficients and shifts of the true orders from which both start.
@@ -46,13 +47,13 @@ def kernel(eta: float, m: int, step: float) -> np.ndarray:
 
 def simulated(problem: FreeProblem, x: np.ndarray, rec: object, signals: tuple[str, ...]) -> list[np.ndarray]:
     """Coupled free run of two equations: the 2 x 2 series system by elimination."""
-    laws = problem.laws(signals)
+    told = laws(problem)
     orders, free = x[: len(problem.orders)], x[len(problem.orders) :]
-    outputs = [law[0] for law in laws]
+    outputs = [law[0] for law in told]
     m, step = rec.m, rec.step
     a = [[np.zeros(m), np.zeros(m)], [np.zeros(m), np.zeros(m)]]
     b = [np.zeros(m), np.zeros(m)]
-    for i, (_, (constant, weights), terms) in enumerate(laws):
+    for i, (_, (constant, weights), terms) in enumerate(told):
         a[i][i][0] += 1.0
         alpha = constant + np.dot(weights, orders)
         for signal, (base, slopes), (factor, powers) in terms:

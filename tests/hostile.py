@@ -27,7 +27,7 @@ SOUND, TWICE = 0.1, 0.3
 LARGE = 1 << 34
 ENDLESS = {"VirtualArm.rest", "VirtualArm.run"}
 #: Where a fit is told how often it may evaluate its cost, which it does; an attack asks it to so often at most.
-EVALUATIONS, MOST_EVALUATIONS = {"output_error": 9, "friction_error": 10}, 2000
+EVALUATIONS, MOST_EVALUATIONS = {"output_error": 9, "friction_error": 10, "JointProblem.descend": 4}, 2000
 
 
 class OursError(Exception):
@@ -316,6 +316,14 @@ class Sound:
     def joint_problem_feasible(self):
         problem, _, values = self.sampled()
         return problem, (np.array(values), np.array(values) * self.one(1.0, 1.4))
+
+    def joint_problem_descend(self):
+        problem, (runs, *_), values = self.sampled()
+        held = self.one((), (0,), (1, 2))
+        return problem, (
+            runs.sampled(1, 1, None), (values, []), self.one(True, False), held, self.one(0, 1, 20), 1e-6,
+            self.one(True, False), self.one(None, _core.Stop()),
+        )  # fmt: skip
 
     def joint_race(self):
         problem, runs, _ = self.sampled()

@@ -350,6 +350,18 @@ class JointProblem:
     def bounds(self) -> list[tuple[float, float]]: ...
     def free_from(self, /, estimated: Mapping[str, float]) -> list[float]: ...
     def feasible(self, /, at: _Floats, towards: _Floats) -> _Vector: ...
+    def descend(
+        self,
+        /,
+        runs: Sequence[_Experiment],
+        start: tuple[Sequence[float], Sequence[Sequence[float]]],
+        plain: bool,
+        held: Sequence[int],
+        evaluations: int,
+        tolerance: float,
+        steady: bool,
+        stop: Stop | None = None,
+    ) -> dict[str, Any]: ...
     def clock(self, /, spans: Sequence[tuple[float, float]]) -> JointClock: ...
 
 @final

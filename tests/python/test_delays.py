@@ -16,6 +16,7 @@ from ftlm import _core, cli
 from ftlm.fit.grid import Attempt, descend, experiment
 from ftlm.fit.joint import fit_output_error
 from ftlm.fit.problem import FreeProblem
+from laws import laws
 
 WORDS = "D^alpha y = a1 D^nu y + a0 y + b0 u"
 
@@ -187,7 +188,7 @@ def test_the_core_refuses_delays_that_are_none():
 
     def core(delays):
         return _core.output_error(
-            prepared, problem.laws(("y", "u")), list(problem.bounds), ["plain"] * 3, False, (False, []),
+            prepared, laws(problem), list(problem.bounds), ["plain"] * 3, False, (False, []),
             [2.2, 0.9], [-0.6, -1.2, 1.2], [(s, "delay", ends, v) for s, ends, v in delays], 1, 1e-9,
         )  # fmt: skip
 

@@ -14,6 +14,7 @@ from ftlm import _core
 from ftlm.fit.grid import experiment
 from ftlm.fit.problem import FreeProblem
 from lagrange import INPUTS, clean_run, model, structure, truth
+from laws import laws
 from plants import with_noise
 from test_derivation import Stage, deriv, vanishes
 
@@ -270,7 +271,7 @@ def test_the_jacobian_above_alpha_is_that_of_finite_differences() -> None:
         def at(values: np.ndarray, problem=problem, prepared=prepared, count=count) -> dict:
             free = list(values[:count]), list(values[count:])
             return _core.output_error(
-                prepared, problem.laws(problem.structure.signals), [(0.01, 3.0)] * count, ["plain"] * len(free[1]),
+                prepared, laws(problem), [(0.01, 3.0)] * count, ["plain"] * len(free[1]),
                 problem.structure.coupling == "simulated", (False, []), *free, [], 1, 1e-12,
             )  # fmt: skip
 

@@ -16,6 +16,7 @@ from ftlm.fit.joint import fit_output_error
 from ftlm.fit.problem import FreeProblem
 from ftlm.fit.twins import twin_words
 from ftlm.paper.arm import demo_plant
+from laws import laws
 
 THREE_TERMS = {"alpha": 2.2, "nu": 0.9, "a1": -0.625, "a0": -1.25, "b0": 1.25}
 
@@ -52,7 +53,7 @@ def arm_run(stage: int, rows: int, noise: float, seed: int) -> ftlm.Run:
 def residuals_at(problem: FreeProblem, prepared: list, initial: object, orders: list, coefficients: list) -> dict:
     """One evaluation, no step."""
     return _core.output_error(
-        prepared, problem.laws(problem.structure.signals), [(0.01, 3.0)] * len(orders), ["plain"] * len(coefficients),
+        prepared, laws(problem), [(0.01, 3.0)] * len(orders), ["plain"] * len(coefficients),
         problem.structure.coupling == "simulated", initial, orders, coefficients, [], 1, 1e-12,
     )  # fmt: skip
 
@@ -101,7 +102,7 @@ def test_the_optimum_is_scipys() -> None:
 
     theirs = least_squares(residuals, start, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12)
     ours = _core.output_error(
-        prepared, problem.laws(("y", "u")), [(0.01, 3.0)] * 2, ["logarithm"] * 3, False, (False, []),
+        prepared, laws(problem), [(0.01, 3.0)] * 2, ["logarithm"] * 3, False, (False, []),
         list(start[:2]), list(start[2:]), [], 100, 1e-12,
     )  # fmt: skip
     assert ours["status"] == "converged"

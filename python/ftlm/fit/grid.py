@@ -17,7 +17,7 @@ from ftlm.data.run import Run
 from ftlm.data.structures import Structure
 from ftlm.fit.problem import FreeProblem
 from ftlm.solve.instants import Instants, compared_times, compared_values, has_own_times
-from ftlm.solve.records import Record, driving, initial_tuple, record, sensor_series
+from ftlm.solve.records import Record, driving, record, sensor_series
 
 #: A descent ends where a whole step would lower the cost by a smaller share than this.
 TOLERANCE = 1e-9
@@ -142,51 +142,16 @@ def descend(
 ) -> Attempt:  # fmt: skip
     """Levenberg-Marquardt from an attempt; numbers, by their places, may be held where they are.
 
-    A steady one goes from a free run that dies away to none that grows.
+    A steady one goes from a free run that dies away to none that grows. What runs of bodies that may stick start with
+    is no projection, and goes on from where it was.
     """
-    structure, signals = problem.structure, problem.structure.signals
-    states = structure.filter_states(structure.initial)
-    coordinates = problem.coordinates(attempt.coefficients, plain=plain)
-    bounds, ends = list(problem.bounds), [item.bounds for item in problem.inputs]
-    for number in (held,) if isinstance(held, int) else held:
-        coefficient = number - len(bounds)
-        if coefficient < 0:
-            bounds[number] = (attempt.orders[number],) * 2
-        elif coefficient < len(coordinates):
-            coordinates[coefficient] = "held"
-        else:
-            place = coefficient - len(coordinates)
-            ends[place] = (attempt.inputs[place],) * 2
-    inputs = [
-        (signals.index(item.signal), item.law, own, value)
-        for item, own, value in zip(problem.inputs, ends, attempt.inputs, strict=True)
-    ]
-    if structure.has_friction:
-        outcome = _with_friction(problem, experiments, attempt, bounds, coordinates, inputs, evaluations, tolerance)
-        numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
-        return replace(attempt, orders=numbers[0], coefficients=numbers[1], outcome=outcome, inputs=numbers[2])
-    outcome = _core.output_error(
-        experiments, problem.laws(signals), bounds, coordinates, structure.coupling == "simulated",
-        initial_tuple(structure.initial, structure.offset, states), attempt.orders, attempt.coefficients,
-        inputs, evaluations, tolerance, steady, stop(),
+    states = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
+    outcome = problem.core.descend(
+        experiments, (attempt.values.tolist(), states), plain, (held,) if isinstance(held, int) else held, evaluations,
+        tolerance, steady, stop(),
     )  # fmt: skip
-    numbers = [list(outcome[n]) for n in ("orders", "coefficients", "inputs")]
-    return replace(attempt, orders=numbers[0], coefficients=numbers[1], outcome=outcome, inputs=numbers[2])
-
-
-def _with_friction(
-    problem: FreeProblem, experiments: list[Any], attempt: Attempt, bounds: list[tuple[float, float]],
-    coordinates: list[str], inputs: Sequence[tuple[int, str, tuple[float, float], float]], evaluations: int,
-    tolerance: float,
-) -> Any:  # fmt: skip
-    """The same of bodies that may stick: what their runs start with is no projection, and goes on from where it was."""
-    structure = problem.structure
-    known = attempt.outcome.get("states", []) if isinstance(attempt.outcome, dict) else []
-    return _core.friction_error(
-        experiments, problem.laws(structure.signals), problem.frictions(), bounds, coordinates,
-        initial_tuple(structure.initial, structure.offset, structure.filter_states(structure.initial)),
-        attempt.orders, attempt.coefficients, inputs, known, evaluations, tolerance, stop(),
-    )  # fmt: skip
+    orders, coefficients, inputs = problem.split(outcome["values"])
+    return replace(attempt, orders=orders, coefficients=coefficients, inputs=inputs, outcome=outcome)
 
 
 @dataclass(frozen=True)

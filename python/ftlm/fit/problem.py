@@ -38,16 +38,6 @@ class FreeProblem:
         """Everything that is free: orders, coefficients, then numbers of inputs."""
         return [*self.orders, *self.coefficients, *(item.name for item in self.inputs)]
 
-    @property
-    def _rubs(self) -> list[Friction]:
-        """Friction of the equations that have some."""
-        return [item.friction for item in self.structure.equations if item.friction is not None]
-
-    @property
-    def _speeds(self) -> set[str]:
-        """Free speeds at which friction falls."""
-        return {f.stribeck.speed for f in self._rubs if f.stribeck is not None and isinstance(f.stribeck.speed, str)}
-
     def split(self, values: Sequence[float]) -> tuple[list[float], list[float], list[float]]:
         """Values of orders, coefficients and numbers of inputs."""
         flat = list(map(float, values))
@@ -72,57 +62,6 @@ class FreeProblem:
     def feasible(self, at: Floats, towards: Floats) -> Floats:
         """The last point on the way from a feasible one to another that keeps bounds and constraints of orders."""
         return self.core.feasible(at, towards)
-
-    def coordinates(self, start: Sequence[float], *, plain: bool) -> list[str]:
-        """Logarithms where the start allows them."""
-        named = self.structure.coefficient_names
-        ratios = {
-            f for _, factors in self.products.values() for f in factors if f not in named and self._exceeds(f) == 1
-        }
-
-        speeds = self._speeds
-
-        def coordinate(name: str, value: float) -> str:
-            # A speed is positive, wherever it goes.
-            if (plain or value == 0) and name not in speeds:
-                return "plain"
-            return "excess" if name in ratios and value > self._exceeds(name) == 1 else "logarithm"
-
-        return [coordinate(n, v) for n, v in zip(self.coefficients, start, strict=True)]
-
-    def laws(self, signals: Sequence[str]) -> list[Any]:
-        """Equations with affine orders and monomial coefficients."""
-        index = {n: i for i, n in enumerate(self.coefficients)}
-        names = self.orders
-
-        def monomial(coefficient: str | float, factor: float) -> tuple[float, list[tuple[int, int]]]:
-            if not isinstance(coefficient, str):
-                return factor * coefficient, []
-            sign, factors = self.products.get(coefficient, (1.0, (coefficient,)))
-            return factor * sign, [(index[f], 1) for f in factors]
-
-        return [
-            (
-                signals.index(e.output), affine(e.order, names),
-                [(signals.index(t.signal), affine(t.order, names), monomial(t.coefficient, t.factor)) for t in e.terms],
-            )
-            for e in self.structure.equations
-        ]  # fmt: skip
-
-    def frictions(self) -> list[tuple[int, list[tuple[float, list[tuple[int, int]]]]]]:
-        """Of each body that may stick its place, and fc, fs and vs as monomials in the free coefficients."""
-        return list(zip(self.structure.sticks, map(self._strength, self._rubs), strict=True))
-
-    def _strength(self, rubs: Friction) -> list[tuple[float, list[tuple[int, int]]]]:
-        more = rubs.stribeck or Stribeck(0.0, 1.0)
-
-        def monomial(coefficient: str | float, factor: float) -> tuple[float, list[tuple[int, int]]]:
-            if isinstance(coefficient, str):
-                return factor, [(self.coefficients.index(coefficient), 1)]
-            return factor * coefficient, []
-
-        numbers = [(rubs.coefficient, -rubs.factor), (more.coefficient, -more.factor), (more.speed, 1.0)]
-        return [monomial(coefficient, factor) for coefficient, factor in numbers]
 
     def named(self, values: Sequence[float]) -> dict[str, float]:
         """Every coefficient of the structure by name from the free ones."""
@@ -168,10 +107,6 @@ class FreeProblem:
     def free_from(self, estimated: Mapping[str, float]) -> list[float]:
         """Free coefficients from freely estimated ones; ratios as the median of what the equations can say."""
         return self.core.free_from(dict(estimated))
-
-    def _exceeds(self, ratio: str) -> float:
-        """What a ratio of the coefficient law exceeds."""
-        return (self.structure.hints or Hints()).exceeds.get(ratio, 1.0)
 
 
 def told(structure: Structure) -> Any:

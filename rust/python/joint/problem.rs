@@ -5,14 +5,18 @@ use std::sync::Arc;
 
 use numpy::{PyArray1, PyReadonlyArray1, PyReadonlyArray2};
 use pyo3::prelude::*;
+use pyo3::types::PyDict;
 
-use super::super::arrays::{copied, rows, vector};
+use super::super::arrays::{copied, rows, stacked, vector};
 use super::super::errors::{attached, detached};
-use super::super::lists::List;
+use super::super::estimate::{evaluated, experiment, status, ExperimentArg};
+use super::super::lists::{nested, List};
+use super::super::search::watch::{leavable, Stop};
 use super::named::{named, StructureArg};
-use crate::error::check_length;
+use crate::error::{check_length, Error};
 use crate::estimate::joint::free::{Free, Law};
-use crate::estimate::joint::Clock;
+use crate::estimate::joint::{Clock, Place};
+use crate::estimate::output_error::Settings;
 
 type Array<'py> = Bound<'py, PyArray1<f64>>;
 /// Sample interval and duration of each run \[s\].
@@ -79,6 +83,46 @@ impl JointProblem {
         let (at, towards) = (vector("values to go from", &at)?, vector("values to go to", &towards)?);
         let found = detached(py, || self.inner.problem.feasible(&at, &towards))?;
         Ok(PyArray1::from_vec(py, found))
+    }
+
+    /// Levenberg–Marquardt on sampled runs from (values of everything free, states of runs with friction), in logarithms
+    /// where the start allows them unless plain ones are asked for, numbers held by their places.
+    #[pyo3(signature = (runs, start, plain, held, evaluations, tolerance, steady, stop=None))]
+    #[allow(clippy::needless_pass_by_value, clippy::too_many_arguments)]
+    fn descend<'py>(
+        &self,
+        py: Python<'py>,
+        runs: List<ExperimentArg<'py>>,
+        start: (List<f64>, List<List<f64>>),
+        plain: bool,
+        held: List<usize>,
+        evaluations: usize,
+        tolerance: f64,
+        steady: bool,
+        stop: Option<&Stop>,
+    ) -> PyResult<Bound<'py, PyDict>> {
+        let experiments = runs.iter().map(experiment).collect::<PyResult<Vec<_>>>()?;
+        let place = Place { point: self.inner.problem.point(&start.0)?, states: nested(start.1) };
+        let size = self.inner.problem.size();
+        if let Some(beyond) = held.iter().find(|&&number| number >= size) {
+            let what = format!("number {beyond} of {size} to be held");
+            return Err(Error::Structure { what, remedy: "count them from 0".into() }.into());
+        }
+        let (free, settings) = (Arc::clone(&self.inner), Settings { evaluations, tolerance });
+        let points = evaluated(&experiments, evaluations);
+        let found = leavable(py, points, stop, move |stop| {
+            free.turned(&place, plain, &held).descend(&experiments, &place, settings, steady, stop)
+        })?;
+        let dict = PyDict::new(py);
+        dict.set_item("values", found.values())?;
+        dict.set_item("states", &found.place.states)?;
+        dict.set_item("cost", found.cost)?;
+        dict.set_item("residuals", PyArray1::from_vec(py, found.residuals))?;
+        let none = found.jacobian.first().is_none_or(Vec::is_empty);
+        dict.set_item("jacobian", if none { None } else { Some(stacked(py, &found.jacobian)?) })?;
+        dict.set_item("evaluations", found.evaluations)?;
+        dict.set_item("status", status(found.status))?;
+        Ok(dict)
     }
 
     /// The unit of time of runs, each told by its sample interval and its duration.
