@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,12 +27,36 @@ class FreeProblem:
     """
 
     structure: Structure
-    orders: tuple[str, ...]
-    coefficients: tuple[str, ...]
-    bounds: tuple[tuple[float, float], ...]
-    products: Mapping[str, tuple[float, tuple[str, ...]]]
-    inputs: tuple[FreeInput, ...]
-    core: _core.JointProblem = field(repr=False, compare=False)
+
+    @cached_property
+    def core(self) -> _core.JointProblem:
+        """What the core makes of the structure."""
+        return _core.JointProblem(told(self.structure))
+
+    @cached_property
+    def orders(self) -> tuple[str, ...]:
+        """Free orders."""
+        return tuple(self.core.orders)
+
+    @cached_property
+    def coefficients(self) -> tuple[str, ...]:
+        """Free coefficients, those of a law among them."""
+        return tuple(self.core.coefficients)
+
+    @cached_property
+    def products(self) -> Mapping[str, tuple[float, tuple[str, ...]]]:
+        """Coefficients that a law gives: sign and factors by name."""
+        return {name: (sign, tuple(factors)) for name, sign, factors in self.core.products}
+
+    @cached_property
+    def bounds(self) -> tuple[tuple[float, float], ...]:
+        """Bounds of the free orders."""
+        return tuple(self.core.bounds[: len(self.orders)])
+
+    @property
+    def inputs(self) -> tuple[FreeInput, ...]:
+        """Free numbers of inputs."""
+        return self.structure.free_inputs
 
     @property
     def names(self) -> list[str]:
@@ -46,13 +71,10 @@ class FreeProblem:
 
     @classmethod
     def of(cls, structure: Structure) -> FreeProblem:
-        """Free orders, free coefficients and their bounds."""
-        core = _core.JointProblem(told(structure))
-        bounds = tuple(core.bounds[: len(core.orders)])
-        products = {name: (sign, tuple(factors)) for name, sign, factors in core.products}
-        return cls(
-            structure, tuple(core.orders), tuple(core.coefficients), bounds, products, structure.free_inputs, core
-        )
+        """The same, refused at once where the core cannot take it."""
+        problem = cls(structure)
+        _ = problem.core
+        return problem
 
     @property
     def all_bounds(self) -> list[tuple[float, float]]:

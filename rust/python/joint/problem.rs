@@ -116,6 +116,7 @@ impl JointProblem {
         let dict = PyDict::new(py);
         dict.set_item("values", found.values())?;
         dict.set_item("states", &found.place.states)?;
+        dict.set_item("initial", found.initial)?;
         dict.set_item("cost", found.cost)?;
         dict.set_item("residuals", PyArray1::from_vec(py, found.residuals))?;
         let none = found.jacobian.first().is_none_or(Vec::is_empty);
