@@ -9,17 +9,11 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use ftlm::equation::{Equation, Initial, Structure, Term};
-use ftlm::estimate::joint::fit::fit;
-use ftlm::estimate::joint::free::{self, Free, Order};
-use ftlm::estimate::joint::starts::Lattices;
-use ftlm::estimate::joint::{JointFit, Loss, Outset, Sampled, Settings, Signal, Size, Sought};
 use ftlm::estimate::least_squares;
 use ftlm::fft::{self, Bin, Workspace};
 use ftlm::kernels::block_pulse_kernel;
-use ftlm::means::{point_samples, Intersample};
 use ftlm::operational::{block_pulse_matrix, operational_matrix, operational_matrix_dense};
 use ftlm::regressors::Record;
-use ftlm::search::certificate::{certify, Asked, Range, Region};
 use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis};
 use ftlm::search::options::{Criterion, Estimator, Norm, Options};
@@ -27,7 +21,6 @@ use ftlm::search::rounds::{search, Search};
 use ftlm::search::threads::pool;
 use ftlm::series::{self, Buffers, Division, Kernel};
 use ftlm::simulate;
-use ftlm::stop::Stop;
 
 /// Processor seconds of this thread where the system tells them; right to a few milliseconds.
 fn processor() -> Option<f64> {
@@ -206,50 +199,6 @@ fn problem(m: usize, step: f64) -> Option<(Record, Lattice)> {
     Some((record, Lattice::new(1, &alphas, &axes, |s| s == 2).ok()?))
 }
 
-/// Step of the lattice whose candidates are bounded by boxes for callgrind: nearly thirty million of them.
-const BOXED: f64 = 0.015;
-
-/// D^α y = d D^μ y + a y + b u fitted to 1000 samples of such an equation with noise, from its automatic starts to its
-/// covariance, on one thread.
-fn fitted() -> Option<JointFit> {
-    let (m, h) = (1000, 0.01);
-    let truth = Equation {
-        structure: Structure {
-            output: 0,
-            order: 1.8,
-            terms: [(0, 0.7), (0, 0.0), (1, 0.0)].map(|(signal, order)| Term { signal, order }).to_vec(),
-        },
-        coefficients: vec![-1.5, -40.0, 40.0],
-    };
-    let u: Vec<f64> = (0..m).map(|k| if (k / 125) % 2 == 0 { 1.0 } else { -1.0 }).collect();
-    let driven = Record::new(h, vec![vec![0.0; m], u.clone()], None).ok()?;
-    let means = simulate::respond(&[truth], &driven, &[]).ok()?;
-    let mut y = point_samples(&means[0]);
-    y.iter_mut().zip(noise(m + 1, 6)).for_each(|(y, e)| *y += 0.01 * e);
-    let sizes = [Size::of(&[y.clone()])];
-    let signal = |samples, between| Signal { samples, between };
-    let u = [u, vec![0.0]].concat();
-    let runs =
-        Sampled::new(h, vec![0], vec![vec![signal(y, Intersample::Linear), signal(u, Intersample::Hold)]]).ok()?;
-    let term = |signal, order, name: &str| free::Term {
-        signal,
-        order,
-        coefficient: free::Coefficient::Free(name.into()),
-        factor: 1.0,
-    };
-    let terms =
-        vec![term(0, Order::free("mu"), "d"), term(0, Order::number(0.0), "a"), term(1, Order::number(0.0), "b")];
-    let equation = free::Equation { output: 0, order: Order::free("alpha"), terms, friction: None };
-    let signals = vec!["y".into(), "u".into()];
-    let free = Free::of(free::Structure::new(signals, vec![equation], Initial::Rest)).ok()?;
-    let stop = Stop::default();
-    let starts = Lattices::new(&runs, 1, 1 << 30, &stop);
-    let sought = Sought { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
-    let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
-    let outset = Outset::Starts { known: Vec::new(), raced: None };
-    fit(sought, outset, settings, &|_, _| Ok(())).ok()?
-}
-
 /// Step of the lattice that is ranked by equation errors for callgrind: five million candidates.
 const RANKED: f64 = 0.025;
 
@@ -338,22 +287,6 @@ fn kernel(name: &str) {
             let _ = black_box(search(&[record], &lattice, &[None; 4], &options, &Control::default()));
             println!("units {}", lattice.count());
         }
-        "boxes" => {
-            let Some((record, lattice)) = problem(m, BOXED) else { return };
-            let _ = black_box(search(&[record], &lattice, &[None; 4], &options(1), &Control::default()));
-            println!("units {}", lattice.count());
-        }
-        "certify" => {
-            let Some((record, _)) = problem(m, 1.0) else { return };
-            let range = |signal, lowest, highest| Range { signal, lowest, highest };
-            let terms = vec![range(1, 0.0, 1.2), range(0, 0.0, 1.2), range(2, 0.0, 0.0)];
-            let region = Region { output: 1, alpha: (1.5, 2.0), terms, apart: 0.1 };
-            let asked = Asked { within: 0.01, largest: 1e4, cells: 20_000, threads: 1, memory: 1 << 30 };
-            if let Ok(found) = black_box(certify(&[record], &region, &asked, &Control::default())) {
-                println!("units {}", found.cells);
-            }
-        }
-        "fit" if black_box(fitted()).is_some() => println!("units 1"),
         "divide" => {
             let (signal, mut divisor) = (noise(m, 2), block_pulse_kernel(1.9, m, 0.005));
             divisor.iter_mut().for_each(|d| *d *= 863.0);

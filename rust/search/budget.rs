@@ -50,9 +50,9 @@ impl Budget {
             }
             if bounded {
                 // Real and imaginary part with every column and the target, once as they come and once as they are kept;
-                // three numbers an own column; the vectors.
+                // four numbers an own column; the vectors.
                 let vectors = vectors as u128;
-                self.bytes += VALUE * vectors * (4 * (width + 1) + 3 * own + 2 * m as u128);
+                self.bytes += VALUE * vectors * (4 * (width + 1) + 4 * own + 2 * m as u128);
             }
         }
         // Products of all columns and the target: of each record at rest apart, of all, as they are summed.

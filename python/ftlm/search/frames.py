@@ -18,11 +18,12 @@ MAGIC = b"ftlm search store 1\n"
 HEAD = struct.Struct("<II")
 DIGEST = 16
 #: Number of the algorithm that rounds follow; rounds of different ones must not be joined.
-ALGORITHM = 4
+ALGORITHM = 5
 #: Earlier ones whose half-finished stores go on where the rounds of a search have not changed since: 2 screens lattices
 #: of 2²⁵ candidates and more in boxes and in longer rounds, 3 in sharper boxes and by squared equation errors too, 4
-#: proves free runs of 2¹⁸ candidates and more closely; all leave the others as they were.
-CONTINUED = (1, 2, 3)
+#: proves free runs of 2¹⁸ candidates and more closely, 5 bounds free runs by coefficients that cancel and lays boxes by
+#: the coefficients of all of their candidates; all leave the others as they were.
+CONTINUED = (1, 2, 3, 4)
 #: Largest payload: a table of 100 000 rows of many coefficients is far below.
 MAX_PAYLOAD = 1 << 30
 Natural = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]

@@ -20,8 +20,9 @@ pub(crate) struct Probes {
     pub(crate) target: Vec<[Wide; 2]>,
     /// Row of `effects` of a column, [`NONE`] where it is not of the output itself.
     pub(crate) rows: Vec<usize>,
-    /// g·‖t‖ (real, imaginary) and ‖Fᵀt − g t‖.
-    pub(crate) effects: Vec<[Wide; 3]>,
+    /// g·‖t‖ (real, imaginary), ‖Fᵀt − g t‖, and the way that Fᵀt − g t has come since the first row: no two rows are
+    /// farther apart than the way between them.
+    pub(crate) effects: Vec<[Wide; 4]>,
     /// ‖t‖ in the dual norm.
     pub(crate) size: Vec<Wide>,
     /// What rounding may add to |⟨t, w⟩| per unit of a column's coefficient, and for the target.
@@ -30,6 +31,9 @@ pub(crate) struct Probes {
     /// What rounding may add to a sum of m terms, per unit.
     pub(crate) unit: f64,
 }
+
+/// Most own columns that are looked at together.
+const TOGETHER: usize = 4;
 
 impl Probes {
     #[allow(clippy::cast_precision_loss)]
@@ -95,16 +99,16 @@ impl Probes {
         let part =
             |rows: &[[Wide; 2]], half: usize, g: usize| pick(&rows.iter().map(|r| r[half]).collect::<Vec<_>>(), g);
         let pairs = |rows: &[[Wide; 2]]| (0..groups).map(|g| [part(rows, 0, g), part(rows, 1, g)]).collect::<Vec<_>>();
-        let triples = |rows: &[[Wide; 3]]| {
-            let half = |h: usize, g: usize| pick(&rows.iter().map(|r| r[h]).collect::<Vec<_>>(), g);
-            (0..groups).map(|g| [half(0, g), half(1, g), half(2, g)]).collect::<Vec<_>>()
+        let fours = |rows: &[[Wide; 4]]| {
+            let part = |h: usize, g: usize| pick(&rows.iter().map(|r| r[h]).collect::<Vec<_>>(), g);
+            (0..groups).map(|g| std::array::from_fn(|h| part(h, g))).collect::<Vec<[Wide; 4]>>()
         };
         Self {
             groups,
             products: self.products.chunks(self.groups).flat_map(pairs).collect(),
             target: pairs(&self.target),
             rows: self.rows.clone(),
-            effects: self.effects.chunks(self.groups).flat_map(triples).collect(),
+            effects: self.effects.chunks(self.groups).flat_map(fours).collect(),
             size: (0..groups).map(|g| pick(&self.size, g)).collect(),
             rounding: self.rounding.clone(),
             target_rounding: self.target_rounding,
@@ -132,6 +136,7 @@ impl Probes {
         let [mut re, mut im] = self.target[group];
         let mut divisor = self.size[group];
         let (mut divisor_im, mut slack) = ([0.0; WIDTH], [0.0; WIDTH]);
+        let (mut own, mut count) = ([(0, 0.0); TOGETHER], 0);
         for (&p, &c) in terms.iter().zip(coefficients) {
             let [a, b] = &self.products[p * self.groups + group];
             for n in 0..WIDTH {
@@ -140,12 +145,16 @@ impl Probes {
             }
             let row = self.rows[p];
             if row != NONE {
-                let [a, b, rest] = &self.effects[row * self.groups + group];
+                let [a, b, rest, _] = &self.effects[row * self.groups + group];
                 for n in 0..WIDTH {
                     divisor[n] -= c * a[n];
                     divisor_im[n] -= c * b[n];
                     slack[n] += c.abs() * rest[n];
                 }
+                if count < TOGETHER {
+                    own[count] = (row, c);
+                }
+                count += 1;
             }
         }
         for (&p, &c) in initial.iter().zip(weights) {
@@ -153,6 +162,12 @@ impl Probes {
             for n in 0..WIDTH {
                 re[n] -= c * a[n];
                 im[n] -= c * b[n];
+            }
+        }
+        if (2..=TOGETHER).contains(&count) {
+            let together = self.together(group, &mut own[..count]);
+            for n in 0..WIDTH {
+                slack[n] = if together[n] < slack[n] { together[n] } else { slack[n] };
             }
         }
         let (mut bounds, mut guesses) = ([0.0; WIDTH], [0.0; WIDTH]);
@@ -164,5 +179,39 @@ impl Probes {
             guesses[n] = seen / size;
         }
         (bounds, guesses)
+    }
+
+    /// At most ‖Σ c (Fᵀt − g t)‖ of own columns by row, whose coefficients may cancel: all of them times what the first
+    /// row has, and all but the first so many times the way to the next.
+    #[inline(always)]
+    fn together(&self, group: usize, own: &mut [(usize, f64)]) -> Wide {
+        for i in 1..own.len() {
+            let mut at = i;
+            while at > 0 && own[at - 1].0 > own[at].0 {
+                own.swap(at - 1, at);
+                at -= 1;
+            }
+        }
+        let (mut left, mut all) = (0.0, 0.0);
+        for (_, c) in own.iter() {
+            left += c;
+            all += c.abs();
+        }
+        let [.., first, mut before] = self.effects[own[0].0 * self.groups + group];
+        let [.., last] = &self.effects[own[own.len() - 1].0 * self.groups + group];
+        let mut most = [0.0; WIDTH];
+        for n in 0..WIDTH {
+            // What is left of sums loses as much as they are.
+            most[n] = left.abs() * first[n] + 16.0 * f64::EPSILON * all * (first[n] + last[n]);
+        }
+        for at in 1..own.len() {
+            left -= own[at - 1].1;
+            let [.., way] = self.effects[own[at].0 * self.groups + group];
+            for n in 0..WIDTH {
+                most[n] += left.abs() * (way[n] - before[n]);
+            }
+            before = way;
+        }
+        most
     }
 }

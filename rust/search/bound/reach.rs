@@ -78,7 +78,7 @@ impl Reach {
                     }
                     let row = probes.rows[p];
                     if row != NONE {
-                        let [re, im, rest] = &probes.effects[row * probes.groups + group];
+                        let [re, im, rest, _] = &probes.effects[row * probes.groups + group];
                         for n in 0..WIDTH {
                             effect.divisor[0][n] = -c * re[n];
                             effect.divisor[1][n] = -c * im[n];

@@ -95,18 +95,24 @@ pub(super) fn vectors(count: usize, m: usize) -> Vec<[Vec<f64>; 2]> {
 struct Scratch {
     product: SumOfProducts,
     buffers: Buffers,
-    parts: [Vec<f64>; 2],
+    /// Fᵀt of this column and of the one before it, backwards, by test vector and half.
+    here: Vec<Vec<f64>>,
+    before: Vec<Vec<f64>>,
 }
 
-/// Own columns by row, each with the test vectors of a batch that it is held against at a time: with all of them, but
-/// where threads would wait for one another with one, which come last.
-fn tasks(own: usize, batch: usize, threads: usize) -> Vec<(usize, Range<usize>)> {
-    let whole = own - own % threads.max(1);
-    let single = (whole..own).flat_map(|row| (0..batch).map(move |j| (row, j..j + 1)));
-    (0..whole).map(|row| (row, 0..batch)).chain(single).collect()
+/// Runs of own columns, as even as they go, so many that threads hardly wait for one another and few columns are asked
+/// twice: each run begins with the last one of the run before it.
+fn runs(own: usize, threads: usize) -> Vec<Range<usize>> {
+    let threads = threads.max(1);
+    let count = (own / LEAST).clamp(threads, 4 * threads).min(own);
+    (0..count).map(|i| i * own / count..(i + 1) * own / count).collect()
 }
 
-/// g·‖t‖ and ‖Fᵀt − g t‖ of every own column and test vector, columns first.
+/// Least columns of a run where there are enough for several runs a thread.
+const LEAST: usize = 16;
+
+/// g·‖t‖, ‖Fᵀt − g t‖, and how far this last vector has come since the first own column, of every own column and test
+/// vector, columns first.
 pub(super) fn effects(
     bank: &Bank,
     own: &[usize],
@@ -114,10 +120,10 @@ pub(super) fn effects(
     sizes: &[f64],
     norm: Norm,
     unit: f64,
-) -> Vec<[Wide; 3]> {
+) -> Vec<[Wide; 4]> {
     let (m, count) = (vectors.first().map_or(0, |v| v[0].len()), vectors.len());
     let groups = count / WIDTH;
-    let mut out = vec![[[0.0; WIDTH]; 3]; own.len() * groups];
+    let mut out = vec![[[0.0; WIDTH]; 4]; own.len() * groups];
     // Fᵀt is F applied to t read backwards, read backwards.
     let backwards = |x: &[f64]| -> Vec<f64> { x.iter().rev().copied().collect() };
     // Two spectra of as many bins as there are samples.
@@ -131,27 +137,38 @@ pub(super) fn effects(
         let halves: Vec<&Vec<f64>> = some.iter().flatten().collect();
         let spectra: Vec<Kernel> =
             halves.into_par_iter().with_max_len(1).map(|half| Kernel::new(&backwards(half))).collect();
-        let scratch = || Scratch {
-            product: SumOfProducts::new(m),
-            buffers: Buffers::default(),
-            parts: [vec![0.0; m], vec![0.0; m]],
-        };
-        // One after the other, as threads come: the short ones at the end fill what the long ones leave.
-        let found: Vec<(usize, usize, [f64; 3])> = tasks(own.len(), end - start, rayon::current_num_threads())
-            .into_iter()
-            .par_bridge()
-            .map_init(scratch, |Scratch { product, buffers, parts: [re, im] }, (row, which)| {
-                let kernel = Kernel::made_with(bank.kernel(own[row]), buffers);
-                let length: f64 = bank.kernel(own[row]).iter().map(|v| v.abs()).sum();
-                which
-                    .map(|j| {
-                        for (part, out) in spectra[2 * j..2 * j + 2].iter().zip([&mut *re, &mut *im]) {
-                            product.add(1.0, &kernel, part);
-                            product.take(out, buffers);
+        let kept = || vec![vec![0.0; m]; spectra.len()];
+        let scratch =
+            || Scratch { product: SumOfProducts::new(m), buffers: Buffers::default(), here: kept(), before: kept() };
+        let found: Vec<(usize, usize, [f64; 4])> = runs(own.len(), rayon::current_num_threads())
+            .into_par_iter()
+            .with_max_len(1)
+            .map_init(scratch, |Scratch { product, buffers, here, before }, run| {
+                let mut found = Vec::new();
+                let mut last: Vec<[f64; 4]> = Vec::new();
+                let from = run.start.saturating_sub(1);
+                for (row, &column) in own.iter().enumerate().take(run.end).skip(from) {
+                    let kernel = Kernel::made_with(bank.kernel(column), buffers);
+                    let length: f64 = bank.kernel(column).iter().map(|v| v.abs()).sum();
+                    let mut now = Vec::with_capacity(some.len());
+                    for (j, vector) in some.iter().enumerate() {
+                        for half in 2 * j..2 * j + 2 {
+                            product.add(1.0, &kernel, &spectra[half]);
+                            product.take(&mut here[half], buffers);
                         }
-                        (row, start + j, effect(&some[j], sizes[start + j], re, im, norm, unit * length))
-                    })
-                    .collect::<Vec<_>>()
+                        let (at, from) = ([&here[2 * j], &here[2 * j + 1]], [&before[2 * j], &before[2 * j + 1]]);
+                        now.push(effect(vector, at, last.get(j).map(|g| (from, *g)), norm, unit * length));
+                        if row >= run.start {
+                            let [g, h, rest, .., step] = now[j];
+                            let size = sizes[start + j];
+                            let beyond = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * size;
+                            found.push((row, start + j, [g * size, h * size, rest + beyond, step]));
+                        }
+                    }
+                    last = now.iter().map(|&[g, h, .., lost, _]| [g, h, lost, 0.0]).collect();
+                    std::mem::swap(here, before);
+                }
+                found
             })
             .flatten_iter()
             .collect();
@@ -161,12 +178,24 @@ pub(super) fn effects(
             }
         }
     }
+    // Steps add up to ways.
+    for place in groups..out.len() {
+        let before = out[place - groups][3];
+        out[place][3].iter_mut().zip(before).for_each(|(way, before)| *way += before);
+    }
     out
 }
 
-/// g·‖t‖ and ‖u − g t‖ for u given backwards; g is the projection of u on t, best for the norm of squares.
+/// g, ‖u − g t‖, what rounding may do to that vector, and its distance from the one before; of u given backwards, and of
+/// the u before it with its g and what rounding may do. g is the projection of u on t, best for the norm of squares.
 #[allow(clippy::cast_precision_loss)]
-fn effect([a, b]: &[Vec<f64>; 2], size: f64, re: &[f64], im: &[f64], norm: Norm, rounding: f64) -> [f64; 3] {
+fn effect(
+    [a, b]: &[Vec<f64>; 2],
+    [re, im]: [&Vec<f64>; 2],
+    before: Option<([&Vec<f64>; 2], [f64; 4])>,
+    norm: Norm,
+    rounding: f64,
+) -> [f64; 5] {
     let rows = || a.iter().zip(b).zip(re.iter().zip(im).rev());
     let (mut x, mut y, mut squares) = (0.0, 0.0, 0.0);
     for ((a, b), (u, v)) in rows() {
@@ -176,15 +205,27 @@ fn effect([a, b]: &[Vec<f64>; 2], size: f64, re: &[f64], im: &[f64], norm: Norm,
         squares += a * a + b * b;
     }
     let (g, h) = (x / squares, y / squares);
-    let rests = rows().map(|((a, b), (u, v))| {
+    let apart = |(a, b): (&f64, &f64), (u, v): (f64, f64), g: f64, h: f64| {
         let (p, q) = (u - (g * a - h * b), v - (g * b + h * a));
         p * p + q * q
-    });
+    };
+    let count = (a.len() as f64).sqrt();
+    let rests = rows().map(|(t, (u, v))| apart(t, (*u, *v), g, h));
     let (rest, count) = match norm {
         Norm::L1 => (rests.fold(0.0, f64::max).sqrt(), 1.0),
-        Norm::L2 => (rests.sum::<f64>().sqrt(), (a.len() as f64).sqrt()),
+        Norm::L2 => (rests.sum::<f64>().sqrt(), count),
     };
-    [g * size, h * size, rest + rounding * count + 16.0 * f64::EPSILON * (g.abs() + h.abs()) * size]
+    let lost = rounding * count;
+    let step = before.map_or(0.0, |([re, im], [g0, h0, lost0, _])| {
+        let steps = rows().zip(re.iter().zip(im).rev());
+        let steps = steps.map(|((t, (u, v)), (u0, v0))| apart(t, (u - u0, v - v0), g - g0, h - h0));
+        let step = match norm {
+            Norm::L1 => steps.fold(0.0, f64::max).sqrt(),
+            Norm::L2 => steps.sum::<f64>().sqrt(),
+        };
+        step + lost + lost0
+    });
+    [g, h, rest + lost, lost, step]
 }
 
 #[cfg(test)]
@@ -203,7 +244,7 @@ mod tests {
         let bank = Bank::new(&index, &record, 0)?;
         let all = vectors(count, m);
         let sizes = vec![1.0; count];
-        let found: Vec<Vec<[Wide; 3]>> = [1, 2]
+        let found: Vec<Vec<[Wide; 4]>> = [1, 2]
             .iter()
             .filter_map(|&threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok())
             .map(|pool| pool.install(|| effects(&bank, &own, all.clone(), &sizes, Norm::L1, 1e-9)))
@@ -220,7 +261,8 @@ mod tests {
                     kernel.apply(&signal, &mut out, &mut Buffers::default());
                     out
                 });
-                let alone = effect(vector, 1.0, &re, &im, Norm::L1, 1e-9 * length);
+                let [g, h, rest, ..] = effect(vector, [&re, &im], None, Norm::L1, 1e-9 * length);
+                let alone = [g, h, rest];
                 for (half, value) in alone.into_iter().enumerate() {
                     let there = found[0][row * groups + j / WIDTH][half][j % WIDTH];
                     assert!((there - value).abs() <= 1e-12 * (1.0 + value.abs()), "{row} {j} {half}: {there} {value}");
@@ -231,15 +273,56 @@ mod tests {
     }
 
     #[test]
-    fn every_column_meets_every_vector_once() {
-        for (own, batch, threads) in [(11, 2, 2), (11, 2, 1), (3, 5, 8), (0, 4, 2), (4, 1, 4)] {
-            let tasks = tasks(own, batch, threads);
-            let mut pairs: Vec<(usize, usize)> =
-                tasks.iter().flat_map(|(row, which)| which.clone().map(move |j| (*row, j))).collect();
-            pairs.sort_unstable();
-            let wanted: Vec<(usize, usize)> = (0..own).flat_map(|row| (0..batch).map(move |j| (row, j))).collect();
-            assert_eq!(pairs, wanted);
+    fn ways_are_no_shorter_than_what_lies_between() -> crate::error::Result<()> {
+        let (m, count) = (96, WIDTH);
+        let record = Record::new(0.05, vec![(0..m).map(|k| libm::sin(f64::from(k) * 0.3)).collect()], None)?;
+        let mut index = Index::default();
+        let orders: Vec<f64> = (1..40).map(|i| 0.05 * f64::from(i)).collect();
+        let own: Vec<usize> = orders.iter().map(|&eta| index.insert(Key::integral(0, eta))).collect();
+        let bank = Bank::new(&index, &record, 0)?;
+        let all = vectors(count, m as usize);
+        for norm in [Norm::L1, Norm::L2] {
+            let found = effects(&bank, &own, all.clone(), &[1.0; WIDTH], norm, 1e-15);
+            let vector = |row: usize, j: usize| -> Vec<(f64, f64)> {
+                let [g, h] = [0, 1].map(|half: usize| found[row][half][j]);
+                let parts = [0, 1].map(|half: usize| -> Vec<f64> {
+                    let (t, f) = (&all[j][half], bank.kernel(own[row]));
+                    (0..t.len()).map(|k| (k..t.len()).map(|i| t[i] * f[i - k]).sum()).collect()
+                });
+                let t = all[j][0].iter().zip(&all[j][1]);
+                t.zip(parts[0].iter().zip(&parts[1]))
+                    .map(|((a, b), (u, v))| (u - (g * a - h * b), v - (g * b + h * a)))
+                    .collect()
+            };
+            let mut closest = 0.0_f64;
+            for (i, k) in [(0, 1), (0, 38), (3, 9), (20, 22), (17, 18)] {
+                for (j, way) in found[k][3].iter().enumerate() {
+                    let squares = vector(i, j)
+                        .into_iter()
+                        .zip(vector(k, j))
+                        .map(|(a, b)| (a.0 - b.0) * (a.0 - b.0) + (a.1 - b.1) * (a.1 - b.1));
+                    let apart = match norm {
+                        Norm::L1 => squares.fold(0.0, f64::max).sqrt(),
+                        Norm::L2 => squares.sum::<f64>().sqrt(),
+                    };
+                    let way = way - found[i][3][j];
+                    assert!(way >= apart * (1.0 - 1e-12), "{norm:?} {i} to {k}, {j}: {way} for {apart}");
+                    closest = closest.max(apart / way);
+                }
+            }
+            assert!(closest > 0.999, "neighbours are as far apart as the way between them: {closest}");
         }
-        assert_eq!(tasks(11, 2, 2).len(), 12);
+        Ok(())
+    }
+
+    #[test]
+    fn every_column_is_of_one_run() {
+        for (own, threads) in [(11, 2), (11, 1), (3, 8), (0, 2), (4, 4), (400, 2)] {
+            let runs = runs(own, threads);
+            let all: Vec<usize> = runs.iter().cloned().flatten().collect();
+            assert_eq!(all, (0..own).collect::<Vec<_>>());
+            assert!(runs.len() <= 4 * threads && runs.iter().all(|run| !run.is_empty()));
+        }
+        assert_eq!(runs(11, 2).len(), 2);
     }
 }

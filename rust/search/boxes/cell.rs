@@ -1,21 +1,30 @@
 //! A lower bound of the errors of all candidates of a box.
 //!
 //! With û and v̂ the two columns that vary (of unit size, less their parts along the others) a candidate's coefficients on
-//! them solve p + B q = û·y, B p + q = v̂·y, B = û·v̂. Over a box, −1 ≤ s, t ≤ 1, every quantity is its straight line
-//! between the corners and a remainder ([`crate::search::boxes::side`]); B is bilinear but for the remainders of û and
-//! v̂, by Cauchy and Schwarz. The p and q of the corners, joined bilinearly, leave residuals E, F of the two equations,
-//! and the true ones lie within (E + |B|F)/(1 − B²) and (F + |B|E)/(1 − B²) of them. ⟨t, w⟩, 1 − Σ c g and what the
-//! columns explain of y are then bilinear in s and t but for remainders of second order, and what follows of bilinear
+//! them solve p + B q = û·y, B p + q = v̂·y, B = û·v̂, so (p ± q)/2 = (û·y ± v̂·y)/(2(1 ± B)): they are made for all
+//! candidates ([`Strip`]), and how far they run from bilinear over a box is looked up. Over a box, −1 ≤ s, t ≤ 1, every
+//! other quantity is its straight line between the ends and a remainder ([`crate::search::boxes::side`]). ⟨t, w⟩, 1 − Σ c g
+//! and coefficients are then bilinear in s and t but for remainders of second order, and what follows of bilinear
 //! functions at the corners follows over the box: |⟨t, w⟩| is at least its part along one direction, which is bilinear,
 //! less λ times moduli of bilinear functions, which is concave in s and in t, so least at a corner.
 
+use std::ops::Range;
+
 use crate::lanes::WIDTH;
+use crate::search::bound::probes::NONE;
 use crate::search::boxes::side::{each_group, Others, Seen, Side, Wide, ZERO};
 use crate::search::options::Norm;
 
 /// What rounding may change in coefficients, in units of ε and the sum of the diagonal of an inverse correlation
 /// matrix: sixteen times the square of the number of terms, far above what elimination loses.
 const ELIMINATED: f64 = 16.0 * f64::EPSILON;
+
+/// Candidates of a row that are looked at side by side.
+const LANES: usize = 4;
+const PLACES: [f64; LANES] = [0.0, 1.0, 2.0, 3.0];
+
+/// Where 1 − B² is no more than this, û and v̂ are one column as far as rounding tells.
+const NOTHING: f64 = 1e-12;
 
 /// Most other columns of a slab.
 pub(super) const MOST_OTHERS: usize = 16;
@@ -31,6 +40,8 @@ pub(super) struct Common {
     pub(super) rounding: Vec<f64>,
     /// Size of the output over all records.
     pub(super) size: f64,
+    /// Largest over smallest inverse size of two columns.
+    pub(super) ratio: f64,
 }
 
 impl Common {
@@ -50,10 +61,13 @@ impl Common {
                 tops
             })
             .collect();
+        let sizes = || others.normal.inverse().iter().copied().filter(|&i| i > 0.0);
+        // What rounding leaves of one coefficient counts as so much of another, and of itself.
+        let ratio = 1.0 + sizes().fold(0.0, f64::max) / sizes().fold(f64::INFINITY, f64::min);
         let most = |rounding: &[f64]| -> f64 {
             rounding.iter().zip(others.normal.inverse()).map(|(r, i)| r * i).fold(0.0, f64::max)
         };
-        Self { norm, squares, tops, rounding: others.probes.iter().map(|p| most(&p.rounding)).collect(), size }
+        Self { norm, squares, tops, rounding: others.probes.iter().map(|p| most(&p.rounding)).collect(), size, ratio }
     }
 }
 
@@ -74,15 +88,15 @@ impl Stretch {
 
 /// Middle, slope and remainder of a quantity over a stretch.
 #[derive(Debug, Clone, Copy)]
-struct Line {
-    middle: f64,
-    slope: f64,
-    rest: f64,
+pub(super) struct Line {
+    pub(super) middle: f64,
+    pub(super) slope: f64,
+    pub(super) rest: f64,
 }
 
 impl Line {
     #[inline(always)]
-    fn new(first: f64, last: f64, rest: f64) -> Self {
+    pub(super) fn new(first: f64, last: f64, rest: f64) -> Self {
         Self { middle: (first + last) / 2.0, slope: (last - first) / 2.0, rest }
     }
 }
@@ -93,44 +107,119 @@ fn bilinear([a, b, c, d]: [f64; 4]) -> [f64; 4] {
     [(a + b + c + d) / 4.0, ((b + d) - (a + c)) / 4.0, ((c + d) - (a + b)) / 4.0, ((a + d) - (b + c)) / 4.0]
 }
 
-/// Largest residual of z − p − B q, all exact at the corners, where B is off by at most `rest`.
-#[inline(always)]
-fn residual(b: [f64; 4], q: [f64; 4], most: f64, rest: f64, line: Line) -> f64 {
-    let curved = (b[1] * q[1]).abs() + (b[2] * q[2]).abs() + (b[3] * q[3]).abs();
-    let mixed = (b[1] * q[3] + b[3] * q[1]).abs() + (b[2] * q[3] + b[3] * q[2]).abs();
-    curved + mixed + line.rest + rest * most
-}
-
 /// What the candidates of a box have in common.
-struct Cell {
+pub(super) struct Cell {
     /// Rows and values at the corners.
-    at: [(usize, usize); 4],
+    pub(super) at: [(usize, usize); 4],
     /// Eighths of the squares of the sides' lengths.
-    wide: [f64; 2],
-    /// p and q at the corners, the largest over the box, and how far from bilinear they run.
-    ps: [f64; 4],
-    qs: [f64; 4],
-    most: [f64; 2],
-    off: [f64; 2],
+    pub(super) wide: [f64; 2],
+    /// p and q at the corners and the largest over the box.
+    pub(super) ps: [f64; 4],
+    pub(super) qs: [f64; 4],
+    pub(super) most: [f64; 2],
+    /// How far from bilinear (p + q)/2 and (p − q)/2 run.
+    pub(super) off: [f64; 2],
     /// Of p the coefficients of s and st, of q those of t and st, in moduli: what bends a product with a line in s or t.
-    bends: [f64; 2],
-    /// û·y and v̂·y.
-    lines: [Line; 2],
+    pub(super) bends: [f64; 2],
+    /// Largest part of ‖y‖² that û and v̂ explain, where that ranks.
+    pub(super) explained: f64,
     /// Size of the output and of all coefficients, and what rounding may change in one of these.
-    all: f64,
-    lost: f64,
+    pub(super) all: f64,
+    pub(super) lost: f64,
 }
 
 impl Cell {
     /// How far p times the first of these quantities along the sides and q times the second run from bilinear.
     #[inline(always)]
-    fn rest(&self, [a, b]: [Line; 2]) -> f64 {
-        let side = |n: usize, line: Line| {
-            self.bends[n] * line.slope.abs()
-                + self.most[n] * line.rest
-                + self.off[n] * (line.middle.abs() + line.slope.abs())
-        };
-        side(0, a) + side(1, b)
+    pub(super) fn rest(&self, [a, b]: [Line; 2]) -> f64 {
+        let bent = self.bends[0] * a.slope.abs() + self.bends[1] * b.slope.abs();
+        let slopes = a.slope.abs() + b.slope.abs();
+        let (sum, difference) = (a.middle + b.middle, a.middle - b.middle);
+        bent + self.most[0] * a.rest
+            + self.most[1] * b.rest
+            + self.off[0] * (sum.abs() + slopes)
+            + self.off[1] * (difference.abs() + slopes)
+    }
+}
+
+/// Coefficients on û and v̂ of all candidates of some rows of a slab.
+#[derive(Default)]
+pub(super) struct Strip {
+    start: usize,
+    len: usize,
+    /// (p + q)/2, (p − q)/2 and 1 − B²; all of them 0 where that is next to nothing, or no number.
+    plus: Vec<f64>,
+    minus: Vec<f64>,
+    left: Vec<f64>,
+    /// B, and products with the other columns one after the other, of a row.
+    product: Vec<f64>,
+}
+
+impl Strip {
+    #[inline(always)]
+    fn at(&self, row: usize, value: usize) -> usize {
+        (row - self.start) * self.len + value
+    }
+
+    /// How far from bilinear functions (p + q)/2 and (p − q)/2 run over a box, and the least 1 − B².
+    #[inline(always)]
+    fn off(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [plus, minus]: [[f64; 4]; 2]) -> ([f64; 2], f64) {
+        let (mut far, mut left) = ([[0.0_f64; LANES]; 2], [f64::INFINITY; LANES]);
+        let width = v1 - v0 + 1;
+        let [down, across] = [(u0, u1), (v0, v1)].map(|(a, b)| if b > a { 2.0 / count(b - a) } else { 0.0 });
+        for row in 0..=u1 - u0 {
+            let s = count(row) * down - 1.0;
+            let (x, y) = (plus[2] + plus[3] * s, minus[2] + minus[3] * s);
+            let (first, second) = (plus[0] + plus[1] * s - x, minus[0] + minus[1] * s - y);
+            let (x, y, start) = (x * across, y * across, self.at(u0 + row, v0));
+            let plus = self.plus[start..start + width].chunks_exact(LANES);
+            let minus = self.minus[start..start + width].chunks_exact(LANES);
+            let lefts = self.left[start..start + width].chunks_exact(LANES);
+            let rest = [plus.remainder(), minus.remainder(), lefts.remainder()];
+            let mut place = PLACES;
+            for ((plus, minus), lefts) in plus.zip(minus).zip(lefts) {
+                for n in 0..LANES {
+                    let a = (plus[n] - (first + x * place[n])).abs();
+                    let b = (minus[n] - (second + y * place[n])).abs();
+                    far[0][n] = if a > far[0][n] { a } else { far[0][n] };
+                    far[1][n] = if b > far[1][n] { b } else { far[1][n] };
+                    left[n] = if lefts[n] < left[n] { lefts[n] } else { left[n] };
+                    place[n] += PLACES[LANES - 1] + 1.0;
+                }
+            }
+            for n in 0..rest[0].len() {
+                let a = (rest[0][n] - (first + x * place[n])).abs();
+                let b = (rest[1][n] - (second + y * place[n])).abs();
+                far[0][n] = if a > far[0][n] { a } else { far[0][n] };
+                far[1][n] = if b > far[1][n] { b } else { far[1][n] };
+                left[n] = if rest[2][n] < left[n] { rest[2][n] } else { left[n] };
+            }
+        }
+        let most = |x: [f64; LANES]| x.into_iter().fold(0.0_f64, f64::max);
+        ([most(far[0]), most(far[1])], left.into_iter().fold(f64::INFINITY, f64::min))
+    }
+
+    /// The least 1 − B² over a box, and the most of ‖y‖² that û and v̂ explain.
+    #[inline(always)]
+    fn explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
+        let (mut left, mut most) = ([f64::INFINITY; LANES], [f64::NEG_INFINITY; LANES]);
+        let width = v1 - v0 + 1;
+        for row in u0..u1 + 1 {
+            let (y, start) = (y[row], self.at(row, v0));
+            let here = [&self.plus, &self.minus, &self.left].map(|from| &from[start..start + width]);
+            let z = &z[v0..v0 + width];
+            let mut at = 0;
+            while at < width {
+                let lanes = LANES.min(width - at);
+                for n in 0..lanes {
+                    let explained = here[0][at + n] * (y + z[at + n]) + here[1][at + n] * (y - z[at + n]);
+                    most[n] = if explained > most[n] { explained } else { most[n] };
+                    left[n] = if here[2][at + n] < left[n] { here[2][at + n] } else { left[n] };
+                }
+                at += lanes;
+            }
+        }
+        (left.into_iter().fold(f64::INFINITY, f64::min), most.into_iter().fold(f64::NEG_INFINITY, f64::max))
     }
 }
 
@@ -140,8 +229,10 @@ pub(super) struct Slab<'a> {
     pub(super) common: &'a Common,
     /// The order that changes from row to row, and the one that runs along rows.
     pub(super) sides: [Side; 2],
+    /// Which of them is one of the output's own signal.
+    own: Option<usize>,
     /// Coefficients of the output on the other columns.
-    along: Vec<f64>,
+    pub(super) along: Vec<f64>,
     /// Squared size of the output less its part along the others.
     unexplained: f64,
     /// Of the output less its part along the others: ⟨t, y⟩ and ‖t‖, by group.
@@ -173,52 +264,85 @@ impl<'a> Slab<'a> {
             base.push(here);
         }
         let explained: f64 = along.iter().zip(&rhs).map(|(c, g)| c * g).sum();
-        Self { others, common, sides, along, unexplained: common.size * common.size - explained, base, rests }
+        let of = |side: &Side| others.probes.first().is_some_and(|p| side.columns.iter().all(|&c| p.rows[c] != NONE));
+        let own = (0..2).find(|&n| of(&sides[n]));
+        Self { others, common, sides, own, along, unexplained: common.size * common.size - explained, base, rests }
     }
 
-    /// û·v̂ of a row and a value along it.
+    /// The coefficients of all candidates of some rows.
     #[inline(always)]
-    fn product(&self, row: usize, value: usize) -> f64 {
-        let k = self.others.columns.len();
+    pub(super) fn lay(&self, strip: &mut Strip, rows: Range<usize>) {
+        let (k, len) = (self.others.columns.len(), self.sides[1].columns.len());
         let [u, v] = &self.sides;
-        let raw = self.others.normal.product(u.columns[row], v.columns[value]);
-        let along: f64 =
-            u.mixed[row * k..(row + 1) * k].iter().zip(&v.shared[value * k..(value + 1) * k]).map(|(a, g)| a * g).sum();
-        (raw * u.scale[row] - along) * v.scale[value]
+        (strip.start, strip.len) = (rows.start, len);
+        let Strip { plus, minus, left, product, .. } = strip;
+        for all in [&mut *plus, minus, left] {
+            all.resize(rows.len() * len, 0.0);
+        }
+        product.resize((k + 1) * len, 0.0);
+        let (product, shared) = product.split_at_mut(len);
+        for (s, shared) in shared.chunks_exact_mut(len).enumerate() {
+            for (j, shared) in shared.iter_mut().enumerate() {
+                *shared = v.shared[j * k + s];
+            }
+        }
+        for (at, row) in rows.enumerate() {
+            let (with, scale, y) = (self.others.normal.products(u.columns[row]), u.scale[row], u.target[row]);
+            for (product, &column) in product.iter_mut().zip(&v.columns) {
+                *product = with[column] * scale;
+            }
+            for (shared, mixed) in shared.chunks_exact(len).zip(&u.mixed[row * k..(row + 1) * k]) {
+                for (product, shared) in product.iter_mut().zip(shared) {
+                    *product -= mixed * shared;
+                }
+            }
+            let at = at * len..(at + 1) * len;
+            let (plus, minus, left) = (&mut plus[at.clone()], &mut minus[at.clone()], &mut left[at]);
+            let (scales, targets) = (&v.scale[..len], &v.target[..len]);
+            for j in 0..len {
+                let (b, z) = (product[j] * scales[j], targets[j]);
+                let (above, below) = (1.0 + b, 1.0 - b);
+                let both = above * below;
+                let sound = both > NOTHING;
+                let half = if sound { 0.5 / both } else { 0.0 };
+                left[j] = if sound { both } else { 0.0 };
+                plus[j] = (y + z) * below * half;
+                minus[j] = (y - z) * above * half;
+            }
+        }
     }
 
     /// What the candidates of a box have in common; none where nothing is proved of it.
     #[inline(always)]
-    fn cell(&self, [su, sv]: [Stretch; 2]) -> Option<Cell> {
+    pub(super) fn cell(&self, strip: &Strip, [su, sv]: [Stretch; 2]) -> Option<Cell> {
         let [u, v] = &self.sides;
         let ((u0, u1), (v0, v1)) = (su.ends(u.columns.len()), sv.ends(v.columns.len()));
         let (wu, wv) = (eighth(u1 - u0), eighth(v1 - v0));
         let (pu, pv) = (u.levels[su.level].plain[su.at], v.levels[sv.level].plain[sv.at]);
         let sums = pu.sum + pv.sum;
         let at = [(u0, v0), (u1, v0), (u0, v1), (u1, v1)];
-        let corners = at.map(|(i, j)| self.product(i, j));
-        let off = wu * pu.curve + wv * pv.curve + self.others.rounding * self.others.trace * sums * sums;
-        let b_most = corners.iter().fold(0.0_f64, |m, b| m.max(b.abs())) + off;
+        let places = at.map(|(i, j)| strip.at(i, j));
+        let halves = [places.map(|place| strip.plus[place]), places.map(|place| strip.minus[place])];
+        let (mut ps, mut qs) = ([0.0; 4], [0.0; 4]);
+        for c in 0..4 {
+            ps[c] = halves[0][c] + halves[1][c];
+            qs[c] = halves[0][c] - halves[1][c];
+        }
+        let (off, left, explained) = if self.common.squares {
+            let (left, explained) = strip.explained([(u0, u1), (v0, v1)], [&u.target, &v.target]);
+            ([0.0; 2], left, explained)
+        } else {
+            let (off, left) = strip.off([(u0, u1), (v0, v1)], halves.map(bilinear));
+            (off, left, 0.0)
+        };
+        let left = left - 2.0 * self.others.rounding * self.others.trace * sums * sums;
         // What is not a number proves nothing.
-        if b_most.is_nan() || b_most >= 1.0 {
+        if left.is_nan() || left <= 0.0 {
             return None;
         }
-        let left = 1.0 - b_most * b_most;
-        let (mut ps, mut qs) = ([0.0; 4], [0.0; 4]);
-        for (c, (i, j)) in at.into_iter().enumerate() {
-            let (b, y, z) = (corners[c], u.target[i], v.target[j]);
-            let left = (1.0 - b) * (1.0 + b);
-            ps[c] = (y - b * z) / left;
-            qs[c] = (z - b * y) / left;
-        }
         let largest = |x: &[f64; 4]| x.iter().fold(0.0_f64, |m, v| m.max(v.abs()));
-        let (p_corner, q_corner) = (largest(&ps), largest(&qs));
-        let (b, p, q) = (bilinear(corners), bilinear(ps), bilinear(qs));
-        let y = Line::new(u.target[u0], u.target[u1], wu * pu.target);
-        let z = Line::new(v.target[v0], v.target[v1], wv * pv.target);
-        let (e, f) = (residual(b, q, q_corner, off, y), residual(b, p, p_corner, off, z));
-        let (dp, dq) = ((e + b_most * f) / left, (f + b_most * e) / left);
-        let (p_most, q_most) = (p_corner + dp, q_corner + dq);
+        let both = off[0] + off[1];
+        let (p, q, p_most, q_most) = (bilinear(ps), bilinear(qs), largest(&ps) + both, largest(&qs) + both);
 
         // Sizes of coefficients, and what rounding may change in them.
         let trace = self.others.trace + sums * sums / left;
@@ -227,41 +351,26 @@ impl<'a> Slab<'a> {
         let terms = count(self.others.columns.len() + 2);
         let lost = ELIMINATED * terms * terms * trace * all;
         let bends = [p[1].abs() + p[3].abs(), q[2].abs() + q[3].abs()];
-        Some(Cell {
-            at,
-            wide: [wu, wv],
-            ps,
-            qs,
-            most: [p_most, q_most],
-            off: [dp, dq],
-            bends,
-            lines: [y, z],
-            all,
-            lost,
-        })
+        Some(Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off, bends, explained, all, lost })
     }
 
     /// Lower bound of the raw scores of all candidates of a box; ends as soon as it exceeds the limit.
     #[inline(always)]
-    pub(super) fn bound(&self, both: [Stretch; 2], limit: f64) -> f64 {
-        match self.cell(both) {
-            None => 0.0,
-            Some(cell) if self.common.squares => self.squares(&cell),
-            Some(cell) => self.errors(both, &cell, limit),
+    pub(super) fn bound(&self, both: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
+        if self.common.squares {
+            self.squares(cell)
+        } else {
+            self.errors(both, cell, limit)
         }
     }
 
     /// Lower bound of their squared equation errors.
     #[inline(always)]
     fn squares(&self, cell: &Cell) -> f64 {
-        let [u, v] = &self.sides;
-        let explained =
-            cell.at.iter().enumerate().map(|(c, &(i, j))| cell.ps[c] * u.target[i] + cell.qs[c] * v.target[j]);
-        let largest = explained.fold(f64::NEG_INFINITY, f64::max) + cell.rest(cell.lines);
         let rounding = self.others.rounding * cell.all + count(self.others.columns.len() + 2) * cell.lost;
-        let bound = self.unexplained - largest - 4.0 * rounding * cell.all;
+        let bound = self.unexplained - cell.explained - 4.0 * rounding * cell.all;
         // Neither NaN nor an overflow proves anything.
-        if bound > 0.0 && bound < f64::MAX && largest > f64::MIN {
+        if bound > 0.0 && bound < f64::MAX && cell.explained > f64::MIN {
             bound
         } else {
             0.0
@@ -273,7 +382,8 @@ impl<'a> Slab<'a> {
     fn errors(&self, [su, sv]: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
         let k = self.others.columns.len();
         let [u, v] = &self.sides;
-        let Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off: [dp, dq], bends, all, lost, .. } = *cell;
+        let Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off, bends, all, lost, .. } = *cell;
+        let both = off[0] + off[1];
         let ((u0, v0), (u1, v1)) = (at[0], at[3]);
         let (lu, lv) = (&u.levels[su.level], &v.levels[sv.level]);
         // Moduli of the other coefficients at the corners, and how far from bilinear they run.
@@ -286,6 +396,24 @@ impl<'a> Slab<'a> {
             let b = Line::new(v.mixed[v0 * k + s], v.mixed[v1 * k + s], wv * lv.mixed[sv.at * k + s]);
             rests[s] = cell.rest([a, b]) + lost;
         }
+
+        // Of the coefficients on the partner and on the own column of a side the sum, whose moduli may cancel.
+        let partner = self.others.partner.filter(|_| self.own.is_some());
+        let (mut sums, mut sums_rest) = ([0.0; 4], 0.0);
+        if let Some(partner) = partner {
+            for (c, (i, j)) in at.into_iter().enumerate() {
+                sums[c] = (self.along[partner] - ps[c] * u.paired[i] - qs[c] * v.paired[j]).abs();
+            }
+            let bent = |values: &[f64], first: usize, last: usize| {
+                let inner =
+                    (first + 1..last).map(|i| ((values[i - 1] - values[i]) + (values[i + 1] - values[i])).abs());
+                inner.fold(0.0, f64::max)
+            };
+            let a = Line::new(u.paired[u0], u.paired[u1], wu * bent(&u.paired, u0, u1));
+            let b = Line::new(v.paired[v0], v.paired[v1], wv * bent(&v.paired, v0, v1));
+            sums_rest = cell.rest([a, b]) + lost * self.common.ratio;
+        }
+        let own = if self.own == Some(0) { &ps } else { &qs };
 
         let groups = self.base.len();
         let (mut sum, mut first) = (0.0, 0);
@@ -303,15 +431,17 @@ impl<'a> Slab<'a> {
                     for n in 0..WIDTH {
                         let mut sizes = [0.0; 4];
                         for part in 2 * half..2 * half + 2 {
-                            sizes[0] += (a[part][n] + b[part][n]).abs() * 0.5;
-                            sizes[1] += (b[part][n] - a[part][n]).abs() * 0.5;
-                            sizes[2] += (c[part][n] + d[part][n]).abs() * 0.5;
+                            let (mu, mv) = ((a[part][n] + b[part][n]) * 0.5, (c[part][n] + d[part][n]) * 0.5);
+                            sizes[0] += (mu + mv).abs();
+                            sizes[1] += (mu - mv).abs();
+                            sizes[2] += (b[part][n] - a[part][n]).abs() * 0.5;
                             sizes[3] += (d[part][n] - c[part][n]).abs() * 0.5;
                         }
-                        rough[half][n] = bends[0] * sizes[1]
+                        rough[half][n] = bends[0] * sizes[2]
                             + bends[1] * sizes[3]
-                            + dp * (sizes[0] + sizes[1])
-                            + dq * (sizes[2] + sizes[3])
+                            + off[0] * sizes[0]
+                            + off[1] * sizes[1]
+                            + both * (sizes[2] + sizes[3])
                             + wu * bu[half][n] * p_most
                             + wv * bv[half][n] * q_most
                             + lost * tops[half][n];
@@ -319,14 +449,40 @@ impl<'a> Slab<'a> {
                 }
                 // What is added to each divisor: of the varying columns (a scale is at least 1) and of the others.
                 let mut slack = [ZERO; 4];
-                for n in 0..WIDTH {
-                    rough[0][n] += rounding;
-                    rough[1][n] += (dp + lost) * bu[2][n] + (dq + lost) * bv[2][n];
-                    for corner in 0..4 {
-                        slack[corner][n] = ps[corner].abs() * bu[2][n] + qs[corner].abs() * bv[2][n];
+                rough[0].iter_mut().for_each(|rough| *rough += rounding);
+                let rest_of = &self.rests[group * k..(group + 1) * k];
+                let mut together = None;
+                if let Some(partner) = partner {
+                    let rest = &rest_of[partner];
+                    let (mut apart, mut joint) = (0.0, 0.0);
+                    for n in 0..WIDTH {
+                        apart += others[partner][0] * rest[n] + own[0].abs() * (bu[2][n] + bv[2][n]);
+                        joint += sums[0] * rest[n] + own[0].abs() * (bu[3][n] + bv[3][n]);
+                    }
+                    if joint < apart {
+                        together = Some(partner);
                     }
                 }
-                for (s, rest) in self.rests[group * k..(group + 1) * k].iter().enumerate() {
+                let part = if together.is_some() { 3 } else { 2 };
+                for n in 0..WIDTH {
+                    rough[1][n] += (both + lost) * (bu[part][n] + bv[part][n]);
+                    for corner in 0..4 {
+                        slack[corner][n] = ps[corner].abs() * bu[part][n] + qs[corner].abs() * bv[part][n];
+                    }
+                }
+                if let Some(partner) = together {
+                    let rest = &rest_of[partner];
+                    for n in 0..WIDTH {
+                        rough[1][n] += sums_rest * rest[n];
+                        for corner in 0..4 {
+                            slack[corner][n] += sums[corner] * rest[n];
+                        }
+                    }
+                }
+                for (s, rest) in rest_of.iter().enumerate() {
+                    if together == Some(s) {
+                        continue;
+                    }
                     for n in 0..WIDTH {
                         rough[1][n] += rests[s] * rest[n];
                         for corner in 0..4 {
@@ -382,7 +538,7 @@ impl<'a> Slab<'a> {
     }
 
     #[inline(always)]
-    fn raw(&self, norm: f64) -> f64 {
+    pub(super) fn raw(&self, norm: f64) -> f64 {
         match self.common.norm {
             Norm::L1 => norm,
             Norm::L2 => norm * norm,

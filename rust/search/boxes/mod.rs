@@ -5,7 +5,6 @@
 //! its corners with proved remainders (`cell`), and boxes are halved until they are excluded or small (`walk`).
 
 mod cell;
-mod differences;
 mod side;
 mod walk;
 

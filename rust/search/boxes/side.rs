@@ -6,7 +6,6 @@
 
 use crate::lanes::WIDTH;
 use crate::search::bound::probes::{Probes, NONE};
-use crate::search::boxes::differences::Differences;
 use crate::search::candidate::normal::Normal;
 
 /// One value for each of [`WIDTH`] test vectors.
@@ -19,16 +18,13 @@ pub(super) type Seen = [Wide; 4];
 /// Of a stretch of 2^l values: what its inner ones differ from straight by, and its largest values.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Node {
-    /// Largest second differences of ⟨t, û⟩ and of g‖t‖, largest ‖Fᵀt − g t‖.
-    pub(super) bent: [Wide; 3],
+    /// Largest second differences of ⟨t, û⟩ and of g‖t‖, largest ‖Fᵀt − g t‖ and way from that of the partner.
+    pub(super) bent: [Wide; 4],
 }
 
 /// The same of numbers that no test vector enters.
 #[derive(Debug, Clone, Copy, Default)]
 pub(super) struct Plain {
-    /// Largest second difference of û (its size) and of û·y.
-    pub(super) curve: f64,
-    pub(super) target: f64,
     /// Largest sum of the moduli of û's coefficients.
     pub(super) sum: f64,
 }
@@ -53,6 +49,8 @@ pub(super) struct Others<'a> {
     pub(super) trace: f64,
     /// What rounding may add to a product of unit columns.
     pub(super) rounding: f64,
+    /// One of the columns that is the output's own, whose coefficient that of an own one of the sides may cancel.
+    pub(super) partner: Option<usize>,
 }
 
 impl Others<'_> {
@@ -62,6 +60,21 @@ impl Others<'_> {
         for (i, out) in out.iter_mut().enumerate() {
             *out = (0..k).map(|j| self.inverse[i * k + j] * products[j]).sum();
         }
+    }
+
+    /// How far an own column's Fᵀt − g t is from the partner's at most; nothing of another column, or without a partner.
+    #[inline(always)]
+    fn way(&self, record: usize, group: usize, column: usize) -> Wide {
+        let probes = &self.probes[record];
+        let (mut way, row) = (ZERO, probes.rows[column]);
+        if let Some(partner) = self.partner.filter(|_| row != NONE) {
+            let at = |row: usize| &probes.effects[row * probes.groups + group][3];
+            let (a, b) = (at(row), at(probes.rows[self.columns[partner]]));
+            for n in 0..WIDTH {
+                way[n] = (a[n] - b[n]).abs();
+            }
+        }
+        way
     }
 
     /// ⟨t, x⟩ and g‖t‖ of a column of unit size, and its ‖Fᵀt − g t‖.
@@ -77,7 +90,7 @@ impl Others<'_> {
             seen[1][n] = im[n] * inverse;
         }
         if row != NONE {
-            let [a, b, c] = &probes.effects[row * probes.groups + group];
+            let [a, b, c, _] = &probes.effects[row * probes.groups + group];
             for n in 0..WIDTH {
                 seen[2][n] = a[n] * inverse;
                 seen[3][n] = b[n] * inverse;
@@ -97,6 +110,9 @@ pub(super) struct Side {
     /// Products with the other columns, and û's coefficients on them (to be subtracted), k a value.
     pub(super) shared: Vec<f64>,
     pub(super) mixed: Vec<f64>,
+    /// What is to be subtracted for û from the coefficient on the partner and that on the order's own column together,
+    /// as if both were the partner; nothing where there is none.
+    pub(super) paired: Vec<f64>,
     /// Groups of test vectors within values.
     pub(super) seen: Vec<Seen>,
     pub(super) levels: Vec<Level>,
@@ -105,7 +121,7 @@ pub(super) struct Side {
 impl Side {
     /// Over these columns; none where one of them is all but a combination of the others.
     #[inline(always)]
-    pub(super) fn new(others: &Others<'_>, columns: Vec<usize>, differences: &Differences) -> Option<Self> {
+    pub(super) fn new(others: &Others<'_>, columns: Vec<usize>) -> Option<Self> {
         let (k, n, normal) = (others.columns.len(), columns.len(), others.normal);
         let (mut scale, mut target, mut shared) = (vec![0.0; n], vec![0.0; n], vec![0.0; n * k]);
         let (mut mixed, mut raw) = (vec![0.0; n * k], vec![0.0; n * k]);
@@ -131,6 +147,16 @@ impl Side {
         let groups: usize = others.probes.iter().map(|p| p.groups).sum();
         let mut seen = Vec::with_capacity(n * groups);
         let mut rests = Vec::with_capacity(n * groups);
+        let mut sound = ZERO;
+        let mut paired = Vec::new();
+        if let Some(partner) = others.partner {
+            let inverse = normal.inverse();
+            let own = others.probes.first().is_some_and(|probes| columns.iter().all(|&p| probes.rows[p] != NONE));
+            paired.extend(columns.iter().enumerate().map(|(i, &p)| {
+                let alone = if own { scale[i] * inverse[p] / inverse[others.columns[partner]] } else { 0.0 };
+                mixed[i * k + partner] - alone
+            }));
+        }
         let along: Vec<Vec<Seen>> = others
             .columns
             .iter()
@@ -150,73 +176,36 @@ impl Side {
                 for here in &mut here {
                     here.iter_mut().for_each(|v| *v *= scale[i]);
                 }
+                let mut way = others.way(r, g, column);
                 rest.iter_mut().for_each(|v| *v *= scale[i]);
+                way.iter_mut().for_each(|v| *v *= scale[i] * normal.inverse()[column]);
+                for values in here.iter().chain([&rest, &way]) {
+                    for n in 0..WIDTH {
+                        sound[n] += 0.0 * values[n];
+                    }
+                }
                 seen.push(here);
-                rests.push(rest);
+                rests.push([rest, way]);
             }
         }
-        // What is not a number, or none that anything follows from, ends here.
-        if !seen.iter().flatten().chain(&rests).flatten().all(|v| v.is_finite()) {
+        // What is not a number, or none that anything follows from, ends here: no multiple of it is 0.
+        if sound.iter().any(|v| v.is_nan()) {
             return None;
         }
-        let mut side = Self { columns, scale, target, shared, mixed, seen, levels: Vec::new() };
-        let curves = side.curves(others, &raw, differences);
-        side.build(k, groups, &curves, &rests);
+        let mut side = Self { columns, scale, target, shared, mixed, paired, seen, levels: Vec::new() };
+        side.build(k, groups, &rests);
         Some(side)
-    }
-
-    /// Size of the second difference of û at every value but the ends; infinite where neighbours are not known.
-    #[inline(always)]
-    fn curves(&self, others: &Others<'_>, raw: &[f64], differences: &Differences) -> Vec<f64> {
-        let (k, n) = (others.columns.len(), self.columns.len());
-        let mut curves = vec![0.0; n];
-        let (mut products, mut along) = (vec![0.0; k], [vec![0.0; k], vec![0.0; k]]);
-        for i in 1..n.saturating_sub(1) {
-            let Some((with, own)) = differences.of([self.columns[i - 1], self.columns[i], self.columns[i + 1]]) else {
-                curves[i] = f64::INFINITY;
-                continue;
-            };
-            // Projected products of x, δ and D, and bounds of their sizes.
-            let (x, raw) = (&self.shared[i * k..(i + 1) * k], &raw[i * k..(i + 1) * k]);
-            let mut cross = [0.0; 2];
-            let mut inner = own;
-            let mut sums = [0.0; 2];
-            for half in 0..2 {
-                for (p, &s) in products.iter_mut().zip(others.columns) {
-                    *p = with[half][s];
-                }
-                others.solve(&products, &mut along[half]);
-                let less = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| a * b).sum::<f64>();
-                cross[half] = with[half][self.columns[i]] - less(&along[half], x);
-                inner[2 * half] -= less(&along[half], &products);
-                if half == 1 {
-                    inner[1] -= less(&along[0], &products);
-                }
-                sums[half] = own[2 * half].max(0.0).sqrt() + along[half].iter().map(|a| a.abs()).sum::<f64>();
-            }
-            let (before, here, after) = (self.scale[i - 1], self.scale[i], self.scale[i + 1]);
-            let (c0, c1, c2) = ((before - here) + (after - here), after - before, (after + before) / 2.0);
-            let square = c0 * c0 / (here * here)
-                + c1 * c1 * inner[0]
-                + c2 * c2 * inner[2]
-                + 2.0 * (c0 * c1 * cross[0] + c0 * c2 * cross[1] + c1 * c2 * inner[1]);
-            let all =
-                c0.abs() * (1.0 + raw.iter().map(|a| a.abs()).sum::<f64>()) + c1.abs() * sums[0] + c2.abs() * sums[1];
-            curves[i] = (square.max(0.0) + 4.0 * others.rounding * others.trace * all * all).sqrt();
-        }
-        curves
     }
 
     /// Stretches of 1, 2, 4, … values.
     #[inline(always)]
-    fn build(&mut self, k: usize, groups: usize, curves: &[f64], rests: &[Wide]) {
+    fn build(&mut self, k: usize, groups: usize, rests: &[[Wide; 2]]) {
         let n = self.columns.len();
         let apart = |values: &[f64], stride: usize, at: usize, i: usize| -> f64 {
             let v = |i: usize| values[i * stride + at];
             ((v(i - 1) - v(i)) + (v(i + 1) - v(i))).abs()
         };
         // Second differences at a value.
-        let plain = |i: usize| Plain { curve: curves[i], target: apart(&self.target, 1, 0, i), sum: 0.0 };
         let bent = |i: usize, g: usize| -> [Wide; 2] {
             let (a, b, c) =
                 (&self.seen[(i - 1) * groups + g], &self.seen[i * groups + g], &self.seen[(i + 1) * groups + g]);
@@ -234,11 +223,11 @@ impl Side {
             plain: (0..n)
                 .map(|i| {
                     let mixed: f64 = self.mixed[i * k..(i + 1) * k].iter().map(|m| m.abs()).sum();
-                    Plain { sum: self.scale[i] + mixed, ..Plain::default() }
+                    Plain { sum: self.scale[i] + mixed }
                 })
                 .collect(),
             mixed: vec![0.0; n * k],
-            nodes: rests.iter().map(|&rest| Node { bent: [ZERO, ZERO, rest] }).collect(),
+            nodes: rests.iter().map(|&[rest, way]| Node { bent: [ZERO, ZERO, rest, way] }).collect(),
         }];
         let mut length = 1;
         while length < n {
@@ -259,20 +248,7 @@ impl Side {
                     // The last of the left half and the first of the right one are now within, unless it is the end.
                     let joint = right * length;
                     let inner = |i: usize| i > left * length && i + 1 < n.min((right + 1) * length);
-                    let other = below.plain[right];
-                    let mut take = |p: Plain| {
-                        all = Plain {
-                            curve: all.curve.max(p.curve),
-                            target: all.target.max(p.target),
-                            sum: all.sum.max(p.sum),
-                        };
-                    };
-                    take(other);
-                    for i in [joint - 1, joint] {
-                        if inner(i) {
-                            take(plain(i));
-                        }
-                    }
+                    all.sum = all.sum.max(below.plain[right].sum);
                     for s in 0..k {
                         let mut value = level.mixed[start + s].max(below.mixed[right * k + s]);
                         for i in [joint - 1, joint] {
@@ -290,7 +266,7 @@ impl Side {
                             }
                         };
                         let other = &below.nodes[right * groups + g];
-                        (0..3).for_each(|part| most(part, &other.bent[part]));
+                        (0..4).for_each(|part| most(part, &other.bent[part]));
                         for i in [joint - 1, joint] {
                             if inner(i) {
                                 let [a, b] = bent(i, g);

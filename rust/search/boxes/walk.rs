@@ -7,9 +7,8 @@ use crate::error::Result;
 use crate::lanes::{self, WIDTH};
 use crate::regressors::Record;
 use crate::search::bound::lower::Bound;
-use crate::search::bound::probes::Probes;
-use crate::search::boxes::cell::{Common, Slab, Stretch, MOST_OTHERS};
-use crate::search::boxes::differences::Differences;
+use crate::search::bound::probes::{Probes, NONE};
+use crate::search::boxes::cell::{Common, Slab, Stretch, Strip, MOST_OTHERS};
 use crate::search::boxes::side::{Others, Side};
 use crate::search::candidate::problem::Problem;
 use crate::search::catalogue::Catalogue;
@@ -31,7 +30,6 @@ const FINE: usize = 4;
 /// What all boxes of a search share.
 pub(crate) struct Boxes {
     common: Common,
-    differences: Differences,
     rounding: f64,
 }
 
@@ -54,30 +52,22 @@ impl Boxes {
     /// What they share; none where there is no bound, or where it would need too much memory. Runs on the current thread
     /// pool.
     pub(crate) fn new(catalogue: &Catalogue<'_>) -> Option<Self> {
-        let (problem, lattice) = (&catalogue.problem, &*catalogue.lattice);
+        let problem = &catalogue.problem;
         let (probes, normal) = (probes(problem)?, problem.equations.whole()?);
-        let mut neighbours: Vec<[usize; 3]> = Vec::new();
-        for (number, block) in lattice.blocks().iter().enumerate() {
-            let Some(slab) = lattice.slab(block.start) else { continue };
-            for term in [slab.outer, slab.inner] {
-                let columns = catalogue.columns(number, term);
-                let from = lattice.first(number, term);
-                neighbours.extend(columns[from..].windows(3).map(|w| [w[0], w[1], w[2]]));
-            }
-        }
-        let differences = Differences::new(problem, neighbours.into_iter(), catalogue.spare)?;
         #[allow(clippy::cast_precision_loss)]
         let rounding = f64::EPSILON * problem.samples() as f64;
-        let others = Others { normal, probes, columns: &[], inverse: &[], trace: 0.0, rounding };
+        let others = Others { normal, probes, columns: &[], inverse: &[], trace: 0.0, rounding, partner: None };
         let common = Common::new(&others, catalogue.options.norm, problem.squares.is_some(), problem.size());
-        Some(Self { common, differences, rounding })
+        Some(Self { common, rounding })
     }
 
     fn others<'a>(&self, catalogue: &'a Catalogue<'_>, columns: &'a [usize], inverse: &'a [f64]) -> Option<Others<'a>> {
-        let k = columns.len();
+        let (k, probes) = (columns.len(), probes(&catalogue.problem)?);
+        let partner = probes.first().and_then(|probes| columns.iter().position(|&p| probes.rows[p] != NONE));
         Some(Others {
             normal: catalogue.problem.equations.whole()?,
-            probes: probes(&catalogue.problem)?,
+            probes,
+            partner,
             columns,
             inverse,
             trace: (0..k).map(|i| inverse[i * k + i]).sum::<f64>().max(1.0),
@@ -135,13 +125,16 @@ impl lanes::Kernel for Walk<'_> {
         let (mut count, mut boxed) = (0, hi - lo);
         let lengths = [rows.len(), slab.len];
         let coarse = lengths.map(|n| COARSE.min(n.next_power_of_two().trailing_zeros() as usize));
-        let mut stack = Vec::new();
+        let (mut stack, mut strip) = (Vec::new(), Strip::default());
         for at in 0..lengths[0].div_ceil(1 << coarse[0]) {
+            ready.lay(&mut strip, at << coarse[0]..lengths[0].min((at + 1) << coarse[0]));
             for by in 0..lengths[1].div_ceil(1 << coarse[1]) {
                 stack.push([Stretch { level: coarse[0], at }, Stretch { level: coarse[1], at: by }]);
                 while let Some([u, v]) = stack.pop() {
-                    if ready.bound([u, v], limit) > limit {
-                        continue;
+                    if let Some(cell) = ready.cell(&strip, [u, v]) {
+                        if ready.bound([u, v], &cell, limit) > limit {
+                            continue;
+                        }
                     }
                     if u.level + v.level > FINE {
                         let part = usize::from(v.level > u.level);
@@ -210,7 +203,7 @@ fn ready<'a>(
     let columns_of = |term: usize| catalogue.columns(slab.block, term);
     let outer = slab.rows[rows].iter().map(|&digit| columns_of(slab.outer)[digit]).collect();
     let inner = columns_of(slab.inner)[slab.first..slab.first + slab.len].to_vec();
-    let sides = [Side::new(others, outer, &boxes.differences)?, Side::new(others, inner, &boxes.differences)?];
+    let sides = [Side::new(others, outer)?, Side::new(others, inner)?];
     Some(Slab::new(others, &boxes.common, sides))
 }
 
@@ -273,6 +266,8 @@ pub fn box_bounds(
         let (others, inverse) = others(catalogue, slab, &columns)?;
         let others = boxes.others(catalogue, &others, &inverse)?;
         let ready = ready(catalogue, boxes, slab, &others, 0..slab.rows.len())?;
+        let mut strip = Strip::default();
+        ready.lay(&mut strip, 0..slab.rows.len());
         let mut found = Vec::new();
         let levels = [0, 1].map(|side: usize| ready.sides[side].levels.len());
         for (a, b) in (0..levels[0]).flat_map(|a| (0..levels[1]).map(move |b| (a, b))) {
@@ -280,12 +275,14 @@ pub fn box_bounds(
                 for by in 0..ready.sides[1].levels[b].plain.len() {
                     let both = [Stretch { level: a, at }, Stretch { level: b, at: by }];
                     let ((u0, u1), (v0, v1)) = (both[0].ends(slab.rows.len()), both[1].ends(slab.len));
+                    let cell = ready.cell(&strip, both);
+                    let bound = cell.map_or(0.0, |cell| ready.bound(both, &cell, f64::INFINITY));
                     found.push(Boxed {
                         first: slab.lo + (u0 * slab.len + v0) as u64,
                         rows: (u1 - u0 + 1) as u64,
                         values: (v1 - v0 + 1) as u64,
                         stride: slab.len as u64,
-                        bound: ready.bound(both, f64::INFINITY),
+                        bound,
                     });
                 }
             }

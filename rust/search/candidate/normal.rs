@@ -45,6 +45,12 @@ impl Normal {
         self.correlation[a * self.width + b]
     }
 
+    /// Correlations of one column with all.
+    #[inline(always)]
+    pub(crate) fn products(&self, a: usize) -> &[f64] {
+        &self.correlation[a * self.width..(a + 1) * self.width]
+    }
+
     /// Products of the columns, of unit size, with the target.
     pub(crate) fn rhs(&self) -> &[f64] {
         &self.rhs

@@ -270,11 +270,6 @@ impl Problem {
         self.refiner.is_some()
     }
 
-    /// Regressors on every record.
-    pub(crate) fn banks(&self) -> &[Bank] {
-        &self.banks
-    }
-
     /// No test vectors of candidates yet, and the bytes that each will take.
     pub(crate) fn no_adapted(&self) -> (Adapted, u64) {
         (Adapted::new(&self.banks, &self.targets, self.options.norm), Adapted::bytes(&self.banks))

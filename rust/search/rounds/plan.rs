@@ -5,7 +5,7 @@
 //! another machine with the same vector instructions, or continued from a checkpoint. On another kind of processor the
 //! last digits may differ: the dense products and the transforms choose their kernels by the instructions they find.
 
-use crate::search::options::Options;
+use crate::search::options::{Criterion, Options};
 
 /// Candidates of one round where the Gram matrix alone ranks (16 ns each), where bounds screen (a microsecond or so), and
 /// where every candidate is followed: a round is long enough to be worth sending away, and short enough to be lost.
@@ -25,15 +25,17 @@ pub(super) const FEW: u64 = ROUND_FOLLOWED;
 /// Number of the algorithm by which the rounds of a search over so many candidates are cut and done.
 #[must_use]
 pub fn algorithm(candidates: u64, options: &Options) -> u64 {
-    if options.refines() || !options.early_stopping {
-        1
-    } else if candidates >= PROVED && options.scored_by_free_runs() {
-        4
-    } else if candidates >= BOXED {
-        3
+    let bounded = options.criterion == Criterion::OutputError || (candidates >= BOXED && !options.refines());
+    if options.early_stopping && bounded {
+        5
     } else {
         1
     }
+}
+
+/// Whether so many candidates are proved closely.
+pub(super) fn proved_closely(candidates: u64, options: &Options) -> bool {
+    candidates >= PROVED && options.scored_by_free_runs()
 }
 
 /// Candidates in a round of a search over so many, by this algorithm.

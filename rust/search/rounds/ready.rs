@@ -17,7 +17,7 @@ use crate::search::options::Options;
 use crate::search::outcome::{Counts, Kept, Outcome, Part, Row};
 use crate::search::rounds::hunt::Hunt;
 use crate::search::rounds::made::Made;
-use crate::search::rounds::plan::{algorithm, round_length, rounds, waves, BOXED, FEW};
+use crate::search::rounds::plan::{algorithm, proved_closely, round_length, rounds, waves, BOXED, FEW};
 use crate::search::rounds::scouts::Scouted;
 use crate::search::spread::visit;
 use crate::search::threads::pool;
@@ -96,7 +96,7 @@ impl<'a> Search<'a> {
             return Ok(Self { catalogue, boxes: None, limit: f64::INFINITY });
         }
         let pay = count >= BOXED && Boxes::pay(&catalogue);
-        let closely = algorithm(count, options) >= 4;
+        let closely = proved_closely(count, options);
         let Scouted { mut kept, mut tried, hard, which } =
             Hunt::new(&catalogue, None, pool, control).scout(pay, closely)?;
         if let Some(which) = which {
