@@ -469,3 +469,8 @@ def test_a_link_whose_other_stage_was_not_measured_is_alone(capsys):
     assert str(made) == "D^2 theta12 = a2 theta12 - 1.0 D^2 theta11 + d2 D^mu2 theta12 + e2 theta11 + c"
     assert made.sensor_filter == ftlm.SensorFilter.low_pass(["theta12"])
     assert options.measured("arm:2", [alone]) == options.structure("arm:2")
+
+
+def test_what_is_free_behind_a_filter_is_known_before_its_offset_is_decided():
+    structure = replace(ftlm.equation(WORDS, sensor_filter=sensor(("y",))), offset="auto")
+    assert FreeProblem.of(structure).names == FreeProblem.of(replace(structure, offset="none")).names

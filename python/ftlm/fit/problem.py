@@ -15,7 +15,7 @@ from ftlm.base.arrays import Floats
 from ftlm.data.equations import Friction, Stribeck
 from ftlm.data.limits import FreeInput
 from ftlm.data.orders import Order
-from ftlm.data.structures import Hints, History, Structure
+from ftlm.data.structures import Hints, History, Offset, Structure
 from ftlm.solve.records import affine, initial_tuple
 
 
@@ -135,6 +135,8 @@ def told(structure: Structure) -> Any:
     """A structure, its initial terms decided, as the core takes it."""
     signals, hints = structure.signals, structure.hints or Hints()
     states = structure.filter_states(structure.initial)
+    # What is free does not hang on an offset that is still to be decided.
+    offset: Offset = "none" if structure.offset == "auto" else structure.offset
 
     def order(of: Order) -> tuple[float, list[tuple[str, float]]]:
         return of.constant, list(of.weights)
@@ -158,7 +160,7 @@ def told(structure: Structure) -> Any:
         "bounds": [(name, (values[0], values[-1])) for name, values in structure.order_values.items()],
         "coupled": structure.coupling == "simulated",
         "delayed": bool(structure.delay),
-        "initial": initial_tuple(structure.initial, structure.offset, states),
+        "initial": initial_tuple(structure.initial, offset, states),
         "history": isinstance(structure.initial, History),
         "inputs": [(i.name, signals.index(i.signal), i.law, i.bounds) for i in structure.free_inputs],
         "laws": list(structure.coefficient_law),
