@@ -2,8 +2,6 @@
 //!
 //! They are complex exponentials under windows that end gently: there F_iᵀt is nearly a multiple of t.
 
-use std::ops::Range;
-
 use rayon::prelude::*;
 
 use crate::lanes::WIDTH;
@@ -91,25 +89,46 @@ pub(super) fn vectors(count: usize, m: usize) -> Vec<[Vec<f64>; 2]> {
     drawn(&shapes(count, m), m)
 }
 
-/// What a thread needs to hold test vectors against a column.
-struct Scratch {
-    product: SumOfProducts,
-    buffers: Buffers,
-    /// Fᵀt of this column and of the one before it, backwards, by test vector and half.
-    here: Vec<Vec<f64>>,
-    before: Vec<Vec<f64>>,
+/// A test vector that is held against one own column after another.
+struct Held<'a> {
+    vector: &'a [Vec<f64>; 2],
+    /// Its number among all.
+    which: usize,
+    size: f64,
+    /// Spectra of its halves read backwards: Fᵀt is F applied to t read backwards, read backwards.
+    spectra: [Kernel; 2],
+    /// Fᵀt of the last column and of the one before it, backwards.
+    here: [Vec<f64>; 2],
+    before: [Vec<f64>; 2],
+    /// What [`effect`] wants to know of the last column.
+    last: Option<[f64; 4]>,
 }
 
-/// Runs of own columns, as even as they go, so many that threads hardly wait for one another and few columns are asked
-/// twice: each run begins with the last one of the run before it.
-fn runs(own: usize, threads: usize) -> Vec<Range<usize>> {
-    let threads = threads.max(1);
-    let count = (own / LEAST).clamp(threads, 4 * threads).min(own);
-    (0..count).map(|i| i * own / count..(i + 1) * own / count).collect()
+impl<'a> Held<'a> {
+    fn new(vector: &'a [Vec<f64>; 2], which: usize, size: f64) -> Self {
+        let backwards = |x: &Vec<f64>| -> Vec<f64> { x.iter().rev().copied().collect() };
+        let spectra = [0, 1].map(|half: usize| Kernel::new(&backwards(&vector[half])));
+        let none = || [0, 1].map(|half: usize| vec![0.0; vector[half].len()]);
+        Self { vector, which, size, spectra, here: none(), before: none(), last: None }
+    }
+
+    /// Of the next own column, whose moduli add up to `length`, what [`effects`] gives, but the step in place of the way.
+    fn on(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, with: &mut With) -> [f64; 4] {
+        std::mem::swap(&mut self.here, &mut self.before);
+        for (spectrum, here) in self.spectra.iter().zip(&mut self.here) {
+            with.0.add(1.0, column, spectrum);
+            with.0.take(here, &mut with.1);
+        }
+        let before = self.last.map(|last| (&self.before, last));
+        let [g, h, rest, lost, step] = effect(self.vector, &self.here, before, norm, unit * length);
+        self.last = Some([g, h, lost, 0.0]);
+        let beyond = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * self.size;
+        [g * self.size, h * self.size, rest + beyond, step]
+    }
 }
 
-/// Least columns of a run where there are enough for several runs a thread.
-const LEAST: usize = 16;
+/// What a thread multiplies spectra with.
+type With = (SumOfProducts, Buffers);
 
 /// g·‖t‖, ‖Fᵀt − g t‖, and how far this last vector has come since the first own column, of every own column and test
 /// vector, columns first.
@@ -124,57 +143,49 @@ pub(super) fn effects(
     let (m, count) = (vectors.first().map_or(0, |v| v[0].len()), vectors.len());
     let groups = count / WIDTH;
     let mut out = vec![[[0.0; WIDTH]; 4]; own.len() * groups];
-    // Fᵀt is F applied to t read backwards, read backwards.
-    let backwards = |x: &[f64]| -> Vec<f64> { x.iter().rev().copied().collect() };
-    // Two spectra of as many bins as there are samples.
-    let batch = (SPECTRA / (32 * m.max(1))).clamp(1, count.max(1));
+    // Every thread has a vector of its own; two spectra of as many bins as there are samples.
+    let threads = rayon::current_num_threads();
+    let batch = (SPECTRA / (32 * m.max(1))).max(threads).min(count.max(1));
+    let block = (SPECTRA / (16 * m.max(1))).max(threads);
     // Of a long record the vectors take more than all else here: drawn again a few at a time they take nothing.
     let mut all = Some(vectors).filter(|_| batch == count);
     let shapes = shapes(count, m);
     for start in (0..count).step_by(batch) {
         let end = (start + batch).min(count);
         let some = all.take().unwrap_or_else(|| drawn(&shapes[start..end], m));
-        let halves: Vec<&Vec<f64>> = some.iter().flatten().collect();
-        let spectra: Vec<Kernel> =
-            halves.into_par_iter().with_max_len(1).map(|half| Kernel::new(&backwards(half))).collect();
-        let kept = || vec![vec![0.0; m]; spectra.len()];
-        let scratch =
-            || Scratch { product: SumOfProducts::new(m), buffers: Buffers::default(), here: kept(), before: kept() };
-        let found: Vec<(usize, usize, [f64; 4])> = runs(own.len(), rayon::current_num_threads())
-            .into_par_iter()
+        let mut held: Vec<Held> = some
+            .par_iter()
+            .enumerate()
             .with_max_len(1)
-            .map_init(scratch, |Scratch { product, buffers, here, before }, run| {
-                let mut found = Vec::new();
-                let mut last: Vec<[f64; 4]> = Vec::new();
-                let from = run.start.saturating_sub(1);
-                for (row, &column) in own.iter().enumerate().take(run.end).skip(from) {
-                    let kernel = Kernel::made_with(bank.kernel(column), buffers);
-                    let length: f64 = bank.kernel(column).iter().map(|v| v.abs()).sum();
-                    let mut now = Vec::with_capacity(some.len());
-                    for (j, vector) in some.iter().enumerate() {
-                        for half in 2 * j..2 * j + 2 {
-                            product.add(1.0, &kernel, &spectra[half]);
-                            product.take(&mut here[half], buffers);
-                        }
-                        let (at, from) = ([&here[2 * j], &here[2 * j + 1]], [&before[2 * j], &before[2 * j + 1]]);
-                        now.push(effect(vector, at, last.get(j).map(|g| (from, *g)), norm, unit * length));
-                        if row >= run.start {
-                            let [g, h, rest, .., step] = now[j];
-                            let size = sizes[start + j];
-                            let beyond = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * size;
-                            found.push((row, start + j, [g * size, h * size, rest + beyond, step]));
-                        }
-                    }
-                    last = now.iter().map(|&[g, h, .., lost, _]| [g, h, lost, 0.0]).collect();
-                    std::mem::swap(here, before);
-                }
-                found
-            })
-            .flatten_iter()
+            .map(|(i, vector)| Held::new(vector, start + i, sizes[start + i]))
             .collect();
-        for (row, j, values) in found {
-            for (half, value) in values.into_iter().enumerate() {
-                out[row * groups + j / WIDTH][half][j % WIDTH] = value;
+        for (first, columns) in own.chunks(block).enumerate().map(|(i, columns)| (i * block, columns)) {
+            let spectra: Vec<(Kernel, f64)> = columns
+                .par_iter()
+                .with_max_len(1)
+                .map_init(Buffers::default, |buffers, &column| {
+                    let length = bank.kernel(column).iter().map(|v| v.abs()).sum();
+                    (Kernel::made_with(bank.kernel(column), buffers), length)
+                })
+                .collect();
+            let found: Vec<(usize, Vec<[f64; 4]>)> = held
+                .par_iter_mut()
+                .with_max_len(1)
+                .map_init(
+                    || (SumOfProducts::new(m), Buffers::default()),
+                    |with, held| {
+                        let rows = spectra.iter().map(|(column, length)| held.on(column, *length, norm, unit, with));
+                        let rows = rows.collect();
+                        (held.which, rows)
+                    },
+                )
+                .collect();
+            for (which, rows) in found {
+                for (row, values) in (first..).zip(rows) {
+                    for (half, value) in values.into_iter().enumerate() {
+                        out[row * groups + which / WIDTH][half][which % WIDTH] = value;
+                    }
+                }
             }
         }
     }
@@ -191,8 +202,8 @@ pub(super) fn effects(
 #[allow(clippy::cast_precision_loss)]
 fn effect(
     [a, b]: &[Vec<f64>; 2],
-    [re, im]: [&Vec<f64>; 2],
-    before: Option<([&Vec<f64>; 2], [f64; 4])>,
+    [re, im]: &[Vec<f64>; 2],
+    before: Option<(&[Vec<f64>; 2], [f64; 4])>,
     norm: Norm,
     rounding: f64,
 ) -> [f64; 5] {
@@ -261,7 +272,7 @@ mod tests {
                     kernel.apply(&signal, &mut out, &mut Buffers::default());
                     out
                 });
-                let [g, h, rest, ..] = effect(vector, [&re, &im], None, Norm::L1, 1e-9 * length);
+                let [g, h, rest, ..] = effect(vector, &[re, im], None, Norm::L1, 1e-9 * length);
                 let alone = [g, h, rest];
                 for (half, value) in alone.into_iter().enumerate() {
                     let there = found[0][row * groups + j / WIDTH][half][j % WIDTH];
@@ -313,16 +324,5 @@ mod tests {
             assert!(closest > 0.999, "neighbours are as far apart as the way between them: {closest}");
         }
         Ok(())
-    }
-
-    #[test]
-    fn every_column_is_of_one_run() {
-        for (own, threads) in [(11, 2), (11, 1), (3, 8), (0, 2), (4, 4), (400, 2)] {
-            let runs = runs(own, threads);
-            let all: Vec<usize> = runs.iter().cloned().flatten().collect();
-            assert_eq!(all, (0..own).collect::<Vec<_>>());
-            assert!(runs.len() <= 4 * threads && runs.iter().all(|run| !run.is_empty()));
-        }
-        assert_eq!(runs(11, 2).len(), 2);
     }
 }
