@@ -9,6 +9,7 @@ use crate::excess::kernel;
 use crate::impulses::is_impulse;
 use crate::kernels::{power_means, power_pulses};
 use crate::series::{self, Buffers, Kernel};
+use crate::stop::Stop;
 
 /// Largest bank that is made for itself, and what a search takes in all where no other limit is given, in bytes.
 pub const BANK_LIMIT: u64 = 2 << 30;
@@ -412,7 +413,7 @@ impl Bank {
         if bytes > limit {
             return Err(Error::BankTooLarge { columns: index.keys.len(), m, bytes, limit });
         }
-        Self::counted(index, record, output)
+        Self::counted(index, record, output, &Stop::default())
     }
 
     /// How many regressors are integrals of this signal.
@@ -423,9 +424,9 @@ impl Bank {
     /// As [`Bank::new`], for who has counted its memory.
     ///
     /// # Errors
-    /// [`Error::Structure`] for a signal that the record does not hold.
+    /// [`Error::Structure`] for a signal that the record does not hold, [`Error::Interrupted`].
     #[allow(clippy::cast_precision_loss)]
-    pub(crate) fn counted(index: &Index, record: &Record, output: usize) -> Result<Self> {
+    pub(crate) fn counted(index: &Index, record: &Record, output: usize, stop: &Stop) -> Result<Self> {
         let m = record.m();
         let strange = |key: &&Key| matches!(key, Key::Integral { signal, .. } if *signal >= record.len());
         if let Some(Key::Integral { signal, .. }) = index.keys.iter().find(strange) {
@@ -460,8 +461,11 @@ impl Bank {
         let spectrum = |(): &mut (), signal: usize| (signal, Kernel::new(record.signal(signal)));
         let spectra: BTreeMap<usize, Kernel> = abreast::map(signals, || (), spectrum).into_iter().collect();
         abreast::map(orders.into_values().collect(), Buffers::default, |buffers, made| {
-            made.write(record, &spectra, buffers);
+            if !stop.is_set() {
+                made.write(record, &spectra, buffers);
+            }
         });
+        stop.check()?;
         abreast::map(
             initial,
             || (),

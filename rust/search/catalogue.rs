@@ -12,6 +12,7 @@ use crate::search::candidate::problem::Problem;
 use crate::search::lattice::cursor::Cursor;
 use crate::search::lattice::independent::Lattice;
 use crate::search::options::Options;
+use crate::stop::Stop;
 
 /// All candidates of a lattice over one equation, and what they share.
 pub(crate) struct Catalogue<'a> {
@@ -32,6 +33,7 @@ impl<'a> Catalogue<'a> {
         fixed: &[Option<f64>],
         options: &Options,
         pool: &rayon::ThreadPool,
+        stop: &Stop,
     ) -> Result<Self> {
         check_length("fixed coefficients", lattice.width(), fixed.len())?;
         for record in records {
@@ -50,8 +52,10 @@ impl<'a> Catalogue<'a> {
         budget.add(records, output, &index, options, Bound::POOL);
         budget.check(options.memory)?;
         let spare = budget.left(options.memory);
-        let problem =
-            pool.install(|| Ok(Problem::new(records, output, index, fixed, options)?.with_bound(lattice.count())))?;
+        let problem = pool.install(|| {
+            Ok(Problem::new(records, output, index, fixed, options, stop)?.with_bound(lattice.count(), stop))
+        })?;
+        stop.check()?;
         let tables = tables(&lattice, &problem)?;
         Ok(Self { problem, lattice, options: options.clone(), spare, tables })
     }

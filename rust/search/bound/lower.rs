@@ -16,6 +16,7 @@ use crate::search::bound::probes::Probes;
 use crate::search::bound::reach::Reach;
 use crate::search::bound::vectors::POOL;
 use crate::search::options::Norm;
+use crate::stop::Stop;
 
 /// What each test vector of the pool proves of an equation's output error at rest: lower bounds of Σ|y − ŷ| or
 /// Σ(y − ŷ)².
@@ -145,7 +146,7 @@ fn pooled(record: &Record, structure: &Structure, norm: Norm) -> Result<(Bound, 
         .collect();
     let bank = Bank::new(&index, record, structure.output)?;
     let target = record.signal(structure.output).to_vec();
-    Ok((Bound::new(&[bank], &[target], norm, true, POOL), positions))
+    Ok((Bound::new((&[bank], &[target]), norm, true, POOL, &Stop::default()), positions))
 }
 
 /// The test vectors of a search, on every record.
@@ -161,9 +162,16 @@ impl Bound {
     /// Makes `count` test vectors (a multiple of [`WIDTH`], at most [`POOL`]) for these records.
     ///
     /// `output_error` tells whether own-output columns act on the divisor; in the equation error D = 1. Runs on the
-    /// current thread pool.
-    pub(crate) fn new(banks: &[Bank], targets: &[Vec<f64>], norm: Norm, output_error: bool, count: usize) -> Self {
-        let probes = banks.iter().zip(targets).map(|(b, y)| Probes::new(b, y, norm, output_error, count)).collect();
+    /// current thread pool; what it comes to once it was told to stop is of no use.
+    pub(crate) fn new(
+        (banks, targets): (&[Bank], &[Vec<f64>]),
+        norm: Norm,
+        output_error: bool,
+        count: usize,
+        stop: &Stop,
+    ) -> Self {
+        let probes =
+            banks.iter().zip(targets).map(|(b, y)| Probes::new(b, y, norm, (output_error, count), stop)).collect();
         Self { norm, probes }
     }
 

@@ -6,6 +6,7 @@ use crate::lanes::WIDTH;
 use crate::regressors::Bank;
 use crate::search::bound::vectors::{effects, vectors, Wide};
 use crate::search::options::Norm;
+use crate::stop::Stop;
 
 /// A column without an effect on the divisor.
 pub(crate) const NONE: usize = usize::MAX;
@@ -37,7 +38,13 @@ const TOGETHER: usize = 4;
 
 impl Probes {
     #[allow(clippy::cast_precision_loss)]
-    pub(super) fn new(bank: &Bank, target: &[f64], norm: Norm, output_error: bool, count: usize) -> Self {
+    pub(super) fn new(
+        bank: &Bank,
+        target: &[f64],
+        norm: Norm,
+        (output_error, count): (bool, usize),
+        stop: &Stop,
+    ) -> Self {
         let m = target.len();
         let groups = count / WIDTH;
         let vectors = vectors(count, m);
@@ -76,7 +83,7 @@ impl Probes {
             || (),
             |(), p| unit * (sum(bank.column(p)) + sum(bank.kernel(p)) * size_of_target),
         );
-        let effects = effects(bank, &own, vectors, &sizes, norm, unit);
+        let effects = effects(bank, &own, vectors, &sizes, (norm, unit), stop);
         let size = (0..groups).map(|g| std::array::from_fn(|n| sizes[g * WIDTH + n])).collect();
         Self {
             groups,

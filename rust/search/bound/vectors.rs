@@ -8,6 +8,7 @@ use crate::lanes::WIDTH;
 use crate::regressors::Bank;
 use crate::search::options::Norm;
 use crate::series::{Buffers, Kernel, SumOfProducts};
+use crate::stop::Stop;
 
 /// One value for each of [`WIDTH`] test vectors.
 pub(super) type Wide = [f64; WIDTH];
@@ -131,14 +132,14 @@ impl<'a> Held<'a> {
 type With = (SumOfProducts, Buffers);
 
 /// g·‖t‖, ‖Fᵀt − g t‖, and how far this last vector has come since the first own column, of every own column and test
-/// vector, columns first.
+/// vector, columns first. What it comes to once it was told to stop is of no use.
 pub(super) fn effects(
     bank: &Bank,
     own: &[usize],
     vectors: Vec<[Vec<f64>; 2]>,
     sizes: &[f64],
-    norm: Norm,
-    unit: f64,
+    (norm, unit): (Norm, f64),
+    stop: &Stop,
 ) -> Vec<[Wide; 4]> {
     let (m, count) = (vectors.first().map_or(0, |v| v[0].len()), vectors.len());
     let groups = count / WIDTH;
@@ -151,6 +152,9 @@ pub(super) fn effects(
     let mut all = Some(vectors).filter(|_| batch == count);
     let shapes = shapes(count, m);
     for start in (0..count).step_by(batch) {
+        if stop.is_set() {
+            break;
+        }
         let end = (start + batch).min(count);
         let some = all.take().unwrap_or_else(|| drawn(&shapes[start..end], m));
         let mut held: Vec<Held> = some
@@ -174,6 +178,9 @@ pub(super) fn effects(
                 .map_init(
                     || (SumOfProducts::new(m), Buffers::default()),
                     |with, held| {
+                        if stop.is_set() {
+                            return (held.which, Vec::new());
+                        }
                         let rows = spectra.iter().map(|(column, length)| held.on(column, *length, norm, unit, with));
                         let rows = rows.collect();
                         (held.which, rows)
@@ -258,7 +265,7 @@ mod tests {
         let found: Vec<Vec<[Wide; 4]>> = [1, 2]
             .iter()
             .filter_map(|&threads| rayon::ThreadPoolBuilder::new().num_threads(threads).build().ok())
-            .map(|pool| pool.install(|| effects(&bank, &own, all.clone(), &sizes, Norm::L1, 1e-9)))
+            .map(|pool| pool.install(|| effects(&bank, &own, all.clone(), &sizes, (Norm::L1, 1e-9), &Stop::default())))
             .collect();
         assert!(found.len() == 2 && found[0] == found[1], "whatever the threads");
         let groups = count / WIDTH;
@@ -284,6 +291,22 @@ mod tests {
     }
 
     #[test]
+    fn who_was_told_to_stop_makes_no_more_columns_and_holds_no_more_vectors() -> crate::error::Result<()> {
+        let m = 64;
+        let record = Record::new(0.1, vec![vec![1.0; m]], None)?;
+        let mut index = Index::default();
+        let own: Vec<usize> = [0.4, 1.1].map(|eta| index.insert(Key::integral(0, eta))).into();
+        let (going, told) = (Stop::default(), Stop::default());
+        told.set();
+        let bank = Bank::counted(&index, &record, 0, &going)?;
+        assert!(matches!(Bank::counted(&index, &record, 0, &told), Err(crate::error::Error::Interrupted)));
+        let found = |stop| effects(&bank, &own, vectors(WIDTH, m), &[1.0; WIDTH], (Norm::L1, 1e-15), stop);
+        assert!(found(&going).iter().flatten().flatten().any(|v| *v != 0.0));
+        assert!(found(&told).iter().flatten().flatten().all(|v| *v == 0.0));
+        Ok(())
+    }
+
+    #[test]
     fn ways_are_no_shorter_than_what_lies_between() -> crate::error::Result<()> {
         let (m, count) = (96, WIDTH);
         let record = Record::new(0.05, vec![(0..m).map(|k| libm::sin(f64::from(k) * 0.3)).collect()], None)?;
@@ -293,7 +316,7 @@ mod tests {
         let bank = Bank::new(&index, &record, 0)?;
         let all = vectors(count, m as usize);
         for norm in [Norm::L1, Norm::L2] {
-            let found = effects(&bank, &own, all.clone(), &[1.0; WIDTH], norm, 1e-15);
+            let found = effects(&bank, &own, all.clone(), &[1.0; WIDTH], (norm, 1e-15), &Stop::default());
             let vector = |row: usize, j: usize| -> Vec<(f64, f64)> {
                 let [g, h] = [0, 1].map(|half: usize| found[row][half][j]);
                 let parts = [0, 1].map(|half: usize| -> Vec<f64> {

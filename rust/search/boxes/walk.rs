@@ -326,8 +326,8 @@ where
     let pool = pool(1)?;
     let options = Options { criterion, norm, ..Options::default() };
     let fixed = vec![None; lattice.width()];
-    let mut catalogue = Catalogue::new(records, Cow::Borrowed(lattice), &fixed, &options, &pool)?;
-    catalogue.problem = pool.install(|| catalogue.problem.with_bound(u64::MAX >> 8));
+    let mut catalogue = Catalogue::new(records, Cow::Borrowed(lattice), &fixed, &options, &pool, &Default::default())?;
+    catalogue.problem = pool.install(|| catalogue.problem.with_bound(u64::MAX >> 8, &Default::default()));
     if criterion == Criterion::OutputError {
         let mut adapted = catalogue.problem.no_adapted().0;
         for made_for in [index, 0, lattice.count() / 2, lattice.count() - 1] {

@@ -7,6 +7,7 @@ use crate::estimate::iv::{low_pass, power_frequency, refine, Scratch, Settings, 
 use crate::regressors::{Bank, Index, Record};
 use crate::search::outcome::Failure;
 use crate::series::Kernel;
+use crate::stop::Stop;
 
 /// Low-pass behind which the first coefficients are estimated, in units of the output's own band.
 const START_BAND: f64 = 2.0;
@@ -93,9 +94,9 @@ impl Refiner {
 ///
 /// # Errors
 /// As [`Bank::counted`].
-pub(crate) fn start_bank(record: &Record, output: usize, index: &Index) -> Result<(Bank, Vec<f64>)> {
+pub(crate) fn start_bank(record: &Record, output: usize, index: &Index, stop: &Stop) -> Result<(Bank, Vec<f64>)> {
     let band = START_BAND * power_frequency(record.signal(output), record.step());
     let smooth = record.cleaned().through(&low_pass(band, record)?)?;
     let target = smooth.signal(output).to_vec();
-    Ok((Bank::counted(index, &smooth, output)?, target))
+    Ok((Bank::counted(index, &smooth, output, stop)?, target))
 }

@@ -19,6 +19,7 @@ use crate::search::candidate::squares::Squares;
 use crate::search::control::Control;
 use crate::search::options::{Criterion, Estimator, Options};
 use crate::search::outcome::{Failure, Row, Verdict};
+use crate::stop::Stop;
 
 /// Transforms that following one candidate is worth; making test vectors must stay below a fraction of all that.
 const TRANSFORMS: u64 = 6;
@@ -166,6 +167,7 @@ impl Problem {
         index: Index,
         fixed: &[Option<f64>],
         options: &Options,
+        stop: &Stop,
     ) -> Result<Self> {
         if records.is_empty() {
             return Err(Error::Length { name: "records".into(), expected: 1, found: 0 });
@@ -180,17 +182,17 @@ impl Problem {
         let width = index.keys().len();
         let refined = options.refines();
         // Noise of a measured output that drives an equation would rank like a fault of the equation.
-        let banks =
-            records
-                .iter()
-                .map(|r| {
-                    if refined {
-                        Bank::counted(&index, &r.cleaned(), output)
-                    } else {
-                        Bank::counted(&index, r, output)
-                    }
-                })
-                .collect::<Result<Vec<_>>>()?;
+        let banks = records
+            .iter()
+            .map(|r| {
+                if refined {
+                    Bank::counted(&index, &r.cleaned(), output, stop)
+                } else {
+                    Bank::counted(&index, r, output, stop)
+                }
+            })
+            .collect::<Result<Vec<_>>>()?;
+        stop.check()?;
         let targets: Vec<Vec<f64>> = records.iter().map(|r| r.signal(output).to_vec()).collect();
         let samples = records.iter().map(Record::m).sum();
         let elements = (width + 1) * (width + 1);
@@ -203,7 +205,7 @@ impl Problem {
         let mut parts = Vec::new();
         for ((bank, target), record) in banks.iter().zip(&targets).zip(records) {
             let mut gram = if refined {
-                let (bank, target) = start_bank(record, output, &index)?;
+                let (bank, target) = start_bank(record, output, &index, stop)?;
                 plain_gram(&bank, &target)
             } else {
                 plain_gram(bank, target)
@@ -223,7 +225,10 @@ impl Problem {
         };
         // D e = w holds for integrals of the output as it was measured.
         let bound_banks = if refined && options.early_stopping && options.criterion == Criterion::OutputError {
-            records.iter().map(|r| Bank::counted(&index, &r.cleaned_but(output), output)).collect::<Result<_>>()?
+            records
+                .iter()
+                .map(|r| Bank::counted(&index, &r.cleaned_but(output), output, stop))
+                .collect::<Result<_>>()?
         } else {
             Vec::new()
         };
@@ -247,7 +252,7 @@ impl Problem {
     }
 
     /// Makes test vectors for about this many candidates, as far as they pay; on the current thread pool.
-    pub(crate) fn with_bound(mut self, candidates: u64) -> Self {
+    pub(crate) fn with_bound(mut self, candidates: u64, stop: &Stop) -> Self {
         let banks = std::mem::take(&mut self.bound_banks);
         let (banks, transforms) = if self.refines() { (&banks, 4 * REFINING) } else { (&self.banks, TRANSFORMS) };
         if self.options.early_stopping && self.squares.is_none() && !banks.is_empty() {
@@ -259,7 +264,8 @@ impl Problem {
             let groups = (candidates.saturating_mul(transforms) / 4 / (each * WIDTH as u64))
                 .min((Bound::POOL / WIDTH) as u64) as usize;
             if groups > 0 {
-                self.bound = Some(Bound::new(banks, &self.targets, self.options.norm, output_error, groups * WIDTH));
+                let data = (&banks[..], &self.targets[..]);
+                self.bound = Some(Bound::new(data, self.options.norm, output_error, groups * WIDTH, stop));
             }
         }
         self

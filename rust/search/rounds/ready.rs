@@ -86,7 +86,7 @@ impl<'a> Search<'a> {
         control: &Control,
     ) -> Result<Self> {
         let count = lattice.count();
-        let mut catalogue = Catalogue::new(records, lattice, fixed, options, pool)?;
+        let mut catalogue = Catalogue::new(records, lattice, fixed, options, pool, &control.stop)?;
         control.total.store(count, Ordering::Relaxed);
         control.check_stop()?;
         let problem = &catalogue.problem;

@@ -161,8 +161,8 @@ impl<'a> Stage<'a> {
         let mut tables = Vec::with_capacity(equations.len());
         for (e, (index, candidates, used)) in indices.into_iter().enumerate() {
             let problem = pool.install(|| {
-                let problem = Problem::new(records, equations[e].output, index, &fixed[e], options)?;
-                Ok(problem.with_bound(used.len() as u64))
+                let problem = Problem::new(records, equations[e].output, index, &fixed[e], options, &control.stop)?;
+                Ok(problem.with_bound(used.len() as u64, &control.stop))
             })?;
             tables.push(Table { problem, candidates, used, scale: scales[e] });
         }
