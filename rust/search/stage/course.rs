@@ -162,7 +162,9 @@ impl<'a> Stage<'a> {
         for (e, (index, candidates, used)) in indices.into_iter().enumerate() {
             let problem = pool.install(|| {
                 let problem = Problem::new(records, equations[e].output, index, &fixed[e], options, &control.stop)?;
-                Ok(problem.with_bound(used.len() as u64, &control.stop))
+                let problem = problem.with_bound(used.len() as u64, &control.stop);
+                control.check_stop()?;
+                Ok(problem)
             })?;
             tables.push(Table { problem, candidates, used, scale: scales[e] });
         }
