@@ -301,6 +301,24 @@ fn naive(problem: &Problem, structure: &Structure) -> Result<(f64, Estimate), Fa
 }
 
 #[test]
+fn a_search_that_is_told_to_stop_does_not_finish_its_set_up() {
+    // Candidates are counted once what they share has been made.
+    let made = |told: bool| {
+        let problem = random_problem(100);
+        let control = Control::default();
+        if told {
+            control.stop.set();
+        }
+        let fixed = vec![None; problem.lattice.width()];
+        let found = search(&problem.records, &problem.lattice, &fixed, &Options::default(), &control);
+        assert_eq!(matches!(found, Err(Error::Interrupted)), told);
+        control.total.load(Ordering::Relaxed)
+    };
+    assert!(made(false) > 0);
+    assert_eq!(made(true), 0);
+}
+
+#[test]
 fn early_stopping_and_threads_change_nothing() {
     let (mut bounded, mut stopped, mut candidates) = (0, 0, 0);
     for seed in 100..140 {

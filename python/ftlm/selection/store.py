@@ -48,6 +48,7 @@ def _plain(value: object) -> object:
         return value.item()
     if isinstance(value, tuple):
         return tuple(value)
+    # What msgspec asks of a hook that knows no better.
     raise NotImplementedError(type(value))
 
 

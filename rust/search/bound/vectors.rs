@@ -91,8 +91,8 @@ pub(super) fn vectors(count: usize, m: usize) -> Vec<[Vec<f64>; 2]> {
 }
 
 /// A test vector that is held against one own column after another.
-struct Held<'a> {
-    vector: &'a [Vec<f64>; 2],
+struct Vector<'a> {
+    halves: &'a [Vec<f64>; 2],
     /// Its number among all.
     which: usize,
     size: f64,
@@ -101,16 +101,16 @@ struct Held<'a> {
     /// Fᵀt of the last column and of the one before it, backwards.
     here: [Vec<f64>; 2],
     before: [Vec<f64>; 2],
-    /// What [`effect`] wants to know of the last column.
-    last: Option<[f64; 4]>,
+    /// g and what rounding may do, of the last column.
+    last: Option<[f64; 3]>,
 }
 
-impl<'a> Held<'a> {
-    fn new(vector: &'a [Vec<f64>; 2], which: usize, size: f64) -> Self {
+impl<'a> Vector<'a> {
+    fn new(halves: &'a [Vec<f64>; 2], which: usize, size: f64) -> Self {
         let backwards = |x: &Vec<f64>| -> Vec<f64> { x.iter().rev().copied().collect() };
-        let spectra = [0, 1].map(|half: usize| Kernel::new(&backwards(&vector[half])));
-        let none = || [0, 1].map(|half: usize| vec![0.0; vector[half].len()]);
-        Self { vector, which, size, spectra, here: none(), before: none(), last: None }
+        let spectra = [0, 1].map(|half: usize| Kernel::new(&backwards(&halves[half])));
+        let none = || [0, 1].map(|half: usize| vec![0.0; halves[half].len()]);
+        Self { halves, which, size, spectra, here: none(), before: none(), last: None }
     }
 
     /// Of the next own column, whose moduli add up to `length`, what [`effects`] gives, but the step in place of the way.
@@ -121,8 +121,8 @@ impl<'a> Held<'a> {
             with.0.take(here, &mut with.1);
         }
         let before = self.last.map(|last| (&self.before, last));
-        let [g, h, rest, lost, step] = effect(self.vector, &self.here, before, norm, unit * length);
-        self.last = Some([g, h, lost, 0.0]);
+        let [g, h, rest, lost, step] = effect(self.halves, &self.here, before, norm, unit * length);
+        self.last = Some([g, h, lost]);
         let beyond = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * self.size;
         [g * self.size, h * self.size, rest + beyond, step]
     }
@@ -157,11 +157,11 @@ pub(super) fn effects(
         }
         let end = (start + batch).min(count);
         let some = all.take().unwrap_or_else(|| drawn(&shapes[start..end], m));
-        let mut held: Vec<Held> = some
+        let mut held: Vec<Vector> = some
             .par_iter()
             .enumerate()
             .with_max_len(1)
-            .map(|(i, vector)| Held::new(vector, start + i, sizes[start + i]))
+            .map(|(i, halves)| Vector::new(halves, start + i, sizes[start + i]))
             .collect();
         for (first, columns) in own.chunks(block).enumerate().map(|(i, columns)| (i * block, columns)) {
             let spectra: Vec<(Kernel, f64)> = columns
@@ -210,7 +210,7 @@ pub(super) fn effects(
 fn effect(
     [a, b]: &[Vec<f64>; 2],
     [re, im]: &[Vec<f64>; 2],
-    before: Option<(&[Vec<f64>; 2], [f64; 4])>,
+    before: Option<(&[Vec<f64>; 2], [f64; 3])>,
     norm: Norm,
     rounding: f64,
 ) -> [f64; 5] {
@@ -234,7 +234,7 @@ fn effect(
         Norm::L2 => (rests.sum::<f64>().sqrt(), count),
     };
     let lost = rounding * count;
-    let step = before.map_or(0.0, |([re, im], [g0, h0, lost0, _])| {
+    let step = before.map_or(0.0, |([re, im], [g0, h0, lost0])| {
         let steps = rows().zip(re.iter().zip(im).rev());
         let steps = steps.map(|((t, (u, v)), (u0, v0))| apart(t, (u - u0, v - v0), g - g0, h - h0));
         let step = match norm {

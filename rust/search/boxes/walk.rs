@@ -19,6 +19,7 @@ use crate::search::options::{Criterion, Estimator, Norm, Options};
 use crate::search::screen::{Open, Screen};
 use crate::search::threads::pool;
 use crate::small;
+use crate::stop::Stop;
 
 /// Fewest candidates of a slab for which its tables pay.
 pub(crate) const LEAST: u64 = 4096;
@@ -326,8 +327,8 @@ where
     let pool = pool(1)?;
     let options = Options { criterion, norm, ..Options::default() };
     let fixed = vec![None; lattice.width()];
-    let mut catalogue = Catalogue::new(records, Cow::Borrowed(lattice), &fixed, &options, &pool, &Default::default())?;
-    catalogue.problem = pool.install(|| catalogue.problem.with_bound(u64::MAX >> 8, &Default::default()));
+    let mut catalogue = Catalogue::new(records, Cow::Borrowed(lattice), &fixed, &options, &pool, &Stop::default())?;
+    catalogue.problem = pool.install(|| catalogue.problem.with_bound(u64::MAX >> 8, &Stop::default()));
     if criterion == Criterion::OutputError {
         let mut adapted = catalogue.problem.no_adapted().0;
         for made_for in [index, 0, lattice.count() / 2, lattice.count() - 1] {

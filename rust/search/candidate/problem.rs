@@ -192,7 +192,6 @@ impl Problem {
                 }
             })
             .collect::<Result<Vec<_>>>()?;
-        stop.check()?;
         let targets: Vec<Vec<f64>> = records.iter().map(|r| r.signal(output).to_vec()).collect();
         let samples = records.iter().map(Record::m).sum();
         let elements = (width + 1) * (width + 1);
