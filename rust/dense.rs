@@ -3,6 +3,7 @@
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatRef, Par};
 
+use crate::stop::Stop;
 use crate::{abreast, orthogonal};
 
 /// Rows over which one product of long columns is summed, at least, and into how many such parts their rows are cut at
@@ -30,12 +31,13 @@ pub fn multiply(left: &[f64], right: &[f64], a: usize, b: usize, c: usize) -> Ve
 }
 
 /// Gram matrix of columns that lie one behind another, and of a target as the last one: row-major, exactly symmetric.
-/// O(k²m), on the threads of the pool at hand; the columns are read where they lie.
+/// O(k²m), on the threads of the pool at hand; the columns are read where they lie. What it comes to once it was told to
+/// stop is of no use.
 ///
 /// # Panics
 /// Where the columns are not as long as the target.
 #[must_use]
-pub fn gram(columns: &[f64], target: &[f64]) -> Vec<f64> {
+pub fn gram(columns: &[f64], target: &[f64], stop: &Stop) -> Vec<f64> {
     let m = target.len();
     let k = columns.len() / m.max(1);
     let x = MatRef::from_column_major_slice(columns, m, k);
@@ -52,7 +54,9 @@ pub fn gram(columns: &[f64], target: &[f64]) -> Vec<f64> {
         |(), ((a, b), (from, len))| {
             let (left, right) = (tiles[a].1.subrows(from, len), tiles[b].1.subrows(from, len));
             let mut product = Mat::<f64>::zeros(left.ncols(), right.ncols());
-            matmul(product.as_mut(), Accum::Replace, left.transpose(), right, 1.0, Par::Seq);
+            if !stop.is_set() {
+                matmul(product.as_mut(), Accum::Replace, left.transpose(), right, 1.0, Par::Seq);
+            }
             (tiles[a].0, tiles[b].0, product)
         },
     );
@@ -135,16 +139,16 @@ pub fn singular(columns: &[Vec<f64>]) -> Option<Singular> {
 }
 
 /// Inner products of every left with every right column (all of one length), row-major left × right. O(left·right·m), on
-/// the threads of the pool at hand.
+/// the threads of the pool at hand. What they come to once it was told to stop is of no use.
 #[must_use]
-pub fn inner_products(left: &[&[f64]], right: &[&[f64]]) -> Vec<f64> {
+pub fn inner_products(left: &[&[f64]], right: &[&[f64]], stop: &Stop) -> Vec<f64> {
     let m = left.first().map_or(0, |c| c.len());
     let made = abreast::map(
         pieces(m),
         || (),
         |(), (from, len)| {
             let mut product = Mat::<f64>::zeros(right.len(), left.len());
-            for first in (from..from + len).step_by(LAID_OUT) {
+            for first in (from..from + len).step_by(LAID_OUT).take_while(|_| !stop.is_set()) {
                 let rows = LAID_OUT.min(from + len - first);
                 let x = Mat::from_fn(rows, left.len(), |i, j| left[j][first + i]);
                 let y = Mat::from_fn(rows, right.len(), |i, j| right[j][first + i]);

@@ -135,10 +135,7 @@ pub fn instrumental_variables(
         let at_rest = initial == Initial::Rest;
         let measured = measured
             .into_iter()
-            .map(|r| {
-                stop.check()?;
-                instruments::with_projections(r, &inputs, at_rest)
-            })
+            .map(|r| instruments::with_projections(r, &inputs, at_rest, stop))
             .collect::<Result<Vec<_>, _>>()?;
         instruments::fit(&measured, &structures, &fixed, &initial, settings)
     })?;

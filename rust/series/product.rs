@@ -82,13 +82,26 @@ impl Kernel {
         Self::planned(fft::plan(fft::fast_length(2 * series.len())), series, buffers)
     }
 
-    fn planned(plan: Plan, series: &[f64], Buffers { time, workspace, .. }: &mut Buffers) -> Self {
-        let mut spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
-        time.clear();
-        time.extend_from_slice(series);
-        time.resize(plan.len(), 0.0);
-        plan.forward(time, &mut spectrum, workspace);
+    fn planned(plan: Plan, series: &[f64], buffers: &mut Buffers) -> Self {
+        let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
+        let mut made = Self { plan, spectrum };
+        made.read(series.iter().copied(), buffers);
+        made
+    }
+
+    /// That of a series of `m` noughts.
+    pub(crate) fn noughts(m: usize) -> Self {
+        let plan = fft::plan(fft::fast_length(2 * m));
+        let spectrum = vec![Bin::new(0.0, 0.0); plan.bins()];
         Self { plan, spectrum }
+    }
+
+    /// Becomes that of another series of the same length, in the memory that it has.
+    pub(crate) fn read(&mut self, series: impl Iterator<Item = f64>, Buffers { time, workspace, .. }: &mut Buffers) {
+        time.clear();
+        time.extend(series);
+        time.resize(self.plan.len(), 0.0);
+        self.plan.forward(time, &mut self.spectrum, workspace);
     }
 
     /// The first `out.len()` terms of the product with `signal`; neither longer than the length cached for.

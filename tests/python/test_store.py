@@ -701,6 +701,27 @@ def test_a_store_of_another_algorithm_is_read_where_it_is_finished_and_refused_w
     assert half.read_bytes() == whole[:kept]
 
 
+def test_only_what_another_algorithm_does_otherwise_is_refused_half_done(run, tmp_path, monkeypatch):
+    """Algorithm 5 ranks free runs otherwise than 4, and squared equation errors of a small lattice as all before it."""
+    free, squares = {"early_stopping": True}, {"early_stopping": True, "criterion": "equation-error", "norm": "l2"}
+    for name, options in {"free": free, "squares": squares}.items():
+        finished, half = tmp_path / f"{name}.ftlm", tmp_path / f"half-{name}.ftlm"
+        expected = bytes_of(search(run, finished, **options))
+        held = read_store(finished)
+        with monkeypatch.context() as patch:
+            patch.setattr("ftlm.search.frames.ALGORITHM", 4)
+            Store(half, held.requests).close()
+        if name == "free":
+            begun = half.read_bytes()
+            with pytest.raises(ftlm.DataError, match=r"rounds follow algorithm 4; this version's is 5: finish the"):
+                search(run, half, **options)
+            assert half.read_bytes() == begun
+        else:
+            assert bytes_of(search(run, half, **options)) == expected
+            assert read_store(half).algorithm == 4
+            assert ftlm.search_status(half)["y"].complete
+
+
 def test_a_second_writer_is_refused_and_readers_are_not(run, whole, expected, tmp_path):
     path = tmp_path / "s.ftlm"
     path.write_bytes(whole)

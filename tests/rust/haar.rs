@@ -3,6 +3,7 @@
 use ftlm::error::Error;
 use ftlm::kernels::block_pulse_kernel;
 use ftlm::search::threads::pool;
+use ftlm::stop::Stop;
 use ftlm::{dense, haar, operational, series};
 use proptest::prelude::*;
 
@@ -155,11 +156,14 @@ fn gram_matrices_and_triangular_factors() {
         let columns: Vec<Vec<f64>> = (0..k).map(|_| random.signal(m)).collect();
         let borrowed: Vec<&[f64]> = columns.iter().map(Vec::as_slice).collect();
         let (target, others) = columns.split_last().unwrap();
-        let gram = dense::gram(&others.concat(), target);
+        let gram = dense::gram(&others.concat(), target, &Stop::default());
         let three = pool(3).unwrap();
-        assert_eq!(three.install(|| dense::gram(&others.concat(), target)), gram);
-        let products = dense::inner_products(&borrowed, &borrowed[..2.min(k)]);
-        assert_eq!(three.install(|| dense::inner_products(&borrowed, &borrowed[..2.min(k)])), products);
+        assert_eq!(three.install(|| dense::gram(&others.concat(), target, &Stop::default())), gram);
+        let products = dense::inner_products(&borrowed, &borrowed[..2.min(k)], &Stop::default());
+        assert_eq!(
+            three.install(|| dense::inner_products(&borrowed, &borrowed[..2.min(k)], &Stop::default())),
+            products
+        );
         let r = dense::triangular_factor(&columns);
         for i in 0..k {
             for j in 0..k {

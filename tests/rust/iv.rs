@@ -13,6 +13,7 @@ use ftlm::search::lattice::{Lattice, TermAxis};
 use ftlm::search::options::{Criterion, Estimator, Norm, Options};
 use ftlm::search::rounds::search;
 use ftlm::series::{divide_naive, multiply_naive, Kernel};
+use ftlm::stop::Stop;
 use ftlm::{simulate, small};
 
 use crate::common::{
@@ -230,9 +231,14 @@ fn refining_one_equation_alone_ends_where_the_whole_does() {
     };
     let settings = Settings { iterations: 40, tolerance: 1e-9 };
     let start = [-2.0, -30.0, 3.0, 0.5];
-    let (found, made, still) = refine(&[source], &FREE, &[], &start, settings, &mut Scratch::default()).unwrap();
+    let (found, made, still) =
+        refine(std::slice::from_ref(&source), &FREE, &[], &start, settings, &mut Scratch::default()).unwrap();
     assert!(still && made < 40);
     check("one equation refined", relative_distance(&found, &whole), 1e-6);
+    let stop = Stop::default();
+    stop.set();
+    let told = refine(&[source], &FREE, &[], &start, settings, &mut Scratch::until(&stop));
+    assert!(matches!(told, Err(Error::Interrupted)), "{told:?}");
 }
 
 #[test]

@@ -7,6 +7,7 @@ use crate::kernels::block_pulse_kernel;
 use crate::orthogonal::extend_orthonormal;
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
+use crate::stop::Stop;
 
 /// Resonators of [`project`] a decade and input, and their damping ratio: broad enough to leave no gap between them.
 const RESONATORS: usize = 8;
@@ -18,12 +19,20 @@ const SPANNED: f64 = 1e-9;
 /// A record with clean substitutes ([`project`]) for all signals that are no inputs; inputs stand for themselves.
 ///
 /// # Errors
-/// As [`project`].
-pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool) -> Result<Record> {
+/// As [`project`], [`Error::Interrupted`].
+pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &Stop) -> Result<Record> {
     let known: Vec<usize> = (0..record.len()).filter(|&s| inputs.get(s).copied().unwrap_or(false)).collect();
-    let clean = (0..record.len())
-        .map(|s| if known.contains(&s) { Ok(record.signal(s).to_vec()) } else { project(&record, s, &known, at_rest) })
-        .collect::<Result<Vec<_>>>()?;
+    // One basis for all signals; none where all are inputs.
+    let basis = if known.len() < record.len() { excited(&record, &known, at_rest, stop)? } else { Vec::new() };
+    let clean = (0..record.len()).map(|s| {
+        let signal = record.signal(s);
+        if known.contains(&s) {
+            signal.to_vec()
+        } else {
+            along(&basis, signal)
+        }
+    });
+    let clean = clean.collect();
     record.with_clean(clean)
 }
 
@@ -35,8 +44,23 @@ pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool) -> Resul
 ///
 /// # Errors
 /// No input, a record of fewer than 8 pulses.
-#[allow(clippy::cast_precision_loss)]
 pub fn project(record: &Record, signal: usize, inputs: &[usize], at_rest: bool) -> Result<Vec<f64>> {
+    Ok(along(&excited(record, inputs, at_rest, &Stop::default())?, record.signal(signal)))
+}
+
+/// The sum of a signal's parts along orthonormal directions.
+fn along(basis: &[Vec<f64>], signal: &[f64]) -> Vec<f64> {
+    let mut out = vec![0.0; signal.len()];
+    for direction in basis {
+        let along = dot(direction, signal);
+        out.iter_mut().zip(direction).for_each(|(o, v)| *o += along * v);
+    }
+    out
+}
+
+/// An orthonormal basis of what the inputs excite.
+#[allow(clippy::cast_precision_loss)]
+fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Result<Vec<Vec<f64>>> {
     let (m, h) = (record.m(), record.step());
     if m < 8 || inputs.is_empty() {
         return Err(Error::Structure {
@@ -68,19 +92,15 @@ pub fn project(record: &Record, signal: usize, inputs: &[usize], at_rest: bool) 
             let denominator = vec![(1.0, 2.0), (2.0 * RESONATOR_DAMPING * omega, 1.0), (omega * omega, 0.0)];
             for numerator in [(omega * omega, 0.0), (omega, 1.0)] {
                 let filter = Filter { numerator: vec![numerator], denominator: denominator.clone() };
+                stop.check()?;
                 columns.push(through(&filter.series(m, h)?));
             }
         }
     }
-    let target = record.signal(signal);
     let mut basis = Vec::with_capacity(columns.len());
     for column in columns {
+        stop.check()?;
         extend_orthonormal(&mut basis, column, SPANNED);
     }
-    let mut out = vec![0.0; m];
-    for direction in &basis {
-        let along = dot(direction, target);
-        out.iter_mut().zip(direction).for_each(|(o, v)| *o += along * v);
-    }
-    Ok(out)
+    Ok(basis)
 }

@@ -11,6 +11,7 @@ use crate::excess;
 use crate::regressors::Record;
 use crate::series::{multiply, Buffers, Kernel, SumOfProducts};
 use crate::small::Scaled;
+use crate::stop::Stop;
 
 /// What a step reads of one record for one equation: spectra good for products of two series of m terms.
 pub struct Source<'a> {
@@ -113,6 +114,15 @@ pub(super) fn divisor(source: &Source<'_>, coefficients: &[f64]) -> Vec<f64> {
 #[derive(Default)]
 pub struct Scratch {
     buffers: Buffers,
+    stop: Stop,
+}
+
+impl Scratch {
+    /// Of steps that end with [`Interrupted`](crate::error::Error::Interrupted) once they are told to stop.
+    #[must_use]
+    pub fn until(stop: &Stop) -> Self {
+        Self { buffers: Buffers::default(), stop: stop.clone() }
+    }
 }
 
 /// One step for one equation: new coefficients from filters 1/D̂ and simulated outputs, one of each a record.
@@ -121,7 +131,8 @@ pub struct Scratch {
 /// covariance of the free coefficients.
 ///
 /// # Errors
-/// [`Singular`](crate::error::Error::Singular) where the instruments do not tell the regressors apart.
+/// [`Singular`](crate::error::Error::Singular) where the instruments do not tell the regressors apart,
+/// [`Interrupted`](crate::error::Error::Interrupted) once the scratch's stop is set.
 #[allow(clippy::cast_precision_loss)]
 pub fn step(
     sources: &[Source<'_>],
@@ -143,27 +154,27 @@ pub fn step(
     for (r, source) in sources.iter().enumerate() {
         let m = source.output.len();
         let filter = &filters[r];
-        let mut target = product(filter, source.target, m, scratch);
+        let mut target = product(filter, source.target, m, scratch)?;
         let mut phi: Vec<Vec<f64>> = Vec::with_capacity(k);
         for (j, value) in fixed.iter().enumerate() {
-            let column = product(filter, source.measured[j], m, scratch);
+            let column = product(filter, source.measured[j], m, scratch)?;
             match value {
                 Some(c) => target.iter_mut().zip(&column).for_each(|(t, v)| *t -= c * v),
                 None => phi.push(column),
             }
         }
-        let simulated = Kernel::new(&product(filter, &Kernel::new(&responses[r]), m, scratch));
+        let simulated = Kernel::new(&product(filter, &Kernel::new(&responses[r]), m, scratch)?);
         let mut psi: Vec<Vec<f64>> = Vec::with_capacity(k);
         for (place, &j) in free.iter().enumerate() {
             psi.push(match source.own[j] {
                 None if std::ptr::eq(source.clean[j], source.measured[j]) => phi[place].clone(),
-                None => product(filter, source.clean[j], m, scratch),
-                Some((_, spectrum)) => product(&simulated, spectrum, m, scratch),
+                None => product(filter, source.clean[j], m, scratch)?,
+                Some((_, spectrum)) => product(&simulated, spectrum, m, scratch)?,
             });
         }
         let mut places: Vec<usize> = (0..free.len()).collect();
         for (place, &(_, i)) in kept.iter().enumerate().filter(|&(_, &(record, _))| record == r) {
-            let column = product(filter, source.initial[i], m, scratch);
+            let column = product(filter, source.initial[i], m, scratch)?;
             psi.push(column.clone());
             phi.push(column);
             places.push(free.len() + place);
@@ -232,10 +243,11 @@ impl Filtered {
 }
 
 /// First m terms of a product of two cached series.
-fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Vec<f64> {
+fn product(a: &Kernel, b: &Kernel, m: usize, scratch: &mut Scratch) -> Result<Vec<f64>> {
+    scratch.stop.check()?;
     let mut out = vec![0.0; m];
     a.times(b, &mut out, &mut scratch.buffers);
-    out
+    Ok(out)
 }
 
 /// One equation refined from a start, its output simulated from the clean signals of its sources.
@@ -259,6 +271,7 @@ pub fn refine(
         let mut responses = Vec::with_capacity(sources.len());
         for (r, source) in sources.iter().enumerate() {
             let m = source.output.len();
+            scratch.stop.check()?;
             let (filter, _) = damped_inverse(&divisor(source, &solution))?;
             let mut sum = SumOfProducts::new(m);
             let spectrum = Kernel::new(&filter);

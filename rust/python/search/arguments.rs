@@ -10,7 +10,7 @@ use crate::error::Error;
 use crate::estimate::iv::{with_projections, Settings};
 use crate::estimate::multi_innovation::{Innovation, Rows};
 use crate::regressors::Record;
-use crate::search::control::{another, Checkpoint, Place};
+use crate::search::control::{another, Checkpoint, Control, Place};
 use crate::search::lattice::independent::{Lattice, TermAxis};
 use crate::search::lattice::law::{LawEquation, LawLattice};
 use crate::search::options::{Criterion, Estimator, Norm, Options};
@@ -101,13 +101,13 @@ impl<F> Given<F> {
     }
 
     /// Records, with the clean signals that the estimator asks for.
-    pub fn records(&mut self) -> Result<Vec<Record>, Error> {
+    pub fn records(&mut self, control: &Control) -> Result<Vec<Record>, Error> {
         let records = std::mem::take(&mut self.records);
         if !matches!(self.options.estimator, Estimator::InstrumentalVariables(_)) {
             return Ok(records);
         }
         let at_rest = self.options.initial == Initial::Rest;
-        records.into_iter().map(|r| with_projections(r, &self.inputs, at_rest)).collect()
+        records.into_iter().map(|r| with_projections(r, &self.inputs, at_rest, &control.stop)).collect()
     }
 }
 

@@ -39,7 +39,7 @@ pub fn search<'py>(
     let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
     let found = watched(py, progress.as_ref(), |control| {
         let lattice = orders.lattice(&given.inputs)?;
-        let records = given.records()?;
+        let records = given.records(control)?;
         Ok(Found::new(&lattice, rounds::search(&records, &lattice, &given.fixed, &given.options, control)?))
     })?;
     found.dict(py)
@@ -165,7 +165,7 @@ impl OrderSearch {
         let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
         let ready = watched(py, None, |control| {
             let lattice = orders.lattice(&given.inputs)?;
-            let records = given.records()?;
+            let records = given.records(control)?;
             let pool = pool(given.options.threads)?;
             rounds::Search::new(&records, Cow::Owned(lattice), &given.fixed, &given.options, &pool, control)
         })?;

@@ -35,7 +35,7 @@ pub fn search_stage<'py>(
     let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
     let found = watched(py, progress.as_ref(), |control| {
         let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
-        let records = given.records()?;
+        let records = given.records(control)?;
         let outcome = stage::search(&records, &lattice, &given.fixed, &scales, &given.options, control)?;
         Ok(Found::new(&lattice, outcome))
     })?;
@@ -121,7 +121,7 @@ impl StageSearch {
         let mut given = Given::new(&runs, inputs, fixed, terms, settings)?;
         let (stage, course) = watched(py, None, |control| {
             let lattice = law_lattice(&axes, laws, &given.inputs, &given.fixed)?;
-            let records = given.records()?;
+            let records = given.records(control)?;
             let pool = pool(given.options.threads)?;
             Stage::new(&records, Cow::Owned(lattice), &given.fixed, &scales, &given.options, &pool, control)
         })?;

@@ -13,6 +13,7 @@ use crate::search::bound::losses::Losses;
 use crate::search::bound::probes::NONE;
 use crate::search::options::Norm;
 use crate::series::{divide, Buffers, Kernel};
+use crate::stop::Stop;
 
 /// Values that are summed before a look at the limit.
 const STRETCH: usize = 8 * WIDTH;
@@ -126,7 +127,7 @@ impl Adapted {
         for ((bank, y), t) in banks.iter().zip(targets).zip(&vectors) {
             let mut columns: Vec<&[f64]> = (0..bank.len()).map(|p| bank.column(p)).collect();
             columns.push(y);
-            let inner = dense::inner_products(&columns, &[t]);
+            let inner = dense::inner_products(&columns, &[t], &Stop::default());
             products.iter_mut().zip(&inner).for_each(|(sum, x)| *sum += x);
             target += inner[bank.len()];
         }

@@ -47,7 +47,7 @@ impl Probes {
     ) -> Self {
         let m = target.len();
         let groups = count / WIDTH;
-        let vectors = vectors(count, m);
+        let vectors = vectors(count, m, stop);
         let dual = |parts: &[&[f64]; 2]| -> f64 {
             let squares = parts[0].iter().zip(parts[1]).map(|(a, b)| a * a + b * b);
             match norm {
@@ -60,7 +60,7 @@ impl Probes {
         let mut columns: Vec<&[f64]> = (0..bank.len()).map(|p| bank.column(p)).collect();
         columns.push(target);
         let flat: Vec<&[f64]> = vectors.iter().flatten().map(Vec::as_slice).collect();
-        let (inner, halves) = (dense::inner_products(&columns, &flat), flat.len());
+        let (inner, halves) = (dense::inner_products(&columns, &flat, stop), flat.len());
         let gathered = |p: usize| -> Vec<[Wide; 2]> {
             (0..groups)
                 .map(|g| {

@@ -15,6 +15,7 @@ use crate::lanes::WIDTH;
 use crate::regressors::{Bank, Index, Key, Record};
 use crate::search::bound::losses::modulus;
 use crate::search::options::Norm;
+use crate::stop::Stop;
 
 /// Decay rates of the paths, per record: a path bounds the half disc of three times its rate to the right of it. Growth
 /// that a record does not show makes no free run large; faster growth than the last is stopped early by any run.
@@ -134,7 +135,7 @@ fn path(rate: f64, series: &[&[f64]], moduli: &[&[f64]], unit: f64) -> (Vec<[[f6
         for (of, by, sums) in [(series, &powers, &mut seen), (moduli, &allowed, &mut slack)] {
             let of: Vec<&[f64]> = of.iter().map(|x| &x[lo..lo + shares.len()]).collect();
             let by: Vec<&[f64]> = by.iter().map(Vec::as_slice).collect();
-            sums.iter_mut().zip(dense::inner_products(&of, &by)).for_each(|(sum, x)| *sum += x);
+            sums.iter_mut().zip(dense::inner_products(&of, &by, &Stop::default())).for_each(|(sum, x)| *sum += x);
         }
     }
     let row = |p: usize| {

@@ -7,7 +7,7 @@ use rayon::prelude::*;
 use crate::lanes::WIDTH;
 use crate::regressors::Bank;
 use crate::search::options::Norm;
-use crate::series::{Buffers, Kernel, SumOfProducts};
+use crate::series::{Buffers, Kernel};
 use crate::stop::Stop;
 
 /// One value for each of [`WIDTH`] test vectors.
@@ -16,8 +16,9 @@ pub(super) type Wide = [f64; WIDTH];
 /// Lowest frequency of a test vector, in cycles a record.
 const LOWEST: f64 = 0.3;
 
-/// Spectra of test vectors held at a time, in bytes.
+/// Spectra of test vectors, and of columns, held at a time, in bytes.
 const SPECTRA: usize = 64 << 20;
+const COLUMNS: usize = 192 << 20;
 
 /// How a test vector fades; it must not stop dead, which its integrals would all feel.
 #[derive(Debug, Clone, Copy)]
@@ -66,33 +67,36 @@ fn shapes(count: usize, m: usize) -> Vec<Shape> {
         .collect()
 }
 
-/// Real and imaginary parts of each.
+/// Writes a test vector's real and imaginary parts.
 #[allow(clippy::cast_precision_loss)]
-fn drawn(shapes: &[Shape], m: usize) -> Vec<[Vec<f64>; 2]> {
-    shapes
+fn draw((window, cycles): Shape, halves: &mut [Vec<f64>; 2]) {
+    let m = halves[0].len();
+    let [re, im] = halves;
+    for (k, (re, im)) in re.iter_mut().zip(im).enumerate() {
+        let x = (k as f64 + 0.5) / m as f64;
+        let (sin, cos) = libm::sincos(-std::f64::consts::TAU * cycles * x);
+        let size = window.at(x);
+        (*re, *im) = (size * cos, size * sin);
+    }
+}
+
+/// The first `count` test vectors, real and imaginary parts. What it comes to once it was told to stop is of no use.
+pub(super) fn vectors(count: usize, m: usize, stop: &Stop) -> Vec<[Vec<f64>; 2]> {
+    shapes(count, m)
         .par_iter()
-        .map(|&(window, cycles)| {
-            (0..m)
-                .map(|k| {
-                    let x = (k as f64 + 0.5) / m as f64;
-                    let (sin, cos) = libm::sincos(-std::f64::consts::TAU * cycles * x);
-                    let size = window.at(x);
-                    (size * cos, size * sin)
-                })
-                .unzip()
+        .map(|&shape| {
+            let mut halves = [0, 1].map(|_| vec![0.0; m]);
+            if !stop.is_set() {
+                draw(shape, &mut halves);
+            }
+            halves
         })
-        .map(|(re, im)| [re, im])
         .collect()
 }
 
-/// The first `count` test vectors, real and imaginary parts.
-pub(super) fn vectors(count: usize, m: usize) -> Vec<[Vec<f64>; 2]> {
-    drawn(&shapes(count, m), m)
-}
-
 /// A test vector that is held against one own column after another.
-struct Vector<'a> {
-    halves: &'a [Vec<f64>; 2],
+struct Vector {
+    halves: [Vec<f64>; 2],
     /// Its number among all.
     which: usize,
     size: f64,
@@ -105,31 +109,35 @@ struct Vector<'a> {
     last: Option<[f64; 3]>,
 }
 
-impl<'a> Vector<'a> {
-    fn new(halves: &'a [Vec<f64>; 2], which: usize, size: f64) -> Self {
-        let backwards = |x: &Vec<f64>| -> Vec<f64> { x.iter().rev().copied().collect() };
-        let spectra = [0, 1].map(|half: usize| Kernel::new(&backwards(&halves[half])));
-        let none = || [0, 1].map(|half: usize| vec![0.0; halves[half].len()]);
-        Self { halves, which, size, spectra, here: none(), before: none(), last: None }
+impl Vector {
+    /// None yet: memory for one of so many samples.
+    fn none(m: usize) -> Self {
+        let none = || [0, 1].map(|_| vec![0.0; m]);
+        let spectra = [0, 1].map(|_| Kernel::noughts(m));
+        Self { halves: none(), which: 0, size: 0.0, spectra, here: none(), before: none(), last: None }
+    }
+
+    /// Turns to the test vector in its halves.
+    fn turn(&mut self, which: usize, size: f64, buffers: &mut Buffers) {
+        for (spectrum, half) in self.spectra.iter_mut().zip(&self.halves) {
+            spectrum.read(half.iter().rev().copied(), buffers);
+        }
+        (self.which, self.size, self.last) = (which, size, None);
     }
 
     /// Of the next own column, whose moduli add up to `length`, what [`effects`] gives, but the step in place of the way.
-    fn on(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, with: &mut With) -> [f64; 4] {
+    fn on(&mut self, column: &Kernel, length: f64, norm: Norm, unit: f64, buffers: &mut Buffers) -> [f64; 4] {
         std::mem::swap(&mut self.here, &mut self.before);
         for (spectrum, here) in self.spectra.iter().zip(&mut self.here) {
-            with.0.add(1.0, column, spectrum);
-            with.0.take(here, &mut with.1);
+            column.times(spectrum, here, buffers);
         }
         let before = self.last.map(|last| (&self.before, last));
-        let [g, h, rest, lost, step] = effect(self.halves, &self.here, before, norm, unit * length);
+        let [g, h, rest, lost, step] = effect(&self.halves, &self.here, before, norm, unit * length);
         self.last = Some([g, h, lost]);
         let beyond = 16.0 * f64::EPSILON * (g.abs() + h.abs()) * self.size;
         [g * self.size, h * self.size, rest + beyond, step]
     }
 }
-
-/// What a thread multiplies spectra with.
-type With = (SumOfProducts, Buffers);
 
 /// g·‖t‖, ‖Fᵀt − g t‖, and how far this last vector has come since the first own column, of every own column and test
 /// vector, columns first. What it comes to once it was told to stop is of no use.
@@ -147,45 +155,50 @@ pub(super) fn effects(
     // Every thread has a vector of its own; two spectra of as many bins as there are samples.
     let threads = rayon::current_num_threads();
     let batch = (SPECTRA / (32 * m.max(1))).max(threads).min(count.max(1));
-    let block = (SPECTRA / (16 * m.max(1))).max(threads);
+    // As many blocks of columns as must be, of one size as nearly as can be.
+    let block = own.len().div_ceil(own.len().div_ceil((COLUMNS / (16 * m.max(1))).max(threads)).max(1)).max(1);
+    let kernels = |columns: &[usize]| -> Vec<(Kernel, f64)> {
+        let kernel = |buffers: &mut Buffers, &column: &usize| {
+            let length = bank.kernel(column).iter().map(|v| v.abs()).sum();
+            (Kernel::made_with(bank.kernel(column), buffers), length)
+        };
+        columns.par_iter().with_max_len(1).map_init(Buffers::default, kernel).collect()
+    };
     // Of a long record the vectors take more than all else here: drawn again a few at a time they take nothing.
     let mut all = Some(vectors).filter(|_| batch == count);
     let shapes = shapes(count, m);
+    let mut held: Vec<Vector> = (0..batch).map(|_| Vector::none(m)).collect();
+    let mut spectra = Vec::new();
     for start in (0..count).step_by(batch) {
-        if stop.is_set() {
-            break;
-        }
-        let end = (start + batch).min(count);
-        let some = all.take().unwrap_or_else(|| drawn(&shapes[start..end], m));
-        let mut held: Vec<Vector> = some
-            .par_iter()
-            .enumerate()
-            .with_max_len(1)
-            .map(|(i, halves)| Vector::new(halves, start + i, sizes[start + i]))
-            .collect();
+        held.truncate(count - start);
+        let drawn = all.take();
+        held.par_iter_mut().with_max_len(1).enumerate().for_each_init(Buffers::default, |buffers, (i, vector)| {
+            if stop.is_set() {
+                return;
+            }
+            match &drawn {
+                Some(all) => vector.halves.clone_from(&all[i]),
+                None => draw(shapes[start + i], &mut vector.halves),
+            }
+            vector.turn(start + i, sizes[start + i], buffers);
+        });
         for (first, columns) in own.chunks(block).enumerate().map(|(i, columns)| (i * block, columns)) {
-            let spectra: Vec<(Kernel, f64)> = columns
-                .par_iter()
-                .with_max_len(1)
-                .map_init(Buffers::default, |buffers, &column| {
-                    let length = bank.kernel(column).iter().map(|v| v.abs()).sum();
-                    (Kernel::made_with(bank.kernel(column), buffers), length)
-                })
-                .collect();
+            if stop.is_set() {
+                return out;
+            }
+            if block < own.len() || start == 0 {
+                spectra.clear();
+                spectra.extend(kernels(columns));
+            }
             let found: Vec<(usize, Vec<[f64; 4]>)> = held
                 .par_iter_mut()
                 .with_max_len(1)
-                .map_init(
-                    || (SumOfProducts::new(m), Buffers::default()),
-                    |with, held| {
-                        if stop.is_set() {
-                            return (held.which, Vec::new());
-                        }
-                        let rows = spectra.iter().map(|(column, length)| held.on(column, *length, norm, unit, with));
-                        let rows = rows.collect();
-                        (held.which, rows)
-                    },
-                )
+                .map_init(Buffers::default, |buffers, vector| {
+                    let columns = spectra.iter().take_while(|_| !stop.is_set());
+                    let rows = columns.map(|(column, length)| vector.on(column, *length, norm, unit, buffers));
+                    let rows = rows.collect();
+                    (vector.which, rows)
+                })
                 .collect();
             for (which, rows) in found {
                 for (row, values) in (first..).zip(rows) {
@@ -228,22 +241,27 @@ fn effect(
         p * p + q * q
     };
     let count = (a.len() as f64).sqrt();
-    let rests = rows().map(|(t, (u, v))| apart(t, (*u, *v), g, h));
-    let (rest, count) = match norm {
-        Norm::L1 => (rests.fold(0.0, f64::max).sqrt(), 1.0),
-        Norm::L2 => (rests.sum::<f64>().sqrt(), count),
+    // Both in one reading: a long record is not in any cache.
+    let add = |sum: f64, x: f64| match norm {
+        Norm::L1 => sum.max(x),
+        Norm::L2 => sum + x,
     };
-    let lost = rounding * count;
-    let step = before.map_or(0.0, |([re, im], [g0, h0, lost0])| {
-        let steps = rows().zip(re.iter().zip(im).rev());
-        let steps = steps.map(|((t, (u, v)), (u0, v0))| apart(t, (u - u0, v - v0), g - g0, h - h0));
-        let step = match norm {
-            Norm::L1 => steps.fold(0.0, f64::max).sqrt(),
-            Norm::L2 => steps.sum::<f64>().sqrt(),
-        };
-        step + lost + lost0
-    });
-    [g, h, rest + lost, lost, step]
+    let lost = match norm {
+        Norm::L1 => rounding,
+        Norm::L2 => rounding * count,
+    };
+    let rest = |t, (u, v): (&f64, &f64)| apart(t, (*u, *v), g, h);
+    let (rest, step) = match before {
+        None => (rows().fold(0.0, |sum, (t, u)| add(sum, rest(t, u))), 0.0),
+        Some(([re, im], [g0, h0, lost0])) => {
+            let (rest, step) = rows().zip(re.iter().zip(im).rev()).fold((0.0, 0.0), |sums, ((t, (u, v)), (u0, v0))| {
+                let step = apart(t, (u - u0, v - v0), g - g0, h - h0);
+                (add(sums.0, rest(t, (u, v))), add(sums.1, step))
+            });
+            (rest, f64::sqrt(step) + lost + lost0)
+        }
+    };
+    [g, h, f64::sqrt(rest) + lost, lost, step]
 }
 
 #[cfg(test)]
@@ -260,7 +278,7 @@ mod tests {
         let mut index = Index::default();
         let own: Vec<usize> = [0.4, 1.1, 1.9].map(|eta| index.insert(Key::integral(0, eta))).into();
         let bank = Bank::new(&index, &record, 0)?;
-        let all = vectors(count, m);
+        let all = vectors(count, m, &Stop::default());
         let sizes = vec![1.0; count];
         let found: Vec<Vec<[Wide; 4]>> = [1, 2]
             .iter()
@@ -300,7 +318,8 @@ mod tests {
         told.set();
         let bank = Bank::counted(&index, &record, 0, &going)?;
         assert!(matches!(Bank::counted(&index, &record, 0, &told), Err(crate::error::Error::Interrupted)));
-        let found = |stop| effects(&bank, &own, vectors(WIDTH, m), &[1.0; WIDTH], (Norm::L1, 1e-15), stop);
+        let found =
+            |stop| effects(&bank, &own, vectors(WIDTH, m, &Stop::default()), &[1.0; WIDTH], (Norm::L1, 1e-15), stop);
         assert!(found(&going).iter().flatten().flatten().any(|v| *v != 0.0));
         assert!(found(&told).iter().flatten().flatten().all(|v| *v == 0.0));
         Ok(())
@@ -314,7 +333,7 @@ mod tests {
         let orders: Vec<f64> = (1..40).map(|i| 0.05 * f64::from(i)).collect();
         let own: Vec<usize> = orders.iter().map(|&eta| index.insert(Key::integral(0, eta))).collect();
         let bank = Bank::new(&index, &record, 0)?;
-        let all = vectors(count, m as usize);
+        let all = vectors(count, m as usize, &Stop::default());
         for norm in [Norm::L1, Norm::L2] {
             let found = effects(&bank, &own, all.clone(), &[1.0; WIDTH], (norm, 1e-15), &Stop::default());
             let vector = |row: usize, j: usize| -> Vec<(f64, f64)> {

@@ -13,15 +13,12 @@ use std::ops::Range;
 use crate::lanes::WIDTH;
 use crate::search::bound::probes::NONE;
 use crate::search::boxes::side::{each_group, Others, Seen, Side, Wide, ZERO};
+use crate::search::boxes::strip::Strip;
 use crate::search::options::Norm;
 
 /// What rounding may change in coefficients, in units of ε and the sum of the diagonal of an inverse correlation
 /// matrix: sixteen times the square of the number of terms, far above what elimination loses.
 const ELIMINATED: f64 = 16.0 * f64::EPSILON;
-
-/// Candidates of a row that are looked at side by side.
-const LANES: usize = 4;
-const PLACES: [f64; LANES] = [0.0, 1.0, 2.0, 3.0];
 
 /// Where 1 − B² is no more than this, û and v̂ are one column as far as rounding tells.
 const NOTHING: f64 = 1e-12;
@@ -142,85 +139,24 @@ impl Cell {
     }
 }
 
-/// Coefficients on û and v̂ of all candidates of some rows of a slab.
-#[derive(Default)]
-pub(super) struct Strip {
-    start: usize,
-    len: usize,
-    /// (p + q)/2, (p − q)/2 and 1 − B²; all of them 0 where that is next to nothing, or no number.
-    plus: Vec<f64>,
-    minus: Vec<f64>,
-    left: Vec<f64>,
-    /// B, and products with the other columns one after the other, of a row.
-    product: Vec<f64>,
+/// Moduli of the coefficients on the other columns at the corners of a box, and how far from bilinear what they are
+/// moduli of runs.
+pub(super) struct Moduli {
+    others: [[f64; 4]; MOST_OTHERS],
+    rests: [f64; MOST_OTHERS],
+    /// Of the coefficients on the partner and on the own column of a side the sum, whose moduli may cancel.
+    sums: [f64; 4],
+    sums_rest: f64,
 }
 
-impl Strip {
-    #[inline(always)]
-    fn at(&self, row: usize, value: usize) -> usize {
-        (row - self.start) * self.len + value
-    }
-
-    /// How far from bilinear functions (p + q)/2 and (p − q)/2 run over a box, and the least 1 − B².
-    #[inline(always)]
-    fn off(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [plus, minus]: [[f64; 4]; 2]) -> ([f64; 2], f64) {
-        let (mut far, mut left) = ([[0.0_f64; LANES]; 2], [f64::INFINITY; LANES]);
-        let width = v1 - v0 + 1;
-        let [down, across] = [(u0, u1), (v0, v1)].map(|(a, b)| if b > a { 2.0 / count(b - a) } else { 0.0 });
-        for row in 0..=u1 - u0 {
-            let s = count(row) * down - 1.0;
-            let (x, y) = (plus[2] + plus[3] * s, minus[2] + minus[3] * s);
-            let (first, second) = (plus[0] + plus[1] * s - x, minus[0] + minus[1] * s - y);
-            let (x, y, start) = (x * across, y * across, self.at(u0 + row, v0));
-            let plus = self.plus[start..start + width].chunks_exact(LANES);
-            let minus = self.minus[start..start + width].chunks_exact(LANES);
-            let lefts = self.left[start..start + width].chunks_exact(LANES);
-            let rest = [plus.remainder(), minus.remainder(), lefts.remainder()];
-            let mut place = PLACES;
-            for ((plus, minus), lefts) in plus.zip(minus).zip(lefts) {
-                for n in 0..LANES {
-                    let a = (plus[n] - (first + x * place[n])).abs();
-                    let b = (minus[n] - (second + y * place[n])).abs();
-                    far[0][n] = if a > far[0][n] { a } else { far[0][n] };
-                    far[1][n] = if b > far[1][n] { b } else { far[1][n] };
-                    left[n] = if lefts[n] < left[n] { lefts[n] } else { left[n] };
-                    place[n] += PLACES[LANES - 1] + 1.0;
-                }
-            }
-            for n in 0..rest[0].len() {
-                let a = (rest[0][n] - (first + x * place[n])).abs();
-                let b = (rest[1][n] - (second + y * place[n])).abs();
-                far[0][n] = if a > far[0][n] { a } else { far[0][n] };
-                far[1][n] = if b > far[1][n] { b } else { far[1][n] };
-                left[n] = if rest[2][n] < left[n] { rest[2][n] } else { left[n] };
-            }
-        }
-        let most = |x: [f64; LANES]| x.into_iter().fold(0.0_f64, f64::max);
-        ([most(far[0]), most(far[1])], left.into_iter().fold(f64::INFINITY, f64::min))
-    }
-
-    /// The least 1 − B² over a box, and the most of ‖y‖² that û and v̂ explain.
-    #[inline(always)]
-    fn explained(&self, [(u0, u1), (v0, v1)]: [(usize, usize); 2], [y, z]: [&[f64]; 2]) -> (f64, f64) {
-        let (mut left, mut most) = ([f64::INFINITY; LANES], [f64::NEG_INFINITY; LANES]);
-        let width = v1 - v0 + 1;
-        for row in u0..u1 + 1 {
-            let (y, start) = (y[row], self.at(row, v0));
-            let here = [&self.plus, &self.minus, &self.left].map(|from| &from[start..start + width]);
-            let z = &z[v0..v0 + width];
-            let mut at = 0;
-            while at < width {
-                let lanes = LANES.min(width - at);
-                for n in 0..lanes {
-                    let explained = here[0][at + n] * (y + z[at + n]) + here[1][at + n] * (y - z[at + n]);
-                    most[n] = if explained > most[n] { explained } else { most[n] };
-                    left[n] = if here[2][at + n] < left[n] { here[2][at + n] } else { left[n] };
-                }
-                at += lanes;
-            }
-        }
-        (left.into_iter().fold(f64::INFINITY, f64::min), most.into_iter().fold(f64::NEG_INFINITY, f64::max))
-    }
+/// What a group of test vectors holds against the candidates of a box.
+pub(super) struct Held {
+    /// ⟨t, w⟩ and the divisor ‖t‖(1 − Σ c g) at the corners: real and imaginary part of each.
+    pub(super) values: [[Wide; 4]; 4],
+    /// What is added to the divisor at the corners: Σ|c|‖Fᵀt − g t‖.
+    pub(super) slack: [Wide; 4],
+    /// How far the first of these, and the other two together, run from bilinear.
+    pub(super) rough: [Wide; 2],
 }
 
 /// A slab, ready for its boxes.
@@ -379,127 +315,14 @@ impl<'a> Slab<'a> {
 
     /// Lower bound of their output errors.
     #[inline(always)]
-    fn errors(&self, [su, sv]: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
-        let k = self.others.columns.len();
-        let [u, v] = &self.sides;
-        let Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off, bends, all, lost, .. } = *cell;
-        let both = off[0] + off[1];
-        let ((u0, v0), (u1, v1)) = (at[0], at[3]);
-        let (lu, lv) = (&u.levels[su.level], &v.levels[sv.level]);
-        // Moduli of the other coefficients at the corners, and how far from bilinear they run.
-        let (mut others, mut rests) = ([[0.0; 4]; MOST_OTHERS], [0.0; MOST_OTHERS]);
-        for s in 0..k {
-            for (c, (i, j)) in at.into_iter().enumerate() {
-                others[s][c] = (self.along[s] - ps[c] * u.mixed[i * k + s] - qs[c] * v.mixed[j * k + s]).abs();
-            }
-            let a = Line::new(u.mixed[u0 * k + s], u.mixed[u1 * k + s], wu * lu.mixed[su.at * k + s]);
-            let b = Line::new(v.mixed[v0 * k + s], v.mixed[v1 * k + s], wv * lv.mixed[sv.at * k + s]);
-            rests[s] = cell.rest([a, b]) + lost;
-        }
-
-        // Of the coefficients on the partner and on the own column of a side the sum, whose moduli may cancel.
-        let partner = self.others.partner.filter(|_| self.own.is_some());
-        let (mut sums, mut sums_rest) = ([0.0; 4], 0.0);
-        if let Some(partner) = partner {
-            for (c, (i, j)) in at.into_iter().enumerate() {
-                sums[c] = (self.along[partner] - ps[c] * u.paired[i] - qs[c] * v.paired[j]).abs();
-            }
-            let bent = |values: &[f64], first: usize, last: usize| {
-                let inner =
-                    (first + 1..last).map(|i| ((values[i - 1] - values[i]) + (values[i + 1] - values[i])).abs());
-                inner.fold(0.0, f64::max)
-            };
-            let a = Line::new(u.paired[u0], u.paired[u1], wu * bent(&u.paired, u0, u1));
-            let b = Line::new(v.paired[v0], v.paired[v1], wv * bent(&v.paired, v0, v1));
-            sums_rest = cell.rest([a, b]) + lost * self.common.ratio;
-        }
-        let own = if self.own == Some(0) { &ps } else { &qs };
-
-        let groups = self.base.len();
+    fn errors(&self, both: [Stretch; 2], cell: &Cell, limit: f64) -> f64 {
+        let moduli = self.moduli(both, cell);
         let (mut sum, mut first) = (0.0, 0);
-        for (probes, most) in self.others.probes.iter().zip(&self.common.rounding) {
-            let rounding = probes.target_rounding + (all + lost) * most;
+        for (r, probes) in self.others.probes.iter().enumerate() {
             let mut best = 0.0;
             for group in first..first + probes.groups {
-                let (bu, bv) = (&lu.nodes[su.at * groups + group].bent, &lv.nodes[sv.at * groups + group].bent);
-                let (a, b) = (&u.seen[u0 * groups + group], &u.seen[u1 * groups + group]);
-                let (c, d) = (&v.seen[v0 * groups + group], &v.seen[v1 * groups + group]);
-                let (base, tops) = (&self.base[group], &self.common.tops[group]);
-                // How far ⟨t, w⟩ and the divisor run from bilinear.
-                let mut rough = [[0.0; WIDTH]; 2];
-                for half in 0..2 {
-                    for n in 0..WIDTH {
-                        let mut sizes = [0.0; 4];
-                        for part in 2 * half..2 * half + 2 {
-                            let (mu, mv) = ((a[part][n] + b[part][n]) * 0.5, (c[part][n] + d[part][n]) * 0.5);
-                            sizes[0] += (mu + mv).abs();
-                            sizes[1] += (mu - mv).abs();
-                            sizes[2] += (b[part][n] - a[part][n]).abs() * 0.5;
-                            sizes[3] += (d[part][n] - c[part][n]).abs() * 0.5;
-                        }
-                        rough[half][n] = bends[0] * sizes[2]
-                            + bends[1] * sizes[3]
-                            + off[0] * sizes[0]
-                            + off[1] * sizes[1]
-                            + both * (sizes[2] + sizes[3])
-                            + wu * bu[half][n] * p_most
-                            + wv * bv[half][n] * q_most
-                            + lost * tops[half][n];
-                    }
-                }
-                // What is added to each divisor: of the varying columns (a scale is at least 1) and of the others.
-                let mut slack = [ZERO; 4];
-                rough[0].iter_mut().for_each(|rough| *rough += rounding);
-                let rest_of = &self.rests[group * k..(group + 1) * k];
-                let mut together = None;
-                if let Some(partner) = partner {
-                    let rest = &rest_of[partner];
-                    let (mut apart, mut joint) = (0.0, 0.0);
-                    for n in 0..WIDTH {
-                        apart += others[partner][0] * rest[n] + own[0].abs() * (bu[2][n] + bv[2][n]);
-                        joint += sums[0] * rest[n] + own[0].abs() * (bu[3][n] + bv[3][n]);
-                    }
-                    if joint < apart {
-                        together = Some(partner);
-                    }
-                }
-                let part = if together.is_some() { 3 } else { 2 };
-                for n in 0..WIDTH {
-                    rough[1][n] += (both + lost) * (bu[part][n] + bv[part][n]);
-                    for corner in 0..4 {
-                        slack[corner][n] = ps[corner].abs() * bu[part][n] + qs[corner].abs() * bv[part][n];
-                    }
-                }
-                if let Some(partner) = together {
-                    let rest = &rest_of[partner];
-                    for n in 0..WIDTH {
-                        rough[1][n] += sums_rest * rest[n];
-                        for corner in 0..4 {
-                            slack[corner][n] += sums[corner] * rest[n];
-                        }
-                    }
-                }
-                for (s, rest) in rest_of.iter().enumerate() {
-                    if together == Some(s) {
-                        continue;
-                    }
-                    for n in 0..WIDTH {
-                        rough[1][n] += rests[s] * rest[n];
-                        for corner in 0..4 {
-                            slack[corner][n] += others[s][corner] * rest[n];
-                        }
-                    }
-                }
-                // ⟨t, w⟩ and the divisor at the corners.
-                let mut values = [[ZERO; 4]; 4];
-                for (corner, value) in values.iter_mut().enumerate() {
-                    let (of_u, of_v) = ([a, b][corner % 2], [c, d][corner / 2]);
-                    for part in 0..4 {
-                        for n in 0..WIDTH {
-                            value[part][n] = base[part][n] - ps[corner] * of_u[part][n] - qs[corner] * of_v[part][n];
-                        }
-                    }
-                }
+                let together = self.together(both, cell, &moduli, group);
+                let Held { values, slack, rough } = self.held(both, cell, &moduli, (r, group), together);
                 // All are looked at along the middle's direction.
                 let mut along = [ZERO; 2];
                 for n in 0..WIDTH {
@@ -537,6 +360,140 @@ impl<'a> Slab<'a> {
         sum
     }
 
+    /// Moduli of the coefficients on the other columns over a box.
+    #[inline(always)]
+    pub(super) fn moduli(&self, [su, sv]: [Stretch; 2], cell: &Cell) -> Moduli {
+        let k = self.others.columns.len();
+        let [u, v] = &self.sides;
+        let Cell { at, wide: [wu, wv], ps, qs, lost, .. } = *cell;
+        let ((u0, v0), (u1, v1)) = (at[0], at[3]);
+        let (lu, lv) = (&u.levels[su.level], &v.levels[sv.level]);
+        let (mut others, mut rests) = ([[0.0; 4]; MOST_OTHERS], [0.0; MOST_OTHERS]);
+        for s in 0..k {
+            for (c, (i, j)) in at.into_iter().enumerate() {
+                others[s][c] = (self.along[s] - ps[c] * u.mixed[i * k + s] - qs[c] * v.mixed[j * k + s]).abs();
+            }
+            let a = Line::new(u.mixed[u0 * k + s], u.mixed[u1 * k + s], wu * lu.mixed[su.at * k + s]);
+            let b = Line::new(v.mixed[v0 * k + s], v.mixed[v1 * k + s], wv * lv.mixed[sv.at * k + s]);
+            rests[s] = cell.rest([a, b]) + lost;
+        }
+        let (mut sums, mut sums_rest) = ([0.0; 4], 0.0);
+        if let Some(partner) = self.partner() {
+            for (c, (i, j)) in at.into_iter().enumerate() {
+                sums[c] = (self.along[partner] - ps[c] * u.paired[i] - qs[c] * v.paired[j]).abs();
+            }
+            let bent = |values: &[f64], first: usize, last: usize| {
+                let inner =
+                    (first + 1..last).map(|i| ((values[i - 1] - values[i]) + (values[i + 1] - values[i])).abs());
+                inner.fold(0.0, f64::max)
+            };
+            let a = Line::new(u.paired[u0], u.paired[u1], wu * bent(&u.paired, u0, u1));
+            let b = Line::new(v.paired[v0], v.paired[v1], wv * bent(&v.paired, v0, v1));
+            sums_rest = cell.rest([a, b]) + lost * self.common.ratio;
+        }
+        Moduli { others, rests, sums, sums_rest }
+    }
+
+    /// The other column whose coefficient may cancel against that of a side's own column.
+    #[inline(always)]
+    fn partner(&self) -> Option<usize> {
+        self.others.partner.filter(|_| self.own.is_some())
+    }
+
+    /// The partner, where a group of test vectors proves more with its column and the own one looked at together.
+    #[inline(always)]
+    pub(super) fn together(&self, [su, sv]: [Stretch; 2], cell: &Cell, moduli: &Moduli, group: usize) -> Option<usize> {
+        let partner = self.partner()?;
+        let (k, groups) = (self.others.columns.len(), self.base.len());
+        let [u, v] = &self.sides;
+        let bu = &u.levels[su.level].nodes[su.at * groups + group].bent;
+        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].bent;
+        let own = if self.own == Some(0) { &cell.ps } else { &cell.qs };
+        let rest = &self.rests[group * k + partner];
+        let (mut apart, mut joint) = (0.0, 0.0);
+        for n in 0..WIDTH {
+            apart += moduli.others[partner][0] * rest[n] + own[0].abs() * (bu[2][n] + bv[2][n]);
+            joint += moduli.sums[0] * rest[n] + own[0].abs() * (bu[3][n] + bv[3][n]);
+        }
+        (joint < apart).then_some(partner)
+    }
+
+    /// What a group of test vectors, of a record, holds against the candidates of a box.
+    #[inline(always)]
+    pub(super) fn held(
+        &self,
+        [su, sv]: [Stretch; 2],
+        cell: &Cell,
+        moduli: &Moduli,
+        (record, group): (usize, usize),
+        together: Option<usize>,
+    ) -> Held {
+        let (k, groups) = (self.others.columns.len(), self.base.len());
+        let [u, v] = &self.sides;
+        let Cell { at, wide: [wu, wv], ps, qs, most: [p_most, q_most], off, bends, all, lost, .. } = *cell;
+        let both = off[0] + off[1];
+        let ((u0, v0), (u1, v1)) = (at[0], at[3]);
+        let bu = &u.levels[su.level].nodes[su.at * groups + group].bent;
+        let bv = &v.levels[sv.level].nodes[sv.at * groups + group].bent;
+        let (a, b) = (&u.seen[u0 * groups + group], &u.seen[u1 * groups + group]);
+        let (c, d) = (&v.seen[v0 * groups + group], &v.seen[v1 * groups + group]);
+        let (base, tops) = (&self.base[group], &self.common.tops[group]);
+        let mut rough = [[0.0; WIDTH]; 2];
+        for half in 0..2 {
+            for n in 0..WIDTH {
+                let mut sizes = [0.0; 4];
+                for part in 2 * half..2 * half + 2 {
+                    let (mu, mv) = ((a[part][n] + b[part][n]) * 0.5, (c[part][n] + d[part][n]) * 0.5);
+                    sizes[0] += (mu + mv).abs();
+                    sizes[1] += (mu - mv).abs();
+                    sizes[2] += (b[part][n] - a[part][n]).abs() * 0.5;
+                    sizes[3] += (d[part][n] - c[part][n]).abs() * 0.5;
+                }
+                rough[half][n] = bends[0] * sizes[2]
+                    + bends[1] * sizes[3]
+                    + off[0] * sizes[0]
+                    + off[1] * sizes[1]
+                    + both * (sizes[2] + sizes[3])
+                    + wu * bu[half][n] * p_most
+                    + wv * bv[half][n] * q_most
+                    + lost * tops[half][n];
+            }
+        }
+        let rounding = self.others.probes[record].target_rounding + (all + lost) * self.common.rounding[record];
+        rough[0].iter_mut().for_each(|rough| *rough += rounding);
+        // Of the varying columns (a scale is at least 1), then of the others.
+        let mut slack = [ZERO; 4];
+        let part = if together.is_some() { 3 } else { 2 };
+        for n in 0..WIDTH {
+            rough[1][n] += (both + lost) * (bu[part][n] + bv[part][n]);
+            for corner in 0..4 {
+                slack[corner][n] = ps[corner].abs() * bu[part][n] + qs[corner].abs() * bv[part][n];
+            }
+        }
+        let rest_of = &self.rests[group * k..(group + 1) * k];
+        for (s, rest) in rest_of.iter().enumerate() {
+            let paired = together == Some(s);
+            let (sizes, beyond) =
+                if paired { (&moduli.sums, moduli.sums_rest) } else { (&moduli.others[s], moduli.rests[s]) };
+            for n in 0..WIDTH {
+                rough[1][n] += beyond * rest[n];
+                for corner in 0..4 {
+                    slack[corner][n] += sizes[corner] * rest[n];
+                }
+            }
+        }
+        let mut values = [[ZERO; 4]; 4];
+        for (corner, value) in values.iter_mut().enumerate() {
+            let (of_u, of_v) = ([a, b][corner % 2], [c, d][corner / 2]);
+            for part in 0..4 {
+                for n in 0..WIDTH {
+                    value[part][n] = base[part][n] - ps[corner] * of_u[part][n] - qs[corner] * of_v[part][n];
+                }
+            }
+        }
+        Held { values, slack, rough }
+    }
+
     #[inline(always)]
     pub(super) fn raw(&self, norm: f64) -> f64 {
         match self.common.norm {
@@ -555,6 +512,6 @@ fn eighth(length: usize) -> f64 {
 
 #[inline(always)]
 #[allow(clippy::cast_precision_loss)]
-fn count(n: usize) -> f64 {
+pub(super) fn count(n: usize) -> f64 {
     n as f64
 }

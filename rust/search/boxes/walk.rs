@@ -8,8 +8,9 @@ use crate::lanes::{self, WIDTH};
 use crate::regressors::Record;
 use crate::search::bound::lower::Bound;
 use crate::search::bound::probes::{Probes, NONE};
-use crate::search::boxes::cell::{Common, Slab, Stretch, Strip, MOST_OTHERS};
+use crate::search::boxes::cell::{Common, Slab, Stretch, MOST_OTHERS};
 use crate::search::boxes::side::{Others, Side};
+use crate::search::boxes::strip::Strip;
 use crate::search::candidate::problem::Problem;
 use crate::search::catalogue::Catalogue;
 use crate::search::lattice::cursor::Cursor;
@@ -341,4 +342,117 @@ where
     let slab = lattice.slab(index).filter(|_| (2..=MOST_OTHERS + 2).contains(&lattice.width()));
     let Some(slab) = slab else { return Ok(Vec::new()) };
     Ok(pool.install(|| work(&catalogue, &Boxes::new(&catalogue)?, &slab)).unwrap_or_default())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::error::Error;
+    use crate::search::bound::probes::Probes;
+    use crate::search::boxes::cell::{Cell, Held};
+    use crate::search::boxes::side::Wide;
+    use crate::search::lattice::TermAxis;
+
+    /// Two hubs and a link under steps, on which orders near one another and far apart are tried.
+    fn problem(case: u32) -> Result<(Record, Lattice)> {
+        let m = 150;
+        let time = |k: i32| f64::from(k) * 0.03;
+        let signal = |of: &dyn Fn(i32) -> f64| (0..m).map(of).collect::<Vec<f64>>();
+        let step = |every: i32| signal(&move |k| if (k / every) % 2 == 0 { 1.0 } else { -0.6 });
+        let signals = vec![signal(&|k| libm::sin(2.0 * time(k)) * libm::exp(-0.2 * time(k))), step(31), step(47)];
+        let grain = [0.2, 0.05, 0.01, 0.002][case as usize % 4];
+        let some = |from: f64, count: u32| (0..count).map(|i| from + grain * f64::from(i)).collect::<Vec<f64>>();
+        let axis = |signal: usize, values: Vec<f64>| TermAxis { signal, values, interchangeable: true };
+        let own = some(0.1 * f64::from(case % 3), 7);
+        let mut axes = vec![axis(0, own.clone()), axis(1, some(0.2, 9))];
+        match case % 5 {
+            0 | 1 => axes.insert(1, axis(0, own)),
+            // No own order varies.
+            2 => axes = vec![axis(0, vec![0.3]), axis(1, some(0.2, 9)), axis(2, some(0.1, 6))],
+            _ => axes.push(axis(2, vec![0.4])),
+        }
+        Ok((Record::new(0.03, signals, None)?, Lattice::new(0, &[1.7], &axes, |s| s == 2)?))
+    }
+
+    /// The bilinear function of these corners at −1 ≤ s, t ≤ 1.
+    fn between(corners: [f64; 4], (s, t): (f64, f64)) -> f64 {
+        let shares = [(1.0 - s) * (1.0 - t), (1.0 + s) * (1.0 - t), (1.0 - s) * (1.0 + t), (1.0 + s) * (1.0 + t)];
+        corners.iter().zip(shares).map(|(c, share)| 0.25 * c * share).sum()
+    }
+
+    /// How far a candidate's ⟨t, w⟩, and its divisor with what is added to it, are from what a box has there, each over
+    /// what the box allows: [`WIDTH`] test vectors.
+    fn far(whole: &Held, one: &Held, place: (f64, f64)) -> [Wide; 2] {
+        let corners = |of: &dyn Fn(usize) -> f64| between(std::array::from_fn(of), place);
+        let apart = |part: usize, n: usize| one.values[0][part][n] - corners(&|c| whole.values[c][part][n]);
+        let seen = |n: usize| apart(0, n).hypot(apart(1, n)) / whole.rough[0][n];
+        let more = |n: usize| (one.slack[0][n] - corners(&|c| whole.slack[c][n])).max(0.0);
+        let size = |n: usize| (apart(2, n).hypot(apart(3, n)) + more(n)) / whole.rough[1][n];
+        [std::array::from_fn(seen), std::array::from_fn(size)]
+    }
+
+    #[test]
+    fn no_candidate_is_farther_from_bilinear_than_its_box_allows() -> Result<()> {
+        let mut nearest: Vec<[f64; 2]> = Vec::new();
+        for case in 0..40 {
+            let (record, lattice) = problem(case)?;
+            let kinds = (Criterion::OutputError, [Norm::L1, Norm::L2][case as usize / 4 % 2]);
+            let found = with_slab(&[record], &lattice, kinds, u64::from(case) * 7, |catalogue, boxes, slab| {
+                let columns = columns(catalogue, slab);
+                let (others, inverse) = others(catalogue, slab, &columns)?;
+                let others = boxes.others(catalogue, &others, &inverse)?;
+                let ready = ready(catalogue, boxes, slab, &others, 0..slab.rows.len())?;
+                let mut strip = Strip::default();
+                ready.lay(&mut strip, 0..slab.rows.len());
+                let groups = others.probes.first().map_or(0, |p: &Probes| p.groups);
+                let held = |both: [Stretch; 2], cell: &Cell, group: usize, together: Option<Option<usize>>| {
+                    let moduli = ready.moduli(both, cell);
+                    let together = together.unwrap_or_else(|| ready.together(both, cell, &moduli, group));
+                    (ready.held(both, cell, &moduli, (0, group), together), together)
+                };
+                let mut most = Vec::new();
+                let levels = [0, 1].map(|side: usize| ready.sides[side].levels.len());
+                for (a, b) in (0..levels[0]).flat_map(|a| (0..levels[1]).map(move |b| (a, b))) {
+                    for (at, by) in (0..ready.sides[0].levels[a].plain.len())
+                        .flat_map(|at| (0..ready.sides[1].levels[b].plain.len()).map(move |by| (at, by)))
+                    {
+                        let both = [Stretch { level: a, at }, Stretch { level: b, at: by }];
+                        let ends = [both[0].ends(slab.rows.len()), both[1].ends(slab.len)];
+                        let Some(cell) = ready.cell(&strip, both) else { continue };
+                        for group in (0..groups).filter(|_| a + b > 0) {
+                            let (whole, together) = held(both, &cell, group, None);
+                            let mut nearest = [0.0_f64; 2];
+                            for (i, j) in
+                                (ends[0].0..=ends[0].1).flat_map(|i| (ends[1].0..=ends[1].1).map(move |j| (i, j)))
+                            {
+                                let alone = [Stretch { level: 0, at: i }, Stretch { level: 0, at: j }];
+                                let Some(cell) = ready.cell(&strip, alone) else { continue };
+                                let (one, _) = held(alone, &cell, group, Some(together));
+                                let place = |x: usize, (from, to): (usize, usize)| {
+                                    2.0 * (x - from) as f64 / (to - from).max(1) as f64 - 1.0
+                                };
+                                let far = far(&whole, &one, (place(i, ends[0]), place(j, ends[1])));
+                                for (nearest, far) in nearest.iter_mut().zip(far) {
+                                    *nearest = far.into_iter().fold(*nearest, f64::max);
+                                }
+                            }
+                            most.push(nearest);
+                        }
+                    }
+                }
+                Some(most)
+            })?;
+            if found.is_empty() {
+                return Err(Error::Internal { what: format!("nothing was proved of case {case}") });
+            }
+            nearest.extend(found);
+        }
+        for (part, name) in ["the projection", "the divisor"].into_iter().enumerate() {
+            let most = nearest.iter().map(|near| near[part]).fold(0.0, f64::max);
+            let close = nearest.iter().filter(|near| near[part] > 0.5).count();
+            println!("{name}: {close} of {} boxes use half of what is allowed, at most {most:.4}", nearest.len());
+            assert!(most <= 1.0 && close > nearest.len() / 20, "{name}");
+        }
+        Ok(())
+    }
 }

@@ -28,28 +28,30 @@ pub(crate) struct Refiner {
 }
 
 impl Refiner {
-    /// Spectra of the columns of `banks`, which are those of the records' clean signals.
-    pub(crate) fn new(records: &[Record], output: usize, banks: &[Bank], settings: Settings) -> Self {
+    /// Spectra of the columns of `banks`, which are those of the records' clean signals; of no use once it was told to stop.
+    pub(crate) fn new(records: &[Record], output: usize, banks: &[Bank], settings: Settings, stop: &Stop) -> Self {
         let shelves = records
             .iter()
             .zip(banks)
             .map(|(record, bank)| {
                 let all = || (0..bank.len()).collect();
+                let spectrum = |x: &[f64]| Kernel::new(if stop.is_set() { &[] } else { x });
                 Shelf {
-                    columns: abreast::map(all(), || (), |(), p| Kernel::new(bank.column(p))),
+                    columns: abreast::map(all(), || (), |(), p| spectrum(bank.column(p))),
                     kernels: abreast::map(
                         all(),
                         || (),
-                        |(), p| Some(bank.kernel(p)).filter(|k| !k.is_empty()).map(Kernel::new),
+                        |(), p| Some(bank.kernel(p)).filter(|k| !k.is_empty()).map(spectrum),
                     ),
-                    target: Kernel::new(record.signal(output)),
+                    target: spectrum(record.signal(output)),
                 }
             })
             .collect();
         Self { shelves, settings }
     }
 
-    /// Refines coefficients in place: of the terms, then of the initial terms record by record.
+    /// Refines coefficients in place: of the terms, then of the initial terms record by record. What it comes to once it was
+    /// told to stop is of no use.
     pub(crate) fn refine(
         &self,
         (banks, targets): (&[Bank], &[Vec<f64>]),
@@ -57,6 +59,7 @@ impl Refiner {
         fixed: &[Option<f64>],
         coefficients: &mut [f64],
         weights: &mut [f64],
+        stop: &Stop,
     ) -> std::result::Result<(), Failure> {
         let sources: Vec<Source<'_>> = self
             .shelves
@@ -77,7 +80,7 @@ impl Refiner {
         let n = initial.len();
         let dropped: Vec<(usize, usize)> =
             weights.iter().enumerate().filter(|(_, w)| **w == 0.0).map(|(i, _)| (i / n, i % n)).collect();
-        match refine(&sources, fixed, &dropped, &start, self.settings, &mut Scratch::default()) {
+        match refine(&sources, fixed, &dropped, &start, self.settings, &mut Scratch::until(stop)) {
             Ok((solution, _, _)) if solution.iter().all(|x| x.is_finite()) => {
                 let (terms, rest) = solution.split_at(coefficients.len());
                 coefficients.copy_from_slice(terms);

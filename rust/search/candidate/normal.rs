@@ -8,6 +8,7 @@ use crate::lanes::Lanes;
 use crate::regressors::Bank;
 use crate::search::candidate::columns::Columns;
 use crate::small::{packed, solve_lanes};
+use crate::stop::Stop;
 
 /// Normal equations over a bank's columns, weighted as the estimator asks, scaled to a diagonal of ones.
 pub(crate) struct Normal {
@@ -188,9 +189,9 @@ impl NormalEquations {
     }
 }
 
-/// Gram matrix of a bank's columns and the target, (columns + 1)² row-major.
-pub(super) fn plain_gram(bank: &Bank, target: &[f64]) -> Vec<f64> {
-    dense::gram(bank.columns(), target)
+/// Gram matrix of a bank's columns and the target, (columns + 1)² row-major; of no use once it was told to stop.
+pub(super) fn plain_gram(bank: &Bank, target: &[f64], stop: &Stop) -> Vec<f64> {
+    dense::gram(bank.columns(), target, stop)
 }
 
 /// Gives a Gram matrix multi-innovation weights: p on all rows but the last p − 1.

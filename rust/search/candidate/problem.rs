@@ -205,10 +205,11 @@ impl Problem {
         for ((bank, target), record) in banks.iter().zip(&targets).zip(records) {
             let mut gram = if refined {
                 let (bank, target) = start_bank(record, output, &index, stop)?;
-                plain_gram(&bank, &target)
+                plain_gram(&bank, &target, stop)
             } else {
-                plain_gram(bank, target)
+                plain_gram(bank, target, stop)
             };
+            stop.check()?;
             unweighted.iter_mut().zip(&gram).for_each(|(s, g)| *s += g);
             if let Estimator::MultiInnovation(innovation) = options.estimator {
                 weigh(&mut gram, bank, target, innovation)?;
@@ -219,7 +220,7 @@ impl Problem {
             }
         }
         let refiner = match options.estimator {
-            Estimator::InstrumentalVariables(settings) => Some(Refiner::new(records, output, &banks, settings)),
+            Estimator::InstrumentalVariables(settings) => Some(Refiner::new(records, output, &banks, settings, stop)),
             _ => None,
         };
         // D e = w holds for integrals of the output as it was measured.
@@ -388,8 +389,10 @@ impl Problem {
         }
         if let Some(refiner) = &self.refiner {
             let (data, places) = ((&self.banks[..], &self.targets[..]), (positions, initial));
-            if let Err(failure) = refiner.refine(data, places, self.equations.fixed(), coefficients, weights) {
-                return Verdict::Failed(failure);
+            let fixed = self.equations.fixed();
+            if let Err(failure) = refiner.refine(data, places, fixed, coefficients, weights, &control.stop) {
+                // What was told to stop has found nothing.
+                return if control.stopped() { Verdict::Stopped(0.0) } else { Verdict::Failed(failure) };
             }
         }
         let (coefficients, weights) = (&coefficients[..], &weights[..]);

@@ -205,6 +205,7 @@ mod tests {
     use super::*;
     use crate::dense;
     use crate::estimate::least_squares;
+    use crate::stop::Stop;
 
     /// Numbers in [−1, 1), always the same ones.
     fn noise(state: &mut u64, count: usize) -> Vec<f64> {
@@ -238,7 +239,8 @@ mod tests {
             let level = libm::pow(10.0, -f64::from(case % 8));
             let sum: Vec<f64> = (0..m).map(|t| columns[..terms].iter().map(|c| c[t]).sum()).collect();
             let target: Vec<f64> = sum.iter().zip(noise(state, m)).map(|(s, v)| s + level * v).collect();
-            let squares = Squares::new(dense::gram(&columns.concat(), &target), columns.len(), m, terms, 1);
+            let squares =
+                Squares::new(dense::gram(&columns.concat(), &target, &Stop::default()), columns.len(), m, terms, 1);
             let but = case as usize % terms;
             let others: Vec<usize> = (0..terms - 1).collect();
             let changing: Vec<usize> = (terms - 1..columns.len()).collect();

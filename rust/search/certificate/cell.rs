@@ -14,6 +14,7 @@ use crate::error::{check_length, Error, Result};
 use crate::regressors::Record;
 use crate::search::certificate::curve::{series, unit, Curve, ALL, MOST};
 use crate::search::certificate::span::Span;
+use crate::stop::Stop;
 
 type Row = [f64; MOST];
 
@@ -229,18 +230,26 @@ pub fn cell_bounds(
             });
         }
     }
-    let (local, span, square) = about(records, output, terms)?;
+    let (local, span, square) = about(records, output, terms, &Stop::default())?;
     Ok((local.bound().least * square, span.bound(largest, goal / square) * square))
 }
 
 /// What a cell with these middles and half widths is bounded from, and the squares of the output.
-pub(super) fn about(records: &[Record], output: usize, terms: &[(usize, f64, f64)]) -> Result<(Local, Span, f64)> {
+pub(super) fn about(
+    records: &[Record],
+    output: usize,
+    terms: &[(usize, f64, f64)],
+    stop: &Stop,
+) -> Result<(Local, Span, f64)> {
     let target: Vec<f64> = records.iter().flat_map(|r| r.signal(output)).copied().collect();
     let square = target.iter().map(|v| v * v).sum::<f64>();
-    let curves =
-        terms.iter().map(|&(s, middle, half)| Curve::new(records, s, middle, half)).collect::<Result<Vec<_>>>()?;
+    let curves = terms
+        .iter()
+        .map(|&(s, middle, half)| Curve::new(records, s, middle, half, stop))
+        .collect::<Result<Vec<_>>>()?;
     let all: Vec<&[f64]> = curves.iter().flat_map(|c| c.columns.iter().map(Vec::as_slice)).collect();
-    let (products, along) = (inner_products(&all, &all), inner_products(&[&target], &all));
+    let (products, along) = (inner_products(&all, &all, stop), inner_products(&[&target], &all, stop));
+    stop.check()?;
     let product = |(i, n): (usize, usize), (j, m): (usize, usize)| products[(i * ALL + n) * all.len() + j * ALL + m];
     let target_product = |(j, m): (usize, usize)| along[j * ALL + m] / square.sqrt();
     let (mut local, mut span) = (Local::new(terms.len(), target.len()), Span::new(target.len()));

@@ -8,6 +8,7 @@
 use crate::error::{Error, Result};
 use crate::regressors::Record;
 use crate::series::{Buffers, Kernel};
+use crate::stop::Stop;
 
 /// Most terms of an equation.
 pub(super) const MOST: usize = 6;
@@ -121,14 +122,15 @@ impl Curve {
     /// About I^eta of a signal, for orders of integration within `half` of it.
     ///
     /// # Errors
-    /// [`Error::Structure`] where its size is no positive number.
-    pub(super) fn new(records: &[Record], signal: usize, eta: f64, half: f64) -> Result<Self> {
+    /// [`Error::Structure`] where its size is no positive number, [`Error::Interrupted`].
+    pub(super) fn new(records: &[Record], signal: usize, eta: f64, half: f64, stop: &Stop) -> Result<Self> {
         let mut columns: [Vec<f64>; ALL] = Default::default();
         let mut errors = [0.0; ALL];
         let mut made = Vec::with_capacity(records.len());
         // The unit of time is the first record's pulse.
         let first = records.first().map_or(1.0, Record::step);
         for record in records {
+            stop.check()?;
             let (m, pace) = (record.m(), record.step() / first);
             let (sums, spectrum) = (Sums::new(eta, m), Kernel::new(record.signal(signal)));
             let (scale, slope) = (libm::pow(pace, eta), libm::log(pace));
@@ -137,6 +139,7 @@ impl Curve {
         let mut buffers = Buffers::default();
         for (j, column) in columns.iter_mut().enumerate().take(2) {
             for (record, (sums, spectrum, scale, slope)) in records.iter().zip(&made) {
+                stop.check()?;
                 column.extend(product(&sums.derivative(j, -slope, record.m()), spectrum, *scale, &mut buffers));
             }
         }
@@ -148,6 +151,7 @@ impl Curve {
             }
             let mut squares = 0.0;
             for (record, (sums, spectrum, scale, slope)) in records.iter().zip(&made) {
+                stop.check()?;
                 let (m, mu) = (record.m(), lambda - slope);
                 let kernel = sums.derivative(j, mu, m);
                 if j > 0 {

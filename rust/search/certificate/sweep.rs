@@ -222,7 +222,7 @@ impl Sweep<'_> {
     /// What orders of integration leave themselves, not read off a table.
     fn left(&self, records: &[Record], etas: &[f64]) -> Result<f64> {
         let terms = self.region.terms.iter().zip(etas).map(|(term, eta)| (term.signal, *eta, 0.0));
-        Ok(about(records, self.region.output, &terms.collect::<Vec<_>>())?.0.bound().middle)
+        Ok(about(records, self.region.output, &terms.collect::<Vec<_>>(), &self.control.stop)?.0.bound().middle)
     }
 
     /// Goes down from the best orders, one or two of them at a time: to edges of the region too, where no middle is.

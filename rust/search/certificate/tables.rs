@@ -144,10 +144,7 @@ impl Tables {
         let curves: Vec<Result<Curve>> = abreast::map(
             nodes.clone(),
             || (),
-            |(), (signal, middle, half)| {
-                control.check_stop()?;
-                Curve::new(records, signal, middle, half)
-            },
+            |(), (signal, middle, half)| Curve::new(records, signal, middle, half, &control.stop),
         );
         let curves = curves.into_iter().collect::<Result<Vec<Curve>>>()?;
         let size = target.iter().map(|v| v * v).sum::<f64>().sqrt();
@@ -164,8 +161,8 @@ impl Tables {
                     return (pair, Vec::new(), Vec::new());
                 }
                 let columns: Vec<&[f64]> = batch.iter().map(|c| &c.columns[m][..]).collect();
-                let along = if n == 0 { inner_products(&columns, &[&target]) } else { Vec::new() };
-                (pair, inner_products(&columns, &all[n]), along)
+                let along = if n == 0 { inner_products(&columns, &[&target], &control.stop) } else { Vec::new() };
+                (pair, inner_products(&columns, &all[n], &control.stop), along)
             },
         );
         control.check_stop()?;
