@@ -324,7 +324,7 @@ def instructions(write: bool) -> None:
         return int(collected[1]), int(units[1])
 
     nothing, _ = count("nothing")
-    for kernel in ("screen", "rank", "divide", "apply"):
+    for kernel in ("screen", "rank", "boxes", "certify", "fit", "divide", "apply"):
         total, units = count(kernel)
         each = round((total - (nothing if kernel == "screen" else 0)) / units)
         allowed = budget.get(kernel)

@@ -9,11 +9,18 @@ use std::hint::black_box;
 use std::time::Instant;
 
 use ftlm::equation::{Equation, Initial, Structure, Term};
+use ftlm::estimate::joint::free::{
+    Coefficient, Equation as FreeEquation, Free, Order, Structure as FreeStructure, Term as FreeTerm,
+};
+use ftlm::estimate::joint::starts::Lattices;
+use ftlm::estimate::joint::{fit, Loss, Outset, Sampled, Settings, Signal, Size, Sought};
 use ftlm::estimate::least_squares;
 use ftlm::fft::{self, Bin, Workspace};
 use ftlm::kernels::block_pulse_kernel;
+use ftlm::means::Intersample;
 use ftlm::operational::{block_pulse_matrix, operational_matrix, operational_matrix_dense};
 use ftlm::regressors::Record;
+use ftlm::search::certificate::{certify, Asked, Range, Region};
 use ftlm::search::control::Control;
 use ftlm::search::lattice::{Lattice, TermAxis};
 use ftlm::search::options::{Criterion, Estimator, Norm, Options};
@@ -21,6 +28,7 @@ use ftlm::search::rounds::{search, Search};
 use ftlm::search::threads::pool;
 use ftlm::series::{self, Buffers, Division, Kernel};
 use ftlm::simulate;
+use ftlm::stop::Stop;
 
 /// Processor seconds of this thread where the system tells them; right to a few milliseconds.
 fn processor() -> Option<f64> {
@@ -201,6 +209,8 @@ fn problem(m: usize, step: f64) -> Option<(Record, Lattice)> {
 
 /// Step of the lattice that is ranked by equation errors for callgrind: five million candidates.
 const RANKED: f64 = 0.025;
+/// Step at which free runs are screened in boxes: of 2^25 candidates and more.
+const BOXED: f64 = 0.015;
 
 fn options(threads: usize) -> Options {
     Options {
@@ -270,6 +280,43 @@ fn peak() -> Option<f64> {
     Some(1024.0 * line.split_whitespace().nth(1)?.parse::<f64>().ok()?)
 }
 
+/// The order that a joint fit of D^alpha y = d D^0.6 y + a y + b u finds where it is 1.6, from its own starts.
+fn joint_fit(m: usize) -> Option<f64> {
+    let h = 0.01;
+    let u: Vec<f64> = (0..m).map(|k| if k % 400 < 230 { 1.0 } else { -0.6 }).collect();
+    let terms = [(0, 0.6, -3.0), (0, 0.0, -8.0), (1, 0.0, 5.0)];
+    let plant = Equation {
+        structure: Structure {
+            output: 0,
+            order: 1.6,
+            terms: terms.iter().map(|&(signal, order, _)| Term { signal, order }).collect(),
+        },
+        coefficients: terms.iter().map(|t| t.2).collect(),
+    };
+    let driven = Record::new(h, vec![vec![0.0; m], u.clone()], None).ok()?;
+    let mut y = simulate::respond(&[plant], &driven, &[]).ok()?.remove(0);
+    y.iter_mut().zip(noise(m, 3)).for_each(|(y, e)| *y += 1e-3 * e);
+    let sizes = [Size::of(&[y.clone()])];
+    let signal = |samples, between| Signal { samples, between };
+    let run = vec![signal(y, Intersample::Linear), signal(u, Intersample::Hold)];
+    let runs = Sampled::new(h, vec![0], vec![run]).ok()?;
+    let free = |(signal, order, _): (usize, f64, f64), name: &str| FreeTerm {
+        signal,
+        order: Order::number(order),
+        coefficient: Coefficient::Free(name.into()),
+        factor: 1.0,
+    };
+    let terms = terms.into_iter().zip(["d", "a", "b"]).map(|(term, name)| free(term, name)).collect();
+    let sought = FreeEquation { output: 0, order: Order::free("alpha"), terms, friction: None };
+    let free = Free::of(FreeStructure::new(vec!["y".into(), "u".into()], vec![sought], Initial::Rest)).ok()?;
+    let stop = Stop::default();
+    let starts = Lattices::new(&runs, 1, 1 << 28, &stop);
+    let asked = Sought { free: &free, source: &runs, starts: &starts, sizes: &sizes, stop: &stop };
+    let settings = Settings { loss: Loss::Squares, refine: true, threads: 1 };
+    let found = fit::fit(asked, Outset::Starts { known: Vec::new(), raced: None }, settings, &|_, _| Ok(())).ok()??;
+    black_box(found).finished.estimate.first().copied()
+}
+
 /// One of the hottest kernels a fixed number of times, for callgrind; prints how many units of work it did.
 fn kernel(name: &str) {
     let m = 2048;
@@ -287,6 +334,27 @@ fn kernel(name: &str) {
             let _ = black_box(search(&[record], &lattice, &[None; 4], &options, &Control::default()));
             println!("units {}", lattice.count());
         }
+        "boxes" => {
+            let Some((record, lattice)) = problem(m / 4, BOXED) else { return };
+            let found = black_box(search(&[record], &lattice, &[None; 4], &options(1), &Control::default()));
+            if found.is_ok_and(|found| found.counts.boxed > lattice.count() / 2) {
+                println!("units {}", lattice.count());
+            }
+        }
+        "certify" => {
+            let Some((record, _)) = problem(m / 8, RANKED) else { return };
+            let range = |signal, highest| Range { signal, lowest: 0.0, highest };
+            let region = Region {
+                output: 1,
+                alpha: (1.05, 2.0),
+                terms: vec![range(1, 1.0), range(0, 1.5), range(2, 0.0)],
+                apart: 0.05,
+            };
+            let asked = Asked { within: 0.05, largest: 100.0, cells: 100_000, threads: 1, memory: 1 << 30 };
+            let Ok(found) = black_box(certify(&[record], &region, &asked, &Control::default())) else { return };
+            println!("units {}", found.cells);
+        }
+        "fit" => println!("units {}", u8::from(joint_fit(m).is_some_and(|order| (order - 1.6).abs() < 0.05))),
         "divide" => {
             let (signal, mut divisor) = (noise(m, 2), block_pulse_kernel(1.9, m, 0.005));
             divisor.iter_mut().for_each(|d| *d *= 863.0);

@@ -1,8 +1,8 @@
 """How long every long call goes on after Ctrl-C, at moments all over it (promise R10: half a second).
 
-``python benches/stops.py [--samples N] [--moments K] [--longest SECONDS] [JOB ...]``: each job is begun K times, each time
-in a process of its own, and told to stop after 1/K, 2/K ... of the time that it takes, or of SECONDS if it takes longer;
-the time is that from the signal to ``KeyboardInterrupt``. Jobs are written out by ``--help``.
+``python benches/stops.py [--samples N] [--moments K] [--longest SECONDS] [JOB ...]``: each job is begun K times, in a
+process of its own each, and told to stop after 1/K, 2/K ... of the time that it takes, or of SECONDS if it takes
+longer; the time is that from the signal to ``KeyboardInterrupt``. Jobs are written out by ``--help``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ LINK = "D^alpha y = a D^beta y + c D^mu y + b D^nu u"
 FIT = "D^alpha y = a y + b u"
 SOLVED = ftlm.equation("D^1.6 y = -3 D^0.6 y - 8 y + 5 u")
 KNOWN = ftlm.equation("D^1.6 y = c D^0.6 y + a y + b u")
-#: What a job promises, and what it took longer than that is marked with.
+#: Seconds within which a job is to end; one that takes longer is marked.
 PROMISED = 0.5
 
 
@@ -132,8 +132,9 @@ def main() -> None:
         after, worst = max(waits, key=lambda wait: wait[1])
         median = sorted(seconds for _, seconds in waits)[len(waits) // 2]
         print(
-            f"{job}: {'more than ' if late else ''}{length:.1f} s, told to stop {len(waits)} times: median {median:.2f} s, "
-            f"at most {worst:.2f} s after {after:.1f} s{'' if worst <= PROMISED else ' NOT KEPT'}",
+            f"{job}: {'more than ' if late else ''}{length:.1f} s, told to stop {len(waits)} times: "
+            f"median {median:.2f} s, at most {worst:.2f} s after {after:.1f} s"
+            f"{'' if worst <= PROMISED else ' NOT KEPT'}",
             flush=True,
         )
 
