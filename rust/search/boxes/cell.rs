@@ -13,7 +13,7 @@ use std::ops::Range;
 use crate::lanes::WIDTH;
 use crate::search::bound::probes::NONE;
 use crate::search::boxes::side::{each_group, Others, Seen, Side, Wide, ZERO};
-use crate::search::boxes::strip::Strip;
+use crate::search::boxes::strip::{count, Strip};
 use crate::search::options::Norm;
 
 /// What rounding may change in coefficients, in units of ε and the sum of the diagonal of an inverse correlation
@@ -508,10 +508,4 @@ impl<'a> Slab<'a> {
 fn eighth(length: usize) -> f64 {
     let length = count(length);
     length * length / 8.0
-}
-
-#[inline(always)]
-#[allow(clippy::cast_precision_loss)]
-pub(super) fn count(n: usize) -> f64 {
-    n as f64
 }

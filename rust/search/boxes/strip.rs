@@ -1,7 +1,5 @@
 //! Coefficients on the two varying columns of all candidates of some rows of a slab.
 
-use crate::search::boxes::cell::count;
-
 /// Candidates of a row that are looked at side by side.
 const LANES: usize = 4;
 const PLACES: [f64; LANES] = [0.0, 1.0, 2.0, 3.0];
@@ -89,4 +87,10 @@ impl Strip {
         }
         (left.into_iter().fold(f64::INFINITY, f64::min), most.into_iter().fold(f64::NEG_INFINITY, f64::max))
     }
+}
+
+#[inline(always)]
+#[allow(clippy::cast_precision_loss)]
+pub(super) fn count(n: usize) -> f64 {
+    n as f64
 }
