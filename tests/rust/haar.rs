@@ -159,6 +159,10 @@ fn gram_matrices_and_triangular_factors() {
         let gram = dense::gram(&others.concat(), target, &Stop::default());
         let three = pool(3).unwrap();
         assert_eq!(three.install(|| dense::gram(&others.concat(), target, &Stop::default())), gram);
+        let told = Stop::default();
+        told.set();
+        assert!(dense::gram(&others.concat(), target, &told).iter().all(|v| *v == 0.0));
+        assert!(dense::inner_products(&borrowed, &borrowed, &told).iter().all(|v| *v == 0.0));
         let products = dense::inner_products(&borrowed, &borrowed[..2.min(k)], &Stop::default());
         assert_eq!(
             three.install(|| dense::inner_products(&borrowed, &borrowed[..2.min(k)], &Stop::default())),

@@ -3,7 +3,7 @@
 use ftlm::equation::{Equation, Initial};
 use ftlm::error::Error;
 use ftlm::estimate::iv::{
-    damped_inverse, fit, low_pass, power_frequency, project, refine, step, Scratch, Settings, Source,
+    damped_inverse, fit, low_pass, power_frequency, project, refine, step, with_projections, Scratch, Settings, Source,
 };
 use ftlm::estimate::least_squares;
 use ftlm::kernels::block_pulse_kernel;
@@ -279,6 +279,11 @@ fn the_projection_keeps_what_inputs_excite_and_little_of_the_noise() {
     let again = project(&with_signal(&clean, 0, kept.clone()), 0, &[1, 2], true).unwrap();
     check("the projection repeated", distance(&again, &kept) / norm(&kept), 1e-9);
     assert!(project(&clean, 0, &[], true).is_err());
+    let stop = Stop::default();
+    assert_eq!(with_projections(clean.clone(), &[false, true, true], true, &stop).unwrap().cleaned().signal(0), kept);
+    stop.set();
+    let told = with_projections(clean.clone(), &[false, true, true], true, &stop);
+    assert!(matches!(told, Err(Error::Interrupted)));
     assert!(project(&record(0.1, vec![vec![1.0; 5], vec![1.0; 5]]), 0, &[1], true).is_err());
 }
 

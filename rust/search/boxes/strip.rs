@@ -7,7 +7,9 @@ const PLACES: [f64; LANES] = [0.0, 1.0, 2.0, 3.0];
 /// Coefficients on û and v̂ of all candidates of some rows of a slab.
 #[derive(Default)]
 pub(super) struct Strip {
+    /// Their first row, and how many values a row has.
     pub(super) start: usize,
+    /// See `start`.
     pub(super) len: usize,
     /// (p + q)/2, (p − q)/2 and 1 − B²; all of them 0 where that is next to nothing, or no number.
     pub(super) plus: Vec<f64>,
@@ -89,6 +91,7 @@ impl Strip {
     }
 }
 
+/// So many, to reckon with.
 #[inline(always)]
 #[allow(clippy::cast_precision_loss)]
 pub(super) fn count(n: usize) -> f64 {

@@ -433,6 +433,8 @@ mod tests {
                                 };
                                 let far = far(&whole, &one, (place(i, ends[0]), place(j, ends[1])));
                                 for (nearest, far) in nearest.iter_mut().zip(far) {
+                                    // What is no number is no proof.
+                                    let far = far.map(|v| if v.is_nan() { f64::INFINITY } else { v });
                                     *nearest = far.into_iter().fold(*nearest, f64::max);
                                 }
                             }
