@@ -1,6 +1,9 @@
 //! Long columns against one another: orthonormal bases, projections, triangular factors, in the widest vectors at hand.
 
+use crate::abreast;
+use crate::error::Result;
 use crate::lanes::{dot, widest, Kernel};
+use crate::stop::Stop;
 
 /// Rows that are taken into a triangular factor at a time: what fits a cache.
 const ROWS: usize = 1 << 10;
@@ -114,6 +117,47 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share
     if left > share * whole && left.is_finite() {
         column.iter_mut().for_each(|v| *v /= left);
         basis.push(column);
+    }
+}
+
+/// Orthonormal directions of which less than this share of any of the columns is left over. O(k² m), on the threads of the
+/// pool at hand.
+///
+/// The column that is farthest from the directions before it comes next: what rounding does to columns is divided by the
+/// share once, not once a column. A column of noughts has no direction, nor has one whose squares are no numbers.
+///
+/// # Errors
+/// [`crate::error::Error::Interrupted`].
+pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop) -> Result<Vec<Vec<f64>>> {
+    let whole = |mut column: Vec<f64>| {
+        let size = norm(&column);
+        let sound = size > 0.0 && size.is_finite();
+        column.iter_mut().for_each(|v| *v /= size);
+        sound.then_some((1.0, column))
+    };
+    let mut waiting: Vec<(f64, Vec<f64>)> = columns.into_iter().filter_map(whole).collect();
+    let mut basis: Vec<Vec<f64>> = Vec::with_capacity(waiting.len());
+    loop {
+        stop.check()?;
+        let farther = |a: &usize, b: &usize| waiting[*a].0.total_cmp(&waiting[*b].0).then(b.cmp(a));
+        let Some(next) = (0..waiting.len()).max_by(farther).filter(|&next| waiting[next].0 > share) else {
+            return Ok(basis);
+        };
+        let (_, mut direction) = waiting.remove(next);
+        // Twice is enough (Kahan, Parlett).
+        project_out(&basis, &mut direction);
+        let left = norm(&direction);
+        direction.iter_mut().for_each(|v| *v /= left);
+        basis.push(direction);
+        let last = &basis[basis.len() - 1..];
+        waiting = abreast::map(
+            waiting,
+            || (),
+            |(), (_, mut column)| {
+                project_out(last, &mut column);
+                (norm(&column), column)
+            },
+        );
     }
 }
 

@@ -1,6 +1,6 @@
 //! Refined instrumental variables: one step against dense algebra, exact data as a fixed point, truth under noise.
 
-use ftlm::equation::{Equation, Initial};
+use ftlm::equation::{Equation, Filter, Initial};
 use ftlm::error::Error;
 use ftlm::estimate::iv::{
     damped_inverse, fit, low_pass, power_frequency, project, refine, step, with_projections, Scratch, Settings, Source,
@@ -285,6 +285,78 @@ fn the_projection_keeps_what_inputs_excite_and_little_of_the_noise() {
     let told = with_projections(clean.clone(), &[false, true, true], true, &stop);
     assert!(matches!(told, Err(Error::Interrupted)));
     assert!(project(&record(0.1, vec![vec![1.0; 5], vec![1.0; 5]]), 0, &[1], true).is_err());
+}
+
+#[test]
+fn the_projection_of_noise_does_not_depend_on_how_columns_are_rounded() {
+    for (m, seed) in [(260, 31), (1000, 32), (2000, 33)] {
+        let (_, clean) = measured(&link(), m, &[], 0.0, seed);
+        let mut random = Random::new(seed);
+        let noise: Vec<f64> = (0..m).map(|_| random.normal()).collect();
+        let only = with_signal(&clean, 0, noise.clone());
+        let kept = project(&only, 0, &[1, 2], true).unwrap();
+        // Inputs in other units are the same inputs but for their rounding.
+        let scaled = |s: usize, by: f64| only.signal(s).iter().map(|v| by * v).collect::<Vec<f64>>();
+        let other = with_signal(&with_signal(&only, 1, scaled(1, 0.3)), 2, scaled(2, 1.7));
+        let change = distance(&project(&other, 0, &[1, 2], true).unwrap(), &kept) / norm(&kept);
+        check(&format!("{m} pulses, inputs in other units"), change, 1e-6);
+    }
+}
+
+/// The projection in plain sums: resonators as filters, one division each, then Gram and Schmidt, the column that most is
+/// left of next.
+fn project_naive(record: &Record, signal: usize, inputs: &[usize]) -> Vec<f64> {
+    let (m, h) = (record.m(), record.step());
+    let dot = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(x, y)| x * y).sum::<f64>();
+    let pi = std::f64::consts::PI;
+    let (low, high) = (pi / (m as f64 * h), pi / (4.0 * h));
+    let decades = (high / low).log10();
+    let count = ((8.0 * decades) as usize).clamp(2, m / (8 * inputs.len()));
+    let mut columns = Vec::new();
+    for &input in inputs {
+        let u = record.signal(input);
+        columns.extend([1.0, 2.0].map(|eta| multiply_naive(&block_pulse_kernel(eta, m, h), u, m)));
+        for i in 0..count {
+            let omega = low * 10.0_f64.powf(decades * i as f64 / (count - 1) as f64);
+            for numerator in [(omega, 1.0), (omega * omega, 0.0)] {
+                let denominator = vec![(1.0, 2.0), (0.4 * omega, 1.0), (omega * omega, 0.0)];
+                let filter = Filter { numerator: vec![numerator], denominator };
+                columns.push(multiply_naive(&filter.series(m, h).unwrap(), u, m));
+            }
+        }
+    }
+    for column in &mut columns {
+        let size = dot(column, column).sqrt();
+        column.iter_mut().for_each(|v| *v /= size);
+    }
+    let (mut out, mut sizes) = (vec![0.0; m], vec![1.0; columns.len()]);
+    loop {
+        let next = (0..sizes.len()).fold(0, |best, i| if sizes[i] > sizes[best] { i } else { best });
+        if sizes[next] <= 1e-6 {
+            return out;
+        }
+        let direction: Vec<f64> = columns[next].iter().map(|v| v / sizes[next]).collect();
+        for (sum, v) in out.iter_mut().zip(&direction) {
+            *sum += dot(&direction, record.signal(signal)) * v;
+        }
+        for column in &mut columns {
+            for _ in 0..2 {
+                let along = dot(column, &direction);
+                column.iter_mut().zip(&direction).for_each(|(v, q)| *v -= along * q);
+            }
+        }
+        sizes = columns.iter().map(|column| dot(column, column).sqrt()).collect();
+    }
+}
+
+#[test]
+fn the_projection_is_that_in_plain_sums() {
+    for (m, seed, inputs) in [(60, 41, &[1, 2][..]), (260, 42, &[1, 2]), (260, 43, &[2]), (1000, 44, &[1])] {
+        let (noisy, _) = measured(&link(), m, &[], 0.5, seed);
+        let kept = project(&noisy, 0, inputs, true).unwrap();
+        let naive = project_naive(&noisy, 0, inputs);
+        check(&format!("{m} pulses, inputs {inputs:?}"), distance(&kept, &naive) / norm(&naive), 1e-6);
+    }
 }
 
 #[test]

@@ -1,20 +1,20 @@
 //! Clean substitutes for measured outputs: their projections on what the inputs excite.
 
 use super::common::dot;
-use crate::equation::Filter;
 use crate::error::{Error, Result};
 use crate::kernels::block_pulse_kernel;
-use crate::orthogonal::extend_orthonormal;
+use crate::orthogonal::orthonormal_basis;
 use crate::regressors::Record;
-use crate::series::{Buffers, Kernel};
+use crate::series::{reciprocal, Buffers, Kernel};
 use crate::stop::Stop;
 
 /// Resonators of [`project`] a decade and input, and their damping ratio: broad enough to leave no gap between them.
 const RESONATORS: usize = 8;
 const RESONATOR_DAMPING: f64 = 0.2;
 
-/// A column of [`project`] of which less than this share is new is left out: it would add rounding, not span.
-const SPANNED: f64 = 1e-9;
+/// Where less than this share of every column of [`project`] is new the others are left out: what inputs excite has next to
+/// nothing along them, noise as much as along any, and rounding (10⁻¹¹ of columns of a thousand pulses) would choose them.
+const SPANNED: f64 = 1e-6;
 
 /// A record with clean substitutes ([`project`]) for all signals that are no inputs; inputs stand for themselves.
 ///
@@ -38,7 +38,7 @@ pub fn with_projections(record: Record, inputs: &[bool], at_rest: bool, stop: &S
 
 /// A measured signal without most of its noise: its least-squares projection on what the inputs excite.
 ///
-/// The basis holds each input's first two integrals and, eight a decade, its response through resonators: k columns
+/// The basis holds each input's first two integrals and, eight a decade, its response through resonators: k directions
 /// leave k/m of the noise power, whatever the signal's dynamics. Deterministic powers of t (offset, ramp) are added
 /// where the record does not start at rest.
 ///
@@ -77,30 +77,32 @@ fn excited(record: &Record, inputs: &[usize], at_rest: bool, stop: &Stop) -> Res
     if !at_rest {
         columns.extend([0.0, 1.0].map(|e| record.initial_term(e)));
     }
+    let [once, twice] = [1.0, 2.0].map(|eta| block_pulse_kernel(eta, m, h));
+    let mut buffers = Buffers::default();
     for &input in inputs {
-        let u = record.signal(input);
-        let driver = Kernel::new(u);
-        let mut buffers = Buffers::default();
-        let mut through = |series: &[f64]| {
-            let mut out = vec![0.0; m];
-            driver.apply(series, &mut out, &mut buffers);
-            out
-        };
-        columns.extend([1.0, 2.0].map(|eta| through(&block_pulse_kernel(eta, m, h))));
+        let driver = Kernel::new(record.signal(input));
+        let integrals = [&once, &twice].map(|kernel| {
+            let mut integral = vec![0.0; m];
+            driver.apply(kernel, &mut integral, &mut buffers);
+            integral
+        });
+        let spectra = [&integrals[0], &integrals[1]].map(|integral| Kernel::new(integral));
+        columns.extend(integrals);
         for i in 0..count {
+            stop.check()?;
+            // s u and u over s² + 2ζωs + ω² are I u and I² u over 1 + 2ζω I + ω² I², whatever their sizes.
             let omega = low * libm::pow(10.0, decades * i as f64 / (count - 1) as f64);
-            let denominator = vec![(1.0, 2.0), (2.0 * RESONATOR_DAMPING * omega, 1.0), (omega * omega, 0.0)];
-            for numerator in [(omega * omega, 0.0), (omega, 1.0)] {
-                let filter = Filter { numerator: vec![numerator], denominator: denominator.clone() };
-                stop.check()?;
-                columns.push(through(&filter.series(m, h)?));
-            }
+            let resonator =
+                once.iter().zip(&twice).map(|(a, b)| 2.0 * RESONATOR_DAMPING * omega * a + omega * omega * b);
+            let mut resonator: Vec<f64> = resonator.collect();
+            resonator[0] += 1.0;
+            let answer = Kernel::made_with(&reciprocal(&resonator), &mut buffers);
+            columns.extend(spectra.each_ref().map(|integral| {
+                let mut column = vec![0.0; m];
+                answer.times(integral, &mut column, &mut buffers);
+                column
+            }));
         }
     }
-    let mut basis = Vec::with_capacity(columns.len());
-    for column in columns {
-        stop.check()?;
-        extend_orthonormal(&mut basis, column, SPANNED);
-    }
-    Ok(basis)
+    orthonormal_basis(columns, SPANNED, stop)
 }

@@ -13,6 +13,7 @@ use crate::search::lattice::cursor::Cursor;
 use crate::search::lattice::slab::Slab;
 use crate::search::outcome::{Failure, Kept, Part, Row, Verdict, LISTED};
 use crate::search::screen::{by_guess, screen, Open};
+use crate::search::spread::visit;
 use crate::search::threads::PerThread;
 
 /// Pulses of all candidates followed between two checkpoints: a tenth of a second or so of one core.
@@ -20,6 +21,10 @@ const PIECE: usize = 1 << 21;
 /// Candidates that a thread screens at a time: those that the Gram matrix alone ranks cost a nanosecond or so.
 const CHUNK: u64 = 512;
 const CHUNK_PLAIN: u64 = 1 << 13;
+/// Slabs of which boxes are tried where candidates are hard to exclude, and the share of their candidates that boxes must
+/// exclude: what they cost is a small part of a candidate's own screening where they exclude most, as much again where none.
+const SLABS: u64 = 32;
+const BOXED: u64 = 8;
 /// First and largest number of candidates followed between two looks at the kept scores.
 const FOLLOWED: (u64, u64) = (256, 16_384);
 /// First and largest number of refined candidates followed between two looks at the kept scores: each takes about a
@@ -110,6 +115,30 @@ impl<'a> Hunt<'a> {
             self.part.failures.extend(singular.into_iter().take(LISTED).map(|index| (index, Failure::Singular)));
         }
         self.follow(&open, kept, place, true).map(|()| true)
+    }
+
+    /// Whether boxes exclude more than one in [`BOXED`] of some candidates all over the lattice at this limit.
+    pub(super) fn boxes_exclude(&self, limit: f64) -> Result<bool> {
+        let Some(boxes) = self.boxes else { return Ok(false) };
+        let (catalogue, control) = (self.catalogue, self.control);
+        let order = visit(catalogue.lattice.count());
+        let places: Vec<u64> = (0..SLABS.min(catalogue.lattice.count())).map(order).collect();
+        let found: Vec<(u64, u64)> = self.pool.install(|| {
+            places
+                .into_par_iter()
+                .with_max_len(1)
+                .filter_map(|at| {
+                    let slab = catalogue.lattice.slab(at).filter(|_| !control.stopped())?;
+                    let end = slab.hi.min(slab.lo + LEAST);
+                    let (.., boxed) = screen_slab(catalogue, boxes, &slab, (slab.lo, end), limit)?;
+                    Some((end - slab.lo, boxed))
+                })
+                .collect()
+        });
+        self.check_stop()?;
+        let (all, boxed) = found.iter().fold((0, 0), |sums, found| (sums.0 + found.0, sums.1 + found.1));
+        eprintln!("boxes exclude {boxed} of {all}");
+        Ok(boxed * BOXED > all)
     }
 
     /// The candidates of a round in chunks: those of a large slab together, others a few at a time.
@@ -257,4 +286,41 @@ fn digest(open: &[Open]) -> u64 {
     let whole =
         bytes.fold(0xcbf2_9ce4_8422_2325_u64, |hash, byte| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01b3));
     (whole >> 1).max(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::borrow::Cow;
+
+    use super::*;
+    use crate::regressors::Record;
+    use crate::search::lattice::{Lattice, TermAxis};
+    use crate::search::options::Options;
+    use crate::search::threads::pool;
+    use crate::stop::Stop;
+
+    #[test]
+    fn boxes_are_used_where_they_exclude_candidates_and_nowhere_else() -> Result<()> {
+        let input: Vec<f64> = (0..200).map(|k| if k % 40 < 20 { 1.0 } else { -0.5 }).collect();
+        let answer = Record::new(0.05, vec![input.clone()], None)?.integral(0, 0.8);
+        let size: f64 = answer.iter().map(|y| y.abs()).sum();
+        let record = Record::new(0.05, vec![answer, input], None)?;
+        let axis = |signal: usize, from: f64| {
+            let values = (0..40).map(|i| from + 0.01 * f64::from(i)).collect();
+            TermAxis { signal, values, interchangeable: false }
+        };
+        let lattice = Lattice::new(0, &[1.4, 1.6], &[axis(0, 0.1), axis(1, 0.6)], |signal| signal == 1)?;
+        let (pool, control, options) = (pool(1)?, Control::default(), Options::default());
+        let (lattice, fixed) = (Cow::Borrowed(&lattice), [None, None]);
+        let catalogue = Catalogue::new(&[record], lattice, &fixed, &options, &pool, &Stop::default())?;
+        let boxes = pool.install(|| Boxes::new(&catalogue));
+        let hunt = Hunt::new(&catalogue, boxes.as_ref(), &pool, &control);
+        assert!(hunt.boxes_exclude(1e-3 * size)?);
+        // Nothing exceeds a limit as large.
+        assert!(!hunt.boxes_exclude(1e3 * size)?);
+        assert!(!Hunt::new(&catalogue, None, &pool, &control).boxes_exclude(1e-3 * size)?);
+        control.stop.set();
+        assert!(hunt.boxes_exclude(1e-3 * size).is_err());
+        Ok(())
+    }
 }

@@ -132,8 +132,13 @@ impl<'a> Search<'a> {
                 catalogue.problem.tangents = Some(along);
             }
         }
-        let boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
+        let mut boxes = pool.install(|| if pay { Boxes::new(&catalogue) } else { None });
         control.check_stop()?;
+        // What scouts leave open boxes may leave open, too, and test vectors made for candidates with them.
+        if hard && boxes.is_some() && !Hunt::new(&catalogue, boxes.as_ref(), pool, control).boxes_exclude(limit)? {
+            boxes = None;
+            catalogue.problem.adapted = None;
+        }
         Ok(Self { catalogue, boxes, limit })
     }
 
