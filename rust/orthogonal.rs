@@ -8,6 +8,9 @@ use crate::stop::Stop;
 /// Rows that are taken into a triangular factor at a time: what fits a cache.
 const ROWS: usize = 1 << 10;
 
+/// Directions that are taken out of a column between two looks at whether to stop.
+const AT_ONCE: usize = 16;
+
 /// Squares of what is factored lie between these: beyond, sums of them are not what they should be.
 const LEAST: f64 = 1e-280;
 const MOST: f64 = 1e280;
@@ -129,13 +132,13 @@ pub fn extend_orthonormal(basis: &mut Vec<Vec<f64>>, mut column: Vec<f64>, share
 /// # Errors
 /// [`crate::error::Error::Interrupted`].
 pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop) -> Result<Vec<Vec<f64>>> {
-    let whole = |mut column: Vec<f64>| {
-        let size = norm(&column);
+    let whole = |(): &mut (), mut column: Vec<f64>| {
+        let size = if stop.is_set() { 0.0 } else { norm(&column) };
         let sound = size > 0.0 && size.is_finite();
         column.iter_mut().for_each(|v| *v /= size);
         sound.then_some((1.0, column))
     };
-    let mut waiting: Vec<(f64, Vec<f64>)> = columns.into_iter().filter_map(whole).collect();
+    let mut waiting: Vec<(f64, Vec<f64>)> = abreast::map(columns, || (), whole).into_iter().flatten().collect();
     let mut basis: Vec<Vec<f64>> = Vec::with_capacity(waiting.len());
     loop {
         stop.check()?;
@@ -145,19 +148,23 @@ pub(crate) fn orthonormal_basis(columns: Vec<Vec<f64>>, share: f64, stop: &Stop)
         };
         let (_, mut direction) = waiting.remove(next);
         // Twice is enough (Kahan, Parlett).
-        project_out(&basis, &mut direction);
+        for before in basis.chunks(AT_ONCE) {
+            stop.check()?;
+            project_out(before, &mut direction);
+        }
         let left = norm(&direction);
         direction.iter_mut().for_each(|v| *v /= left);
         basis.push(direction);
         let last = &basis[basis.len() - 1..];
-        waiting = abreast::map(
-            waiting,
-            || (),
-            |(), (_, mut column)| {
-                project_out(last, &mut column);
-                (norm(&column), column)
-            },
-        );
+        let without = |(): &mut (), (left, mut column): (f64, Vec<f64>)| {
+            // What is half done once it was told to stop is thrown away.
+            if stop.is_set() {
+                return (left, column);
+            }
+            project_out(last, &mut column);
+            (norm(&column), column)
+        };
+        waiting = abreast::map(waiting, || (), without);
     }
 }
 
