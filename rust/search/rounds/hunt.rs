@@ -21,10 +21,10 @@ const PIECE: usize = 1 << 21;
 /// Candidates that a thread screens at a time: those that the Gram matrix alone ranks cost a nanosecond or so.
 const CHUNK: u64 = 512;
 const CHUNK_PLAIN: u64 = 1 << 13;
-/// Slabs of which boxes are tried where candidates are hard to exclude, and the share of their candidates that boxes must
-/// exclude: what they cost is a small part of a candidate's own screening where they exclude most, as much again where none.
+/// Slabs of which boxes are tried where candidates are hard to exclude, and one in how many of their candidates boxes must
+/// exclude to pay: where they exclude none a search takes half as long again.
 const SLABS: u64 = 32;
-const BOXED: u64 = 8;
+const PAYING: u64 = 8;
 /// First and largest number of candidates followed between two looks at the kept scores.
 const FOLLOWED: (u64, u64) = (256, 16_384);
 /// First and largest number of refined candidates followed between two looks at the kept scores: each takes about a
@@ -117,7 +117,7 @@ impl<'a> Hunt<'a> {
         self.follow(&open, kept, place, true).map(|()| true)
     }
 
-    /// Whether boxes exclude more than one in [`BOXED`] of some candidates all over the lattice at this limit.
+    /// Whether boxes exclude more than one in [`PAYING`] of some candidates all over the lattice at this limit.
     pub(super) fn boxes_exclude(&self, limit: f64) -> Result<bool> {
         let Some(boxes) = self.boxes else { return Ok(false) };
         let (catalogue, control) = (self.catalogue, self.control);
@@ -137,8 +137,7 @@ impl<'a> Hunt<'a> {
         });
         self.check_stop()?;
         let (all, boxed) = found.iter().fold((0, 0), |sums, found| (sums.0 + found.0, sums.1 + found.1));
-        eprintln!("boxes exclude {boxed} of {all}");
-        Ok(boxed * BOXED > all)
+        Ok(boxed * PAYING > all)
     }
 
     /// The candidates of a round in chunks: those of a large slab together, others a few at a time.
